@@ -1,0 +1,115 @@
+"""What every device folder has in common: the emulator's frame and the physics it may ask for."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.link import DeviceEnd
+
+
+class Emulator(Protocol):
+    """The device side of a protocol, byte for byte, with the device's own persistent state."""
+
+    name: str
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve for ever; survives hosts that come, go and die."""
+        ...
+
+    def power_cycle(self) -> None:
+        """Supply off and on again: volatile state is lost, stored settings stay."""
+        ...
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start (or end) a device fault by name.
+
+        Raises:
+            InputError: unknown fault or bad value; the text lists what is known.
+        """
+        ...
+
+
+class RangeSource(Protocol):
+    """What a lidar sees."""
+
+    def scan(self, time_ns: int) -> NDArray[np.int32]:
+        """Raw distances in mm of one revolution that began at ``time_ns``.
+
+        Shape (769,), step 0..768; values below 20 are the sensor's error codes.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class MotorReading:
+    """A motor shaft at one instant, in the controller's own sign."""
+
+    turns: float
+    """Shaft revolutions since power-up of the world."""
+    rpm: float
+    demand_rpm: float
+    current_ma: float
+    supply_v: float
+
+
+class MotorPlant(Protocol):
+    """A motor with its load, driven by a speed controller."""
+
+    def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
+        """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
+        ...
+
+    def reading(self, time_ns: int) -> MotorReading:
+        """State at ``time_ns`` (never earlier than a time already asked for)."""
+        ...
+
+
+class PulseSource(Protocol):
+    """A servo controller's outputs."""
+
+    def pulse_us(self, channel: int, time_ns: int) -> float | None:
+        """Pulse being sent, microseconds; None = no pulses."""
+        ...
+
+
+class ServoPlant(Protocol):
+    """Servos with their load; ``advance`` is called before any target changes."""
+
+    def attach(self, pulses: PulseSource) -> None:
+        """Name the controller whose pulses move the servos."""
+        ...
+
+    def advance(self, time_ns: int) -> None:
+        """Let the servos follow their pulses up to ``time_ns``."""
+        ...
+
+    def analog_volts(self, channel: int, time_ns: int) -> float:
+        """Voltage at an analog input."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CompassReading:
+    """What the compass's sensors feel: magnetic heading and tilt, without the device's own quantisation."""
+
+    heading_deg: float
+    """Clockwise from magnetic north."""
+    pitch_deg: float
+    """Device's sign: nose up positive."""
+    roll_deg: float
+    """Device's sign: right side down positive."""
+    temperature_c: float
+    field: tuple[float, float, float]
+    """Magnetic field in the device frame, milligauss."""
+    acceleration: tuple[float, float, float]
+    """In g."""
+
+
+class AttitudeSource(Protocol):
+    """Where a compass gets its truth from."""
+
+    def compass(self, time_ns: int) -> CompassReading:
+        """Reading at ``time_ns``."""
+        ...

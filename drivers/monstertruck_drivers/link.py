@@ -1,0 +1,399 @@
+"""Byte links: one receive buffer, one way to lose the peer; serial ports and in-memory pairs.
+
+A ``Port`` is a place a device can be plugged into; opening it gives a ``Link``. The host side never sees
+whether the bytes come from a tty, a pty or another coroutine.
+"""
+
+import asyncio
+import contextlib
+import errno
+import termios
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Protocol, Self
+
+import serial
+import serial_asyncio
+
+from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
+
+BUFFER_LIMIT = 1 << 16
+"""Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
+
+
+class Link:
+    """One open connection: buffered reads, immediate writes, one ``lost`` state.
+
+    Args:
+        name: for error messages.
+        transmit: takes bytes to the peer.
+        hang_up: closes the underlying transport; called once.
+    """
+
+    def __init__(self, name: str, transmit: Callable[[bytes], None], hang_up: Callable[[], None]) -> None:
+        self.name = name
+        self._transmit = transmit
+        self._hang_up = hang_up
+        self._buffer = bytearray()
+        self._lost: str | None = None
+        self._waiter: asyncio.Future[None] | None = None
+
+    # What the transport calls
+
+    def feed(self, data: bytes) -> None:
+        """Bytes arrived from the peer."""
+        self._buffer += data
+        if len(self._buffer) > BUFFER_LIMIT:
+            del self._buffer[:-BUFFER_LIMIT]
+        self._wake()
+
+    def lose(self, why: str) -> None:
+        """The peer is gone; pending and later reads raise ``DeviceLostError``."""
+        if self._lost is None:
+            self._lost = why
+            self._wake()
+
+    # What the user calls
+
+    @property
+    def is_lost(self) -> bool:
+        """True once the peer is gone or the link was closed."""
+        return self._lost is not None
+
+    def write(self, data: bytes) -> None:
+        """Send all of ``data``.
+
+        Raises:
+            DeviceLostError: the link is down.
+        """
+        if self._lost is not None:
+            raise DeviceLostError(f"{self.name}: {self._lost}")
+        self._transmit(data)
+
+    async def read(self) -> bytes:
+        """Everything received so far, at least one byte.
+
+        Raises:
+            DeviceLostError: the link is down and its buffer is empty.
+        """
+        while not self._buffer:
+            await self._more()
+        data = bytes(self._buffer)
+        self._buffer.clear()
+        return data
+
+    async def exactly(self, count: int) -> bytes:
+        """Read ``count`` bytes; bytes beyond stay buffered.
+
+        Raises:
+            DeviceLostError: the link went down before they came.
+        """
+        while len(self._buffer) < count:
+            await self._more()
+        data = bytes(self._buffer[:count])
+        del self._buffer[:count]
+        return data
+
+    async def until(self, end: bytes, limit: int = 4096) -> bytes:
+        """Read up to and including ``end``.
+
+        Raises:
+            DeviceLostError: the link went down before it came.
+            ProtocolError: more than ``limit`` bytes came without ``end``; they are dropped.
+        """
+        start = 0
+        while (at := self._buffer.find(end, start)) < 0:
+            if len(self._buffer) > limit:
+                self._buffer.clear()
+                raise ProtocolError(f"{self.name}: {limit} bytes without {end!r}")
+            start = max(0, len(self._buffer) - len(end) + 1)
+            await self._more()
+        data = bytes(self._buffer[: at + len(end)])
+        del self._buffer[: at + len(end)]
+        return data
+
+    def discard(self) -> int:
+        """Throw away what was received and not read; returns how many bytes."""
+        count = len(self._buffer)
+        self._buffer.clear()
+        return count
+
+    def close(self) -> None:
+        """Hang up at once, dropping unsent bytes; may be called again."""
+        if self._hang_up is not _nothing:
+            hang_up, self._hang_up = self._hang_up, _nothing
+            hang_up()
+        self.lose("closed")
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    async def _more(self) -> None:
+        if self._lost is not None:
+            raise DeviceLostError(f"{self.name}: {self._lost}")
+        if self._waiter is not None:
+            raise RuntimeError(f"{self.name}: two readers")
+        self._waiter = asyncio.get_running_loop().create_future()
+        try:
+            await self._waiter
+        finally:
+            self._waiter = None
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+
+def _nothing() -> None:
+    return None
+
+
+class Port(Protocol):
+    """Somewhere a device may be plugged in."""
+
+    name: str
+
+    async def open(self) -> Link:
+        """Open a fresh link.
+
+        Raises:
+            DeviceLostError: nothing is plugged in.
+            PortBusyError: another process holds it.
+        """
+        ...
+
+
+class SerialPort:
+    """A tty by its path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
+
+    Args:
+        path: device node or a symlink to it; resolved anew at every open.
+        baud: bits per second; meaningless on USB-CDC and ptys.
+    """
+
+    def __init__(self, path: Path, baud: int = 115200) -> None:
+        self.name = str(path)
+        self._path = path
+        self._baud = baud
+
+    async def open(self) -> Link:
+        """Open raw and exclusive, with empty buffers.
+
+        Raises:
+            DeviceLostError: the node does not exist or vanished.
+            PortBusyError: another process holds an exclusive lock on it.
+        """
+        if not self._path.exists():
+            raise DeviceLostError(f"{self.name}: not plugged in")
+        loop = asyncio.get_running_loop()
+        try:
+            transport, protocol = await serial_asyncio.create_serial_connection(
+                loop, lambda: _SerialProtocol(self.name), str(self._path), baudrate=self._baud, exclusive=True
+            )
+        except serial.SerialException as error:
+            raise self._open_error(error) from error
+        except (OSError, termios.error) as error:
+            raise DeviceLostError(f"{self.name}: {error}") from error
+        link = protocol.own(transport)
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcflush(transport.serial.fileno(), termios.TCIOFLUSH)
+        return link
+
+    def _open_error(self, error: serial.SerialException) -> Exception:
+        busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
+        return PortBusyError(f"{self.name}: held by another process") if busy else DeviceLostError(str(error))
+
+
+class _SerialProtocol(asyncio.Protocol):
+    """Feeds a ``Link`` from a pyserial-asyncio transport."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._transport: serial_asyncio.SerialTransport | None = None
+        self.link: Link | None = None
+
+    def own(self, transport: "serial_asyncio.SerialTransport") -> Link:
+        self._transport = transport
+        # abort(), never close(): close() with a stalled peer never ends.
+        self.link = Link(self._name, transport.write, transport.abort)
+        return self.link
+
+    def data_received(self, data: bytes) -> None:
+        if self.link is not None:
+            self.link.feed(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self.link is not None:
+            self.link.lose(f"unplugged ({exc})" if exc else "unplugged")
+
+
+class DeviceEnd:
+    """The device's side of a port: what an emulator reads and writes, whoever has the host side open.
+
+    Bytes for nobody are dropped, as a USB device's are. ``baud`` paces both directions like a real
+    line (10 bits a byte). Faults of the cable live here too.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.baud: int | None = None
+        self.faults = LineFaults()
+        self.on_plug: Callable[[bool], None] | None = None
+        """Told True/False when the cable is plugged/unplugged."""
+        self._received = Link(name, lambda _: None, _nothing)
+        self._out_free = 0.0
+        self._in_free = 0.0
+        self._deliver: Callable[[bytes], None] | None = None
+
+    def connect(self, deliver: Callable[[bytes], None] | None) -> None:
+        """A host opened the port (or closed it: None)."""
+        self._deliver = deliver
+
+    async def read(self) -> bytes:
+        """Bytes from the host, at least one; waits for ever while nothing is plugged in or open."""
+        return await self._received.read()
+
+    def write(self, data: bytes) -> None:
+        """Send to the host, through baud pacing and line faults."""
+        for chunk in self.faults.corrupt(data):
+            self._out_free = self._paced(self._out_free, len(chunk), partial(self._emit, chunk))
+
+    def take(self, data: bytes) -> None:
+        """Bytes from the host enter the line."""
+        self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
+
+    def _paced(self, free: float, count: int, act: Callable[[], None]) -> float:
+        delay = self.faults.delay
+        if self.baud is None and delay <= 0:
+            act()
+            return free
+        loop = asyncio.get_running_loop()
+        done = max(free, loop.time()) + (count * 10 / self.baud if self.baud else 0.0)
+        loop.call_at(done + delay, act)
+        return done
+
+    def _emit(self, data: bytes) -> None:
+        if self._deliver is not None and not self.faults.stalled:
+            self._deliver(data)
+
+    def _accept(self, data: bytes) -> None:
+        if not self.faults.deaf:
+            self._received.feed(data)
+
+
+class LineFaults:
+    """What can be wrong with a cable; all off by default. Randomness is set by ``seed``."""
+
+    def __init__(self) -> None:
+        self.stalled = False
+        """Nothing reaches the host."""
+        self.deaf = False
+        """Nothing reaches the device."""
+        self.delay = 0.0
+        """Seconds added to every transfer."""
+        self.chunk: int | None = None
+        """Deliver at most this many bytes at a time (1 = one-byte reads)."""
+        self.flip_rate = 0.0
+        """Probability that one bit of a byte is flipped."""
+        self.drop_rate = 0.0
+        """Probability that a byte is lost."""
+        self.garbage = b""
+        """Sent once before the next bytes."""
+        self._state = 0x9E3779B9
+
+    def seed(self, seed: int) -> None:
+        """Make the faults reproducible."""
+        self._state = (seed * 2654435761 + 1) & 0xFFFFFFFF
+
+    def corrupt(self, data: bytes) -> list[bytes]:
+        """Apply the faults; returns the chunks to deliver."""
+        if self.garbage:
+            data, self.garbage = self.garbage + data, b""
+        if self.flip_rate or self.drop_rate:
+            out = bytearray()
+            for byte in data:
+                if self._random() < self.drop_rate:
+                    continue
+                out.append(byte ^ (1 << int(self._random() * 8)) if self._random() < self.flip_rate else byte)
+            data = bytes(out)
+        if self.chunk is None:
+            return [data] if data else []
+        return [data[i : i + self.chunk] for i in range(0, len(data), self.chunk)]
+
+    def _random(self) -> float:
+        self._state ^= (self._state << 13) & 0xFFFFFFFF
+        self._state ^= self._state >> 17
+        self._state ^= (self._state << 5) & 0xFFFFFFFF
+        return self._state / 2**32
+
+
+class EmulatedPort(Protocol):
+    """A port whose device is emulated: can be plugged and unplugged."""
+
+    name: str
+    device: DeviceEnd
+
+    def plug(self) -> None:
+        """Connect the cable."""
+        ...
+
+    def unplug(self) -> None:
+        """Pull the cable: the host's link is lost."""
+        ...
+
+
+class MemoryPort:
+    """Port and device end in one process, for the virtual clock."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.device = DeviceEnd(name)
+        self._plugged = False
+        self._link: Link | None = None
+
+    @property
+    def plugged(self) -> bool:
+        """True while the cable is in."""
+        return self._plugged
+
+    def plug(self) -> None:
+        """Connect the cable."""
+        if not self._plugged:
+            self._plugged = True
+            if self.device.on_plug is not None:
+                self.device.on_plug(True)
+
+    def unplug(self) -> None:
+        """Pull the cable: an open link is lost."""
+        if self._plugged:
+            self._plugged = False
+            self.device.connect(None)
+            link, self._link = self._link, None
+            if link is not None:
+                link.lose("unplugged")
+            if self.device.on_plug is not None:
+                self.device.on_plug(False)
+
+    async def open(self) -> Link:
+        """Open the host side.
+
+        Raises:
+            DeviceLostError: nothing is plugged in.
+            PortBusyError: it is open already.
+        """
+        if not self._plugged:
+            raise DeviceLostError(f"{self.name}: not plugged in")
+        if self._link is not None:
+            raise PortBusyError(f"{self.name}: held by another process")
+        link = Link(self.name, self.device.take, self._hang_up)
+        self._link = link
+        self.device.connect(link.feed)
+        return link
+
+    def _hang_up(self) -> None:
+        self._link = None
+        self.device.connect(None)

@@ -1,0 +1,1 @@
+"""Kinematics of the truck and of every wheeled-robot family: pure numpy, no I/O."""

@@ -1,0 +1,1 @@
+"""Planners and trackers: pure plan/control functions inside thin coroutine shells."""

@@ -1,0 +1,1 @@
+"""What every room needs: clock, services, errors, wire codec, client."""

@@ -1,0 +1,179 @@
+"""Time, injected everywhere: wall, virtual and replay clocks, and the event loops that carry them.
+
+Every coroutine sleeps on its event loop as usual (``asyncio.sleep``, ``asyncio.timeout``); what differs is
+the loop. ``VirtualLoop`` jumps to the next timer as soon as nothing is ready to run, so an hour of driving
+takes as long as its computations, and two runs of one seed are identical. A replay clock is a virtual loop
+that starts at the log's first stamp and can be held to a multiple of real time.
+
+This is the only module that may import ``time``.
+"""
+
+import asyncio
+import selectors
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, Protocol, TypeVar
+
+T = TypeVar("T")
+
+SECOND = 1_000_000_000
+"""Nanoseconds of a second."""
+
+
+class Clock(Protocol):
+    """What a service may know of time."""
+
+    def now(self) -> int:
+        """Nanoseconds of the daemon's monotonic time."""
+        ...
+
+    def real_offset(self) -> int:
+        """Nanoseconds to add to ``now()`` for real (UNIX) time."""
+        ...
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait at least ``seconds``."""
+        ...
+
+    async def sleep_until(self, instant: int) -> None:
+        """Wait until ``now() >= instant``; returns at once if that has passed."""
+        ...
+
+    def deadline(self, seconds: float) -> asyncio.Timeout:
+        """Async context manager that raises ``TimeoutError`` inside after ``seconds``."""
+        ...
+
+
+class _LoopClock:
+    """Shared part: sleeping rests on the running loop, whatever carries it."""
+
+    def now(self) -> int:
+        raise NotImplementedError
+
+    async def sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def sleep_until(self, instant: int) -> None:
+        while (left := instant - self.now()) > 0:
+            await asyncio.sleep(left / SECOND)
+
+    def deadline(self, seconds: float) -> asyncio.Timeout:
+        return asyncio.timeout(seconds)
+
+
+class WallClock(_LoopClock):
+    """CLOCK_MONOTONIC and the ordinary event loop."""
+
+    def now(self) -> int:
+        """Nanoseconds of CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def real_offset(self) -> int:
+        """Offset of CLOCK_REALTIME, read back to back with CLOCK_MONOTONIC."""
+        before = time.monotonic_ns()
+        real = time.time_ns()
+        return real - (before + time.monotonic_ns()) // 2
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """Event loop whose time jumps to the next timer when nothing is ready.
+
+    Args:
+        start: first instant, ns.
+        rate: greatest speed relative to real time; ``None`` runs as fast as it can.
+    """
+
+    def __init__(self, start: int = 0, rate: float | None = None) -> None:
+        self._now = start
+        self._real_start = time.monotonic_ns()
+        self._start = start
+        self._rate = rate
+        super().__init__(_JumpingSelector(self))
+
+    def time(self) -> float:
+        """Virtual seconds."""
+        return self._now / SECOND
+
+    def now(self) -> int:
+        """Virtual nanoseconds."""
+        return self._now
+
+    def jump(self, seconds: float) -> None:
+        """Advance by ``seconds``; called by the selector when nothing is ready.
+
+        One nanosecond is added because the loop compares timers in float seconds.
+        """
+        self._now += round(seconds * SECOND) + 1
+        if self._rate is not None:
+            due = self._real_start + int((self._now - self._start) / self._rate)
+            time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
+
+
+class _JumpingSelector(selectors.DefaultSelector):
+    """Never waits for a timer: polls, and if nothing came lets the loop jump."""
+
+    def __init__(self, loop: VirtualLoop) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None:  # no timers at all: only another thread can wake us
+            return super().select(None)
+        if timeout <= 0:
+            return super().select(0)
+        events: list[tuple[selectors.SelectorKey, int]] = super().select(0)
+        if not events:
+            self._loop.jump(timeout)
+        return events
+
+
+class VirtualClock(_LoopClock):
+    """Clock of a ``VirtualLoop``; its real time is fixed, so that runs are reproducible."""
+
+    def __init__(self, loop: VirtualLoop, real_offset: int = 0) -> None:
+        self._loop = loop
+        self._real_offset = real_offset
+
+    def now(self) -> int:
+        """Virtual nanoseconds."""
+        return self._loop.now()
+
+    def real_offset(self) -> int:
+        """The fixed offset given at construction."""
+        return self._real_offset
+
+
+class ReplayClock(VirtualClock):
+    """Clock of a recorded run: starts at the log's first stamp, with the log's own real-time offset."""
+
+
+def run_virtual(
+    main: Callable[[VirtualClock], Coroutine[Any, Any, T]], *, start: int = SECOND, rate: float | None = None
+) -> T:
+    """Run ``main(clock)`` to its end on a virtual loop of its own.
+
+    Args:
+        main: coroutine function that gets the clock.
+        start: first instant, ns.
+        rate: greatest speed relative to real time; ``None`` = unlimited.
+    """
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(start, rate)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, VirtualLoop)
+        return runner.run(main(VirtualClock(loop)))
+
+
+def run_replay(
+    main: Callable[[ReplayClock], Coroutine[Any, Any, T]], *, start: int, real_offset: int, rate: float | None
+) -> T:
+    """Run ``main(clock)`` on a loop that starts at ``start`` and is paced to ``rate`` times real time."""
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(start, rate)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, VirtualLoop)
+        return runner.run(main(ReplayClock(loop, real_offset)))
+
+
+def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
+    """Run ``main(clock)`` on the ordinary event loop."""
+    with asyncio.Runner() as runner:
+        return runner.run(main(WallClock()))

@@ -1,0 +1,97 @@
+"""The error tree: every expected failure of the project derives from ``TruckError`` and knows its reason."""
+
+from typing import ClassVar
+
+from monstertruck_schemas.reasons import Reason
+
+
+class TruckError(Exception):
+    """Root of all expected failures; anything else is a bug."""
+
+    reason: ClassVar[Reason] = Reason.INTERNAL
+
+
+class ConfigError(TruckError):
+    """A configuration was refused; the text names file, line, key and what was expected."""
+
+    reason = Reason.BAD_CONFIG
+
+
+class InputError(TruckError):
+    """Other input (map, log, path, argument) was refused; the text names what was expected."""
+
+    reason = Reason.BAD_INPUT
+
+
+class NotFoundError(TruckError):
+    """A named file, key or robot does not exist."""
+
+    reason = Reason.NOT_FOUND
+
+
+class RequestRefusedError(TruckError):
+    """The robot refused a request."""
+
+    def __init__(self, refusal: Reason, text: str = "") -> None:
+        super().__init__(text or refusal.text)
+        self.refusal = refusal
+
+
+class DeviceError(TruckError):
+    """Anything a device or its link did; the supervisor restarts the service."""
+
+    reason = Reason.DEVICE_FAULT
+
+
+class DeviceLostError(DeviceError):
+    """The port vanished or was closed: unplugged."""
+
+    reason = Reason.DEVICE_LOST
+
+
+class DeviceTimeoutError(DeviceError):
+    """The device did not answer in time."""
+
+    reason = Reason.DEVICE_TIMEOUT
+
+
+class ProtocolError(DeviceError):
+    """Bytes against the device's protocol."""
+
+    reason = Reason.DEVICE_PROTOCOL
+
+
+class WrongDeviceError(DeviceError):
+    """The handshake shows another device on this port."""
+
+    reason = Reason.DEVICE_WRONG
+
+
+class DeviceFaultError(DeviceError):
+    """The device reports a fault of its own that did not clear."""
+
+    reason = Reason.DEVICE_FAULT
+
+
+class PortBusyError(DeviceError):
+    """Another process holds the port."""
+
+    reason = Reason.DEVICE_BUSY
+
+
+class DeviceMismatchError(DeviceError):
+    """Device's parameters contradict the configuration; retrying cannot help."""
+
+    reason = Reason.DEVICE_MISMATCH
+
+
+class WorkerError(TruckError):
+    """A worker process failed."""
+
+    reason = Reason.WORKER_DIED
+
+
+class WorkerTimeoutError(WorkerError):
+    """A worker missed its deadline and was killed."""
+
+    reason = Reason.WORKER_TIMEOUT

@@ -1,0 +1,56 @@
+"""The narrow interfaces services see of the rest: publish, subscribe, report."""
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+
+M = TypeVar("M", bound=Message)
+M_co = TypeVar("M_co", bound=Message, covariant=True)
+M_contra = TypeVar("M_contra", bound=Message, contravariant=True)
+
+Value = float | int | str | bool | None
+
+
+class Publisher(Protocol[M_contra]):
+    """Write end of one topic."""
+
+    def next_seq(self) -> int:
+        """Sequence number for the next message of this topic."""
+        ...
+
+    def put(self, message: M_contra) -> None:
+        """Hand the message to every subscriber; never blocks."""
+        ...
+
+
+class Subscription(Protocol[M_co]):
+    """Read end of one topic, with its own delivery (latest, or bounded FIFO)."""
+
+    @property
+    def latest(self) -> M_co | None:
+        """Newest message, or None before the first; reading it consumes nothing."""
+        ...
+
+    @property
+    def drops(self) -> int:
+        """Messages lost because the FIFO was full (latest-only delivery never counts)."""
+        ...
+
+    async def next(self) -> M_co:
+        """Wait for a message not returned by ``next`` yet."""
+        ...
+
+
+class EventSink(Protocol):
+    """Where a service reports what happened."""
+
+    def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
+        """Publish one event."""
+        ...
+
+
+Ready = Callable[[], None]
+"""Called by a service once its session works; resets the restart budget."""

@@ -1,0 +1,160 @@
+"""Services and their supervision.
+
+A service's ``run`` owns ONE session: it opens its resource, calls ``ready()`` when it works, serves until
+cancelled, and raises when the session is lost. It never reconnects: ``supervise`` runs it again by a
+``RestartPolicy``. Only ``TruckError`` is a reason to retry; anything else is a bug.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Annotated, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceMismatchError, TruckError
+from monstertruck_runtime.ports import Ready
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
+
+log = logging.getLogger(__name__)
+
+
+class Service(Protocol):
+    """One supervised activity."""
+
+    name: str
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session until cancelled; raise ``TruckError`` when it is lost."""
+        ...
+
+
+class OnBug(StrEnum):
+    """What an unexpected exception in a service does."""
+
+    EXIT = "exit"
+    """Gate, actuators, bus: the process must not go on."""
+    FAIL = "fail"
+    """Any other: stop the truck through the gate, fail this service alone."""
+
+
+class RestartPolicy(Schema):
+    """When a lost session is tried again."""
+
+    first_delay: Annotated[float, Field(ge=0)] = 0.1
+    """Seconds before the first retry."""
+    factor: Annotated[float, Field(ge=1)] = 1.6
+    max_delay: Annotated[float, Field(gt=0)] = 1.0
+    """Greatest seconds between two tries: a replugged device is back within this time."""
+    jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.1
+    """Share of the delay that is drawn at random, so that devices of one hub do not start together."""
+    settled_after: Annotated[float, Field(ge=0)] = 5.0
+    """Seconds of work after which the delay starts from the first one again."""
+    budget: Annotated[int, Field(ge=1)] | None = None
+    """Restarts allowed within ``window`` seconds before the service is given up; None = never give up."""
+    window: Annotated[float, Field(gt=0)] = 60.0
+
+
+HealthSink = Callable[[ServiceHealth], None]
+
+
+async def supervise(
+    service: Service,
+    policy: RestartPolicy,
+    clock: Clock,
+    report: HealthSink,
+    rng: np.random.Generator,
+    on_bug: OnBug = OnBug.FAIL,
+) -> None:
+    """Run ``service`` again and again by ``policy`` until cancelled, reporting its health.
+
+    Args:
+        service: what to run.
+        policy: delays and budget.
+        clock: time.
+        report: gets a row whenever the state changes.
+        rng: source of the jitter.
+        on_bug: whether an exception outside the error tree is raised or fails this service alone.
+
+    Raises:
+        Exception: a bug, when ``on_bug`` is ``EXIT``.
+    """
+    session = _Session(service.name, clock, report)
+    restarts: deque[int] = deque()
+    delay = policy.first_delay
+    while True:
+        session.start()
+        try:
+            await service.run(session.ready)
+        except asyncio.CancelledError:
+            session.tell(ServiceState.STOPPED)
+            raise
+        except TruckError as error:
+            lost = error
+        except Exception:
+            session.tell(ServiceState.FAILED, Reason.INTERNAL, "unexpected exception, see the log")
+            log.exception("%s: bug", service.name)
+            if on_bug is OnBug.EXIT:
+                raise
+            return
+        else:
+            session.tell(ServiceState.STOPPED)
+            return
+
+        detail = str(lost) or type(lost).__name__
+        # The first failure of an outage is news, its repetitions are not.
+        log.log(logging.WARNING if session.ready_at is not None else logging.DEBUG, "%s: %s", service.name, detail)
+        now = clock.now()
+        restarts.append(now)
+        while now - restarts[0] > policy.window * SECOND:
+            restarts.popleft()
+        exhausted = policy.budget is not None and len(restarts) > policy.budget
+        if exhausted or isinstance(lost, DeviceMismatchError):
+            session.tell(ServiceState.FAILED, lost.reason, detail)
+            log.error("%s: given up: %s", service.name, detail)
+            return
+        if session.ready_at is not None and now - session.ready_at >= policy.settled_after * SECOND:
+            delay = policy.first_delay
+        session.tell(ServiceState.BACKOFF, lost.reason, detail)
+        await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
+        delay = min(delay * policy.factor, policy.max_delay)
+
+
+class _Session:
+    """Health bookkeeping of the service's present run."""
+
+    def __init__(self, name: str, clock: Clock, report: HealthSink) -> None:
+        self._name = name
+        self._clock = clock
+        self._report = report
+        self._starts = 0
+        self.ready_at: int | None = None
+
+    def start(self) -> None:
+        self._starts += 1
+        self.ready_at = None
+        self.tell(ServiceState.STARTING)
+
+    def ready(self) -> None:
+        if self.ready_at is None:
+            self.ready_at = self._clock.now()
+            self.tell(ServiceState.READY)
+            log.info("%s: ready", self._name)
+
+    def tell(self, state: ServiceState, reason: Reason = Reason.OK, detail: str = "") -> None:
+        self._report(
+            ServiceHealth(
+                name=self._name,
+                state=state,
+                since=self._clock.now(),
+                restarts=self._starts - 1,
+                reason=reason,
+                detail=detail,
+            )
+        )

@@ -1,0 +1,96 @@
+"""Foundations of every message: strict frozen models, read-only arrays, one header.
+
+Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z up) and REP 105
+(map > odom > base > sensors). A value that is absent is ``None``, never NaN.
+"""
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, WithJsonSchema
+
+
+class Schema(BaseModel):
+    """A strict, frozen record; unknown fields are refused when constructed, ignored on the wire."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        strict=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+        use_attribute_docstrings=True,
+    )
+
+    def __eq__(self, other: object) -> bool:
+        """Fieldwise equality that also compares arrays by value."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(_equal(a, b) for a, b in zip(self.__dict__.values(), other.__dict__.values(), strict=True))
+
+    __hash__ = None  # type: ignore[assignment]  # messages carry arrays
+
+
+def _equal(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b)
+    return bool(a == b)
+
+
+def _frozen_array(dtype: type[np.generic]) -> BeforeValidator:
+    def freeze(value: Any) -> NDArray[Any]:
+        array = np.asarray(value, dtype=dtype)
+        if array.flags.writeable:
+            array = array.copy() if isinstance(value, np.ndarray) else array
+            array.flags.writeable = False
+        return array
+
+    return BeforeValidator(freeze)
+
+
+def _array_type(dtype: type[np.generic], json_item: str) -> Any:
+    return (
+        _frozen_array(dtype),
+        PlainSerializer(lambda a: a.tolist(), when_used="json"),
+        WithJsonSchema({"type": "array", "items": {"type": json_item}}),
+    )
+
+
+Float64Array = Annotated[NDArray[np.float64], *_array_type(np.float64, "number")]
+"""Read-only float64 array; JSON: list of numbers. May hold +inf for "no return" only where stated."""
+UInt8Array = Annotated[NDArray[np.uint8], *_array_type(np.uint8, "integer")]
+Int8Array = Annotated[NDArray[np.int8], *_array_type(np.int8, "integer")]
+
+Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+"""Nanoseconds of CLOCK_MONOTONIC (of the daemon's clock: wall, virtual or replay)."""
+FrameId = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
+
+
+class Message(Schema):
+    """Header shared by every topic."""
+
+    stamp: Nanoseconds
+    """When the measurement was true, mapped from the sensor's clock where it has one."""
+    received: Nanoseconds
+    """When the daemon had all bytes of it."""
+    seq: Annotated[int, Field(ge=0, lt=2**63)]
+    """Counts messages of this topic since the daemon started; a gap is a loss."""
+    frame: FrameId = "base"
+    """Coordinate frame the values are expressed in."""
+
+
+class Pose2D(Schema):
+    """Planar pose in the message's frame: metres, radians (counter-clockwise positive)."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+class Twist2D(Schema):
+    """Planar velocity in the base frame: m/s, m/s, rad/s."""
+
+    vx: float
+    vy: float
+    wz: float

@@ -1,0 +1,36 @@
+"""Messages of the ``plan`` group: paths, tracker progress, and the planners' wishes to the gate."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Float64Array, Message
+from monstertruck_schemas.reasons import Reason
+
+
+class Path(Message):
+    """Poses to be driven in order, expressed in ``frame``."""
+
+    poses: Float64Array
+    """Shape (3 n,), row-major (x, y, yaw) rows: m, m, rad."""
+    directions: Float64Array
+    """Shape (n,): +1 where the truck arrives forward, -1 backward; empty = all forward."""
+    closed: bool = False
+    """A closed path is a lap: it ends where it began."""
+    name: str = ""
+
+
+class TrackerState(Message):
+    """How well the tracker follows its path."""
+
+    path: str = ""
+    cross_track: float
+    """Signed distance from the path, left positive, m."""
+    heading_error: float
+    """Rad."""
+    along: Annotated[float, Field(ge=0)]
+    """Metres driven along the path."""
+    length: Annotated[float, Field(ge=0)]
+    """Metres of the whole path."""
+    outcome: Reason
+    """DRIVING, GOAL_REACHED, PATH_LOST ..."""

@@ -1,0 +1,83 @@
+"""One enum of reason codes, shared by gate, services, RPC, events and CLI exit codes.
+
+Members only ever get added; a value or an exit code is never reused.
+"""
+
+from enum import StrEnum
+from typing import Self
+
+
+class Reason(StrEnum):
+    """Why something happened, was refused or ended; ``exit_code`` is what the CLI returns for it."""
+
+    exit_code: int
+    text: str
+
+    def __new__(cls, value: str, exit_code: int, text: str) -> Self:
+        """Build a member from its wire value, exit code and one-line explanation."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.exit_code = exit_code
+        member.text = text
+        return member
+
+    # Outcomes
+    OK = "ok", 0, "done as asked"
+    INTERNAL = "internal", 1, "a bug: see the log"
+    BAD_CONFIG = "bad_config", 2, "configuration refused"
+    BAD_INPUT = "bad_input", 3, "input refused"
+    NOT_FOUND = "not_found", 4, "no such file, key or robot"
+    TIMEOUT = "timeout", 5, "no answer in time"
+    CANCELLED = "cancelled", 6, "ended by the user"
+    GOAL_REACHED = "goal_reached", 0, "path driven to its end"
+    BUSY = "busy", 7, "in use by another process or caller"
+    DISK_FULL = "disk_full", 8, "no space left to record"
+    LOG_DAMAGED = "log_damaged", 9, "log is truncated or damaged"
+
+    # Devices
+    DEVICE_LOST = "device_lost", 20, "device unplugged or its port vanished"
+    DEVICE_TIMEOUT = "device_timeout", 21, "device does not answer"
+    DEVICE_PROTOCOL = "device_protocol", 22, "device answers against its protocol"
+    DEVICE_WRONG = "device_wrong", 23, "another device answers on this port"
+    DEVICE_FAULT = "device_fault", 24, "device reports a fault of its own"
+    DEVICE_MISMATCH = "device_mismatch", 25, "device's parameters differ from the configuration"
+    DEVICE_BUSY = "device_busy", 26, "port is held by another process"
+    DEVICE_READY = "device_ready", 0, "device is up"
+
+    # Gate
+    DISARMED = "disarmed", 40, "the truck is disarmed"
+    ESTOPPED = "estopped", 41, "emergency stop is latched"
+    ESTOP_REQUESTED = "estop_requested", 42, "emergency stop was asked for"
+    LEASE_EXPIRED = "lease_expired", 43, "no fresh drive request within its lease"
+    LOWER_PRIORITY = "lower_priority", 44, "a source of higher priority is driving"
+    BAD_NONCE = "bad_nonce", 45, "request is for another run of the robot"
+    BAD_SEQUENCE = "bad_sequence", 46, "request is older than one already seen"
+    BAD_ROLE = "bad_role", 47, "this role may not ask for that"
+    NOT_FINITE = "not_finite", 48, "request holds NaN or infinity"
+    SCAN_STALE = "scan_stale", 49, "no fresh lidar scan"
+    DRIVE_STALE = "drive_stale", 50, "no fresh drive feedback"
+    STEERING_STALE = "steering_stale", 51, "no fresh steering feedback"
+    ATTITUDE_STALE = "attitude_stale", 52, "no fresh attitude"
+    TILT_SLOW = "tilt_slow", 53, "tilted: speed limited"
+    TILT_STOP = "tilt_stop", 54, "dangerous tilt"
+    OBSTACLE_SLOW = "obstacle_slow", 55, "obstacle ahead: speed limited"
+    OBSTACLE_STOP = "obstacle_stop", 56, "obstacle within the stopping distance"
+    BATTERY_LOW = "battery_low", 57, "battery low: speed limited"
+    BATTERY_CRITICAL = "battery_critical", 58, "battery critical"
+    BATTERY_STALE = "battery_stale", 59, "no fresh battery voltage"
+    CLIPPED = "clipped", 60, "request beyond the limits, clipped keeping its curvature"
+    TICK_STALLED = "tick_stalled", 61, "the control tick came too late"
+    DRIVE_FAULT = "drive_fault", 62, "drive controller is in fault"
+    SERVICE_FAILED = "service_failed", 63, "a service failed"
+    NOT_ARMED_SPEED = "not_armed_speed", 64, "arming refused: the truck or the stick is not at rest"
+    SHUTDOWN = "shutdown", 65, "the daemon is stopping"
+    ARMED = "armed", 0, "armed"
+    DRIVING = "driving", 0, "driving"
+    STOPPED = "stopped", 0, "at standstill"
+
+    # Services and workers
+    WORKER_TIMEOUT = "worker_timeout", 80, "worker missed its deadline and was killed"
+    WORKER_DIED = "worker_died", 81, "worker process ended by itself"
+    CLOCK_STEPPED = "clock_stepped", 82, "real time was stepped"
+    MESSAGES_DROPPED = "messages_dropped", 83, "a bounded queue overflowed"
+    PATH_LOST = "path_lost", 84, "truck is too far from its path"

@@ -1,0 +1,129 @@
+"""Messages of the ``sensor`` group: what the devices measured, in SI units, before any estimation."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Float64Array, Message, Schema, UInt8Array
+
+
+class LaserScan(Message):
+    """One lidar revolution, counter-clockwise, beam i at ``start_angle + i * angle_increment``.
+
+    ``stamp`` is the time of the FIRST beam in ``ranges``; beam i is ``i * time_increment`` later.
+    """
+
+    start_angle: float
+    """Angle of the first beam, rad."""
+    end_angle: float
+    """Angle of the last beam, rad."""
+    time_increment: Annotated[float, Field(ge=0)]
+    """Seconds between neighbouring beams."""
+    scan_time: Annotated[float, Field(gt=0)]
+    """Seconds of one revolution."""
+    range_min: Annotated[float, Field(ge=0)]
+    """Least range the sensor can measure, m."""
+    range_max: Annotated[float, Field(gt=0)]
+    """Greatest range the sensor can measure, m."""
+    ranges: Float64Array
+    """Shape (n,), m; +inf where the beam has no valid return (see ``codes``)."""
+    codes: UInt8Array
+    """Shape (n,); 255 = valid, otherwise the sensor's own error code (devices' manual)."""
+
+    @property
+    def angle_increment(self) -> float:
+        """Angle between neighbouring beams, rad."""
+        return (self.end_angle - self.start_angle) / max(len(self.ranges) - 1, 1)
+
+
+VALID_BEAM = 255
+"""``LaserScan.codes`` value of a beam that measured a range."""
+
+
+class Vector3(Schema):
+    """Three components in the message's frame."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Attitude(Message):
+    """Compass with tilt sensor."""
+
+    heading: Annotated[float, Field(ge=0, lt=6.2831853072)]
+    """Heading clockwise from magnetic north, rad, exactly as the device means it."""
+    roll: float
+    """Rotation about x (REP 103: left side up is positive), rad."""
+    pitch: float
+    """Rotation about y (REP 103: nose DOWN is positive), rad."""
+    temperature: float | None = None
+    """Board temperature, degree Celsius; crude."""
+    magnetic_field: Vector3 | None = None
+    """Magnetometer, microtesla where the unit was calibrated so."""
+    acceleration: Vector3 | None = None
+    """Accelerometer, m/s^2."""
+    heading_disturbed: bool = False
+    """Field strength differs from the calibrated one: do not trust the heading."""
+    tilt_valid: bool = True
+    """False while the acceleration is not near 1 g: roll and pitch are then not tilt."""
+
+
+class DriveMode(StrEnum):
+    """DS402 power states, folded to what the robot cares about."""
+
+    DISABLED = "disabled"
+    STARTING = "starting"
+    ENABLED = "enabled"
+    QUICK_STOP = "quick_stop"
+    FAULT = "fault"
+
+
+class DriveFeedback(Message):
+    """Drive motor as its controller reports it, at the MOTOR shaft, sign as in the robot (forward positive)."""
+
+    position: float
+    """Motor shaft angle since start, rad, unwrapped."""
+    velocity: float
+    """Motor shaft speed, rad/s: averaged by the controller."""
+    current: float | None = None
+    """Motor current, A; None in messages that did not read it."""
+    mode: DriveMode
+    fault_code: int | None = None
+    """Newest entry of the controller's error history while in fault."""
+    supply_voltage: float | None = None
+
+
+class SteeringFeedback(Message):
+    """Pulses the servo controller sends now, as servo angles; NOT a measured horn position."""
+
+    front: float
+    """Front servo angle, rad, left positive, 0 = straight ahead."""
+    rear: float
+    """Rear servo angle, rad, left positive, 0 = straight ahead."""
+    error_word: int = 0
+    """Non-zero: the controller reported errors since the last read (its own bits)."""
+    trusted: bool = True
+    """False while the targets have to be sent again after an error or a restart."""
+
+
+class BatteryLevel(StrEnum):
+    """Judgement of the battery with hysteresis and dwell."""
+
+    UNKNOWN = "unknown"
+    NORMAL = "normal"
+    LOW = "low"
+    CRITICAL = "critical"
+    SENSOR_FAULT = "sensor_fault"
+
+
+class Battery(Message):
+    """Pack voltage and its judgement."""
+
+    voltage: float | None
+    """Filtered pack voltage, V; None while the sensor is at fault."""
+    raw_voltage: float
+    """Newest single sample, V."""
+    cells: int
+    level: BatteryLevel

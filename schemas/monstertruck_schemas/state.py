@@ -1,0 +1,112 @@
+"""Messages of the ``state`` group: what the robot believes and in which state it is."""
+
+from enum import StrEnum
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import (
+    Float64Array,
+    FrameId,
+    Int8Array,
+    Message,
+    Nanoseconds,
+    Pose2D,
+    Schema,
+    Twist2D,
+)
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+
+
+class Odometry(Message):
+    """Pose of ``child`` in ``frame`` with velocity and covariance."""
+
+    child: FrameId = "base"
+    pose: Pose2D
+    twist: Twist2D
+    pose_covariance: Float64Array
+    """Shape (9,), row-major covariance of (x, y, yaw): m^2, m rad, rad^2."""
+    twist_covariance: Float64Array
+    """Shape (9,), row-major covariance of (vx, vy, wz)."""
+    age: Annotated[float, Field(ge=0)]
+    """Seconds since the newest drive reading this estimate rests on; the rest is predicted."""
+    sources: tuple[str, ...] = ()
+    """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        if self.pose_covariance.shape != (9,) or self.twist_covariance.shape != (9,):
+            msg = "covariances must have shape (9,)"
+            raise ValueError(msg)
+        return self
+
+
+class Transform(Schema):
+    """Pose of ``child`` in ``parent``."""
+
+    parent: FrameId
+    child: FrameId
+    stamp: Nanoseconds
+    translation: tuple[float, float, float]
+    """Metres."""
+    rotation: tuple[float, float, float, float]
+    """Unit quaternion x, y, z, w."""
+
+
+class Transforms(Message):
+    """The whole frame tree, static mounts included."""
+
+    transforms: tuple[Transform, ...]
+
+
+class Grid(Message):
+    """Occupancy grid: row 0 is the lowest y, column 0 the lowest x."""
+
+    resolution: Annotated[float, Field(gt=0)]
+    """Metres per cell."""
+    width: Annotated[int, Field(gt=0)]
+    height: Annotated[int, Field(gt=0)]
+    origin: Pose2D
+    """Pose of the outer corner of cell (0, 0)."""
+    cells: Int8Array
+    """Shape (height * width,): -1 unknown, 0 free ... 100 occupied."""
+
+
+class ClockOffset(Message):
+    """Real time = daemon time + offset."""
+
+    offset: Nanoseconds
+    stepped: Nanoseconds = 0
+    """Size of the step since the message before; 0 when none."""
+
+
+class GateMode(StrEnum):
+    """States of the safety gate."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    DRIVING = "driving"
+    STOPPING = "stopping"
+    ESTOPPED = "estopped"
+
+
+class GateState(Message):
+    """The safety gate: who drives, what limits apply and why. Retained; also acknowledges requests."""
+
+    mode: GateMode
+    nonce: str
+    """Changes at every start of the daemon; requests must carry it."""
+    holder: str | None = None
+    """Source that is driving."""
+    role: Role | None = None
+    lease_left: float | None = None
+    """Seconds until the holder's lease runs out."""
+    last_seq: int | None = None
+    """Newest accepted sequence number of the holder."""
+    speed_limit: float
+    """Speed allowed now, m/s."""
+    reasons: tuple[Reason, ...] = ()
+    """Everything that limits or stops the truck now, worst first."""
+    stopping_distance: float = 0.0
+    """Metres the truck would still travel if stopped now."""

@@ -1,0 +1,135 @@
+"""The topic table: one row per key. Bus, recorder, health, access rules and docs are derived from it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, Generic, TypeVar
+
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth
+from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
+from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, Transforms
+
+M = TypeVar("M", bound=Message)
+
+KEY_ROOT: Final = "mt"
+
+
+class Writer(StrEnum):
+    """Who may publish a topic; the bus refuses everybody else."""
+
+    DRIVER = "driver"
+    ESTIMATION = "estimation"
+    PLANNER = "planner"
+    GATE = "gate"
+    DAEMON = "daemon"
+    OUTSIDE = "outside"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic(Generic[M]):
+    """One row: what is published under ``mt/<robot>/<name>``, how often, by whom, and who keeps it."""
+
+    name: str
+    model: type[M]
+    writer: Writer
+    doc: str
+    rate: float | None = None
+    """Nominal rate in Hz; None = on change."""
+    stale_after: float | None = None
+    """Seconds after which the newest message no longer counts."""
+    logged: bool = True
+    retained: bool = False
+    """Late joiners get the newest message at once."""
+    foxglove: str | None = None
+    """Well-known protobuf schema it travels as; None = JSON with JSON Schema."""
+
+    @property
+    def group(self) -> str:
+        """First part of the name: sensor, state, plan, cmd, health, event or req."""
+        return self.name.partition("/")[0]
+
+    @property
+    def schema_name(self) -> str:
+        """Name of the wire schema."""
+        return self.foxglove or f"monstertruck.{self.model.__name__}"
+
+    def key(self, robot: str) -> str:
+        """Zenoh key expression of this topic on ``robot``."""
+        return f"{KEY_ROOT}/{robot}/{self.name}"
+
+
+W = Writer
+
+SCAN: Final = Topic("sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, 0.35, foxglove="foxglove.LaserScan")
+COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, 0.3)
+DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.25)
+STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.3)
+BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
+
+ODOMETRY: Final = Topic(
+    "state/odometry",
+    Odometry,
+    W.ESTIMATION,
+    "Dead-reckoned pose in odom",
+    50,
+    0.1,
+    foxglove="foxglove.PoseInFrame",
+)
+POSE: Final = Topic("state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, 0.1, foxglove="foxglove.PoseInFrame")
+TRANSFORMS: Final = Topic(
+    "state/transforms",
+    Transforms,
+    W.ESTIMATION,
+    "Frame tree, static mounts included",
+    10,
+    retained=True,
+    foxglove="foxglove.FrameTransforms",
+)
+MAP: Final = Topic("state/map", Grid, W.ESTIMATION, "Occupancy grid", 0.5, retained=True, foxglove="foxglove.Grid")
+GATE: Final = Topic(
+    "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, 0.5, retained=True
+)
+CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daemon time", 1, retained=True)
+
+PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
+TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 10, 0.5)
+PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The tracker's wish to the gate", 20, 0.3)
+
+CMD_DRIVE: Final = Topic("cmd/drive", DriveCommand, W.GATE, "Command sent to the drive controller", 50, 0.1)
+CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command sent to the servos", 50, 0.1)
+
+HEALTH: Final = Topic("health/services", HealthTable, W.DAEMON, "Every service's state", 1, 3.0, retained=True)
+LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, 3.0)
+RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, 3.0, retained=True)
+
+EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
+
+REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, 0.3)
+REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")
+REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
+REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off board")
+
+TOPICS: Final[tuple[Topic[Message], ...]] = tuple(
+    value for value in list(globals().values()) if isinstance(value, Topic)
+)
+BY_NAME: Final[dict[str, Topic[Message]]] = {topic.name: topic for topic in TOPICS}
+
+
+def topics_of(group: str) -> Iterator[Topic[Message]]:
+    """All rows of one group."""
+    return (topic for topic in TOPICS if topic.group == group)
+
+
+def rpc_key(robot: str, name: str) -> str:
+    """Key of a queryable."""
+    return f"{KEY_ROOT}/{robot}/rpc/{name}"
+
+
+def alive_key(robot: str) -> str:
+    """Key of the robot's liveliness token."""
+    return f"{KEY_ROOT}/{robot}/alive"

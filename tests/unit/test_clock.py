@@ -1,0 +1,67 @@
+"""The virtual loop jumps; deadlines, ordering and determinism hold on it."""
+
+import asyncio
+
+import pytest
+from monstertruck_runtime.clock import SECOND, ReplayClock, VirtualClock, WallClock, run_replay, run_virtual
+
+
+def test_an_hour_of_sleep_takes_no_time_and_wakes_on_time():
+    async def main(clock: VirtualClock) -> int:
+        start = clock.now()
+        await clock.sleep(3600)
+        return clock.now() - start
+
+    slept = run_virtual(main)
+    assert 3600 * SECOND <= slept < 3600 * SECOND + 1000
+
+
+def test_interleaving_is_identical_in_two_runs():
+    async def main(clock: VirtualClock) -> list[tuple[str, int]]:
+        log: list[tuple[str, int]] = []
+
+        async def beat(name: str, period: int) -> None:
+            due = clock.now()
+            for _ in range(50):
+                due += period
+                await clock.sleep_until(due)
+                log.append((name, clock.now()))
+
+        await asyncio.gather(beat("a", 20_000_000), beat("b", 30_000_000), beat("c", 7_000_000))
+        return log
+
+    assert run_virtual(main) == run_virtual(main)
+
+
+def test_deadline_raises_inside():
+    async def main(clock: VirtualClock) -> int:
+        start = clock.now()
+        with pytest.raises(TimeoutError):
+            async with clock.deadline(1.5):
+                await clock.sleep(10)
+        return clock.now() - start
+
+    assert run_virtual(main) == pytest.approx(1.5 * SECOND, abs=10)
+
+
+def test_sleep_until_the_past_returns_at_once():
+    async def main(clock: VirtualClock) -> int:
+        await clock.sleep_until(clock.now() - 5)
+        return clock.now()
+
+    assert run_virtual(main, start=77) == 77
+
+
+def test_replay_clock_starts_at_the_log_and_keeps_its_real_time():
+    async def main(clock: ReplayClock) -> tuple[int, int]:
+        return clock.now(), clock.real_offset()
+
+    assert run_replay(main, start=123, real_offset=5, rate=None) == (123, 5)
+
+
+async def test_wall_clock_is_monotonic_and_knows_real_time():
+    clock = WallClock()
+    before = clock.now()
+    await clock.sleep(0.01)
+    assert clock.now() - before >= 9_000_000
+    assert clock.now() + clock.real_offset() > 1_700_000_000 * SECOND
