@@ -198,7 +198,7 @@ class SerialPort:
             raise self._open_error(error) from error
         except (OSError, termios.error) as error:
             raise DeviceLostError(f"{self.name}: {error}") from error
-        link = protocol.own(transport)
+        link: Link = protocol.own(transport)
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(transport.serial.fileno(), termios.TCIOFLUSH)
         return link
