@@ -1,0 +1,128 @@
+"""Set up everything on a bare machine, then run the demo or the tests.
+
+Uses nothing but Python's standard library: no pip, no venv module, no root. It fetches the pinned ``uv`` from the
+package index (checked by sha256), lets it build ``.venv`` beside ``pyproject.toml`` from the committed lock file,
+and runs the command there. A second run finds everything in place.
+
+    python3 -m monstertruckd.bootstrap demo     the truck drives a lap
+    python3 -m monstertruckd.bootstrap check    lint, types, import contracts, all tests
+"""
+
+import hashlib
+import io
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import urllib.parse
+import urllib.request
+import zipfile
+from pathlib import Path
+
+UV_VERSION = "0.13.8"
+UV_SHA256 = {
+    "x86_64": "e18a57b8b352eb7c8feb317b9f6f533c8f0ad9673fd6cf34bbe3cf1a9f6a8984",
+    "aarch64": "0b3e8b1a4f5e405e31e2ff33de8af4744831e9f7338539671efbd8c3c94e791d",
+}
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+COVERED = (
+    "schemas/monstertruck_schemas/*",
+    "drivers/monstertruck_drivers/*/protocol.py",
+    "monstertruckd/gate/*",
+)
+EXTRAS = {"demo": ("robot", "sim", "plot"), "check": ("dev",), "sync": ("dev",)}
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point; returns the exit code of what was run."""
+    if sys.version_info < (3, 11):
+        print(f"Python 3.11 or newer is needed; this is {platform.python_version()}.", file=sys.stderr)
+        return 2
+    if not arguments or arguments[0] not in EXTRAS:
+        print(__doc__)
+        return 0 if arguments[:1] in ([], ["-h"], ["--help"]) else 2
+    command, *rest = arguments
+    sync(EXTRAS[command])
+    if command == "demo":
+        return run(VENV / "bin" / "monstertruckd", "demo", *rest)
+    if command == "check":
+        return check(rest)
+    return 0
+
+
+def sync(extras: tuple[str, ...]) -> None:
+    """Create or update ``.venv`` with the locked packages of ``extras``; leaves other extras in place."""
+    flags = [flag for extra in extras for flag in ("--extra", extra)]
+    command = [find_uv(), "sync", "--frozen", "--inexact", "--quiet", "--python", sys.executable, *flags]
+    environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
+    subprocess.run(command, cwd=ROOT, env=environment, check=True)
+
+
+def find_uv() -> str:
+    """Path of a usable ``uv``: the machine's own, or the pinned one, fetched once into the user's cache."""
+    if own := shutil.which("uv"):
+        return own
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "monstertruckd"
+    target = cache / f"uv-{UV_VERSION}"
+    if not target.exists():
+        print(f"Fetching uv {UV_VERSION} ...", file=sys.stderr)
+        cache.mkdir(parents=True, exist_ok=True)
+        scratch = target.with_suffix(f".{os.getpid()}")
+        scratch.write_bytes(fetch_uv())
+        scratch.chmod(0o755)
+        scratch.replace(target)
+    return str(target)
+
+
+def fetch_uv() -> bytes:
+    """Download the pinned wheel from the package index, compare its sha256, and take the program out of it."""
+    machine = platform.machine()
+    if machine not in UV_SHA256 or platform.libc_ver()[0] != "glibc":
+        raise SystemExit(f"{machine} is not supported: x86_64 and aarch64 Linux with glibc >= 2.28 are.")
+    index = os.environ.get("UV_DEFAULT_INDEX") or os.environ.get("PIP_INDEX_URL") or "https://pypi.org/simple"
+    page_url = f"{index.rstrip('/')}/uv/"
+    with urllib.request.urlopen(page_url, timeout=60) as reply:
+        page = reply.read().decode()
+    pattern = rf'href="([^"#]*/uv-{re.escape(UV_VERSION)}-[^"#]*)#sha256={UV_SHA256[machine]}"'
+    found = re.search(pattern, page)
+    if found is None:
+        raise SystemExit(f"{page_url} does not list the pinned uv {UV_VERSION} for {machine}.")
+    with urllib.request.urlopen(urllib.parse.urljoin(page_url, found[1]), timeout=300) as reply:
+        wheel = reply.read()
+    if hashlib.sha256(wheel).hexdigest() != UV_SHA256[machine]:
+        raise SystemExit(f"uv {UV_VERSION}: what {found[1]} sent has another sha256; not used.")
+    with zipfile.ZipFile(io.BytesIO(wheel)) as archive:
+        name = next(name for name in archive.namelist() if name.endswith("/scripts/uv"))
+        return archive.read(name)
+
+
+def run(program: Path, *arguments: str) -> int:
+    """Run a program of the environment from the project's root."""
+    return subprocess.run([str(program), *arguments], cwd=ROOT, check=False).returncode
+
+
+def check(arguments: list[str]) -> int:
+    """All checks, cheapest first; stops at the first that fails. ``arguments`` go to pytest."""
+    tools = VENV / "bin"
+    steps = [
+        (tools / "ruff", "check", "."),
+        (tools / "ruff", "format", "--check", "."),
+        (tools / "mypy",),
+        (tools / "lint-imports",),
+        (tools / "pytest", "-n", "2", "-m", "not wall and not virtual", "--cov", "--cov-report=", *arguments),
+        (tools / "coverage", "report", f"--include={','.join(COVERED)}", "--fail-under=95", "--skip-covered"),
+        (tools / "pytest", "-n", "2", "-m", "virtual", *arguments),
+        (tools / "pytest", "-m", "wall", *arguments),
+    ]
+    for program, *rest in steps:
+        print(f"==> {program.name} {' '.join(rest)}", flush=True)
+        if code := run(program, *rest):
+            return code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
