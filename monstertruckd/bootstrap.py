@@ -38,7 +38,7 @@ EXTRAS = {"demo": ("robot", "sim", "plot"), "check": ("dev",), "sync": ("dev",)}
 
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit code of what was run."""
-    if sys.version_info < (3, 11):
+    if sys.version_info < (3, 11):  # noqa: UP036  # this file also runs where nothing is installed yet
         print(f"Python 3.11 or newer is needed; this is {platform.python_version()}.", file=sys.stderr)
         return 2
     if not arguments or arguments[0] not in EXTRAS:
@@ -56,7 +56,17 @@ def main(arguments: list[str]) -> int:
 def sync(extras: tuple[str, ...]) -> None:
     """Create or update ``.venv`` with the locked packages of ``extras``; leaves other extras in place."""
     flags = [flag for extra in extras for flag in ("--extra", extra)]
-    command = [find_uv(), "sync", "--frozen", "--inexact", "--quiet", "--python", sys.executable, *flags]
+    command = [
+        find_uv(),
+        "sync",
+        "--frozen",
+        "--inexact",
+        "--quiet",
+        "--system-certs",
+        "--python",
+        sys.executable,
+        *flags,
+    ]
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
 
