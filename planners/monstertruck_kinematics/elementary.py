@@ -1,0 +1,159 @@
+"""Elementary functions that take a float or an array alike.
+
+Floats go through ``math`` (fast enough for a control tick), arrays through numpy.
+"""
+
+import math
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.errors import KinematicsError
+
+Array = NDArray[np.float64]
+Real = TypeVar("Real", float, Array)
+"""A float, or an array of any shape; every argument of one call is of one kind or broadcasts."""
+
+
+def sin(x: Real) -> Real:
+    """Sine."""
+    if isinstance(x, np.ndarray):
+        return np.sin(x)
+    return math.sin(x)
+
+
+def cos(x: Real) -> Real:
+    """Cosine."""
+    if isinstance(x, np.ndarray):
+        return np.cos(x)
+    return math.cos(x)
+
+
+def tan(x: Real) -> Real:
+    """Tangent."""
+    if isinstance(x, np.ndarray):
+        return np.tan(x)
+    return math.tan(x)
+
+
+def atan(x: Real) -> Real:
+    """Arc tangent in (-pi/2, pi/2)."""
+    if isinstance(x, np.ndarray):
+        return np.arctan(x)
+    return math.atan(x)
+
+
+def atan2(y: Real, x: Real) -> Real:
+    """Angle of (x, y) in [-pi, pi]."""
+    if isinstance(y + x, np.ndarray):
+        return np.arctan2(y, x)
+    return math.atan2(y, x)
+
+
+def asin(x: Real) -> Real:
+    """Arc sine in [-pi/2, pi/2]."""
+    if isinstance(x, np.ndarray):
+        return np.arcsin(x)
+    return math.asin(x)
+
+
+def sqrt(x: Real) -> Real:
+    """Square root."""
+    if isinstance(x, np.ndarray):
+        return np.sqrt(x)
+    return math.sqrt(x)
+
+
+def hypot(x: Real, y: Real) -> Real:
+    """Length of (x, y)."""
+    if isinstance(x + y, np.ndarray):
+        return np.hypot(x, y)
+    return math.hypot(x, y)
+
+
+def sign(x: Real) -> Real:
+    """+1 for x >= 0 (and +0.0), -1 otherwise: never 0, so that a product keeps its size."""
+    if isinstance(x, np.ndarray):
+        return np.copysign(1.0, x)
+    return math.copysign(1.0, x)
+
+
+def clip(x: Real, low: Real | float, high: Real | float) -> Real:
+    """X limited to [low, high]."""
+    return smaller(larger(x, low), high)
+
+
+def larger(a: Real, b: Real | float) -> Real:
+    """Maximum, element by element."""
+    if isinstance(a + b, np.ndarray):
+        return np.maximum(a, b)
+    return max(a, b)
+
+
+def smaller(a: Real, b: Real | float) -> Real:
+    """Minimum, element by element."""
+    if isinstance(a + b, np.ndarray):
+        return np.minimum(a, b)
+    return min(a, b)
+
+
+def sinc(x: Real) -> Real:
+    """sin(x)/x, 1 at 0."""
+    if isinstance(x, np.ndarray):
+        return np.sinc(x / np.pi)
+    return math.sin(x) / x if abs(x) > 1e-4 else 1.0 - x * x / 6.0
+
+
+def polynomial(coefficients: tuple[float, ...], x: Real) -> Real:
+    """Value of the polynomial at x, highest power first (Horner)."""
+    value = 0.0 * x + coefficients[0]
+    for coefficient in coefficients[1:]:
+        value = value * x + coefficient
+    return value
+
+
+def require_finite(name: str, x: Real) -> None:
+    """Refuse NaN and infinity.
+
+    Raises:
+        KinematicsError: naming the argument, and the first bad element of an array.
+    """
+    if isinstance(x, np.ndarray):
+        if not np.isfinite(x).all():
+            first = int(np.flatnonzero(~np.isfinite(x))[0])
+            raise KinematicsError(f"{name}[{first}] is {x.flat[first]}: expected a finite number")
+    elif not math.isfinite(x):
+        raise KinematicsError(f"{name} is {x}: expected a finite number")
+
+
+def require_within(name: str, x: Real, low: float, high: float) -> None:
+    """Refuse values outside [low, high], NaN included.
+
+    Raises:
+        KinematicsError: naming the argument, the value and the range.
+    """
+    if isinstance(x, np.ndarray):
+        bad = ~((x >= low) & (x <= high))
+        if bad.any():
+            first = int(np.flatnonzero(bad)[0])
+            raise KinematicsError(f"{name}[{first}] is {x.flat[first]}: expected {low:.6g} to {high:.6g}")
+    elif not low <= x <= high:
+        raise KinematicsError(f"{name} is {x}: expected {low:.6g} to {high:.6g}")
+
+
+def require_positive(name: str, value: float) -> None:
+    """Refuse a length, ratio or count that is not finite and above zero.
+
+    Raises:
+        KinematicsError: naming the field.
+    """
+    if not (math.isfinite(value) and value > 0.0):
+        raise KinematicsError(f"{name} is {value}: expected a finite number above 0")
+
+
+def any_zero(x: Real) -> bool:
+    """Whether x, or any element of it, is exactly 0."""
+    if isinstance(x, np.ndarray):
+        return not x.all()
+    return x == 0.0

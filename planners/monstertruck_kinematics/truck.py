@@ -1,0 +1,276 @@
+"""The truck: drivetrain, fitted steering and four-wheel-steer kinematics (thesis eqs. 2.1 and 2.27-2.56, corrected).
+
+Frames: x forward, y left, angles positive to the left, rad. Wheels are ordered front left, front right, rear left,
+rear right. Speed is signed along the direction of travel of the reference point C. Everything is in curvature form:
+straight ahead and crab are no special cases. Every function takes floats or arrays.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from monstertruck_kinematics.elementary import (
+    Real,
+    any_zero,
+    asin,
+    atan,
+    clip,
+    cos,
+    hypot,
+    larger,
+    require_finite,
+    require_positive,
+    require_within,
+    sign,
+    smaller,
+    tan,
+)
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.motion import integrate
+from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
+
+__all__ = ["AxlePolynomials", "DriveTrain", "FourWheelSteering", "Mode", "SteeringPolynomials", "integrate"]
+
+Mode = Literal["front", "rear", "counter", "crab", "spot"]
+
+STEEPEST = math.radians(89.0)
+"""Largest axle angle that the bicycle form accepts (tangents stay meaningful)."""
+
+
+@dataclass(frozen=True)
+class DriveTrain:
+    """Motor to wheel (eq. 2.1): one motor, a fixed ratio, wheels of one radius, no slip.
+
+    Args:
+        ratio: motor turns per wheel turn.
+        wheel_radius: m.
+
+    Raises:
+        KinematicsError: a field is not above zero.
+    """
+
+    ratio: float = 644.0
+    wheel_radius: float = 0.075
+
+    def __post_init__(self) -> None:
+        require_positive("ratio", self.ratio)
+        require_positive("wheel_radius", self.wheel_radius)
+
+    @classmethod
+    def from_teeth(
+        cls,
+        gearbox: float = 66.0,
+        pinion: int = 46,
+        spur: int = 81,
+        transfer: float = 1.68,
+        axle: float = 3.3,
+        wheel_radius: float = 0.075,
+    ) -> "DriveTrain":
+        """Ratio from its stages: gearbox x spur/pinion x transfer case x axle differential (644.31 for the truck)."""
+        for name, value in (("gearbox", gearbox), ("pinion", pinion), ("spur", spur), ("transfer", transfer)):
+            require_positive(name, value)
+        require_positive("axle", axle)
+        return cls(gearbox * spur / pinion * transfer * axle, wheel_radius)
+
+    def speed(self, motor_rate: Real) -> Real:
+        """Ground speed of the wheels, m/s, at a motor rate in rad/s."""
+        return motor_rate * (self.wheel_radius / self.ratio)
+
+    def motor_rate(self, speed: Real) -> Real:
+        """Motor rate in rad/s for a ground speed in m/s."""
+        return speed * (self.ratio / self.wheel_radius)
+
+    def distance(self, motor_angle: Real) -> Real:
+        """Way rolled, m, for a motor angle in rad."""
+        return motor_angle * (self.wheel_radius / self.ratio)
+
+    def motor_angle(self, distance: Real) -> Real:
+        """Motor angle, rad, for a way rolled in m."""
+        return distance * (self.ratio / self.wheel_radius)
+
+
+@dataclass(frozen=True)
+class FourWheelSteering:
+    """Kinematics of a body with two steered axles.
+
+    Args:
+        wheelbase: L, m.
+        track: w, m.
+        cg_split: l_f / L: where the reference point C lies, 0 on the front axle, 0.5 at the geometric centre, 1 on the
+            rear axle.
+
+    Raises:
+        KinematicsError: a length is not above zero, or the split is outside 0 to 1.
+    """
+
+    wheelbase: float = 0.32
+    track: float = 0.26
+    cg_split: float = 0.5
+
+    def __post_init__(self) -> None:
+        require_positive("wheelbase", self.wheelbase)
+        require_positive("track", self.track)
+        require_within("cg_split", self.cg_split, 0.0, 1.0)
+
+    @property
+    def l_f(self) -> float:
+        """Distance of C behind the front axle, m."""
+        return self.cg_split * self.wheelbase
+
+    @property
+    def l_r(self) -> float:
+        """Distance of C before the rear axle, m."""
+        return self.wheelbase - self.l_f
+
+    @property
+    def wheel_positions(self) -> tuple[tuple[float, float], ...]:
+        """The wheels' (x, y) in C's frame, m."""
+        half = self.track / 2.0
+        return ((self.l_f, half), (self.l_f, -half), (-self.l_r, half), (-self.l_r, -half))
+
+    def _tangents(self, front: Real, rear: Real) -> tuple[Real, Real]:
+        require_within("front", front, -STEEPEST, STEEPEST)
+        require_within("rear", rear, -STEEPEST, STEEPEST)
+        return tan(front), tan(rear)
+
+    def sideslip(self, front: Real, rear: Real) -> Real:
+        """Angle from the body's x axis to C's direction of travel (eq. 2.34)."""
+        tan_f, tan_r = self._tangents(front, rear)
+        return atan((self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase)
+
+    def curvature(self, front: Real, rear: Real) -> Real:
+        """Curvature of C's path, 1/m, left positive: cos(beta) (tan d_f - tan d_r) / L (eqs. 2.38, 2.56)."""
+        tan_f, tan_r = self._tangents(front, rear)
+        tan_b = (self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase
+        return (tan_f - tan_r) / (self.wheelbase * hypot(1.0 + 0.0 * tan_b, tan_b))
+
+    def body_twist(self, speed: Real, front: Real, rear: Real) -> tuple[Real, Real, Real]:
+        """Velocity (vx, vy, wz) of C in the body frame (eqs. 2.34, 2.54-2.56).
+
+        Args:
+            speed: of C along its direction of travel, m/s, negative backwards.
+            front: bicycle angle of the front axle.
+            rear: bicycle angle of the rear axle.
+
+        Raises:
+            KinematicsError: an angle of 89 deg or more, or NaN.
+        """
+        require_finite("speed", speed)
+        tan_f, tan_r = self._tangents(front, rear)
+        tan_b = (self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase
+        vx = speed / hypot(1.0 + 0.0 * tan_b, tan_b)
+        return vx, vx * tan_b, vx * (tan_f - tan_r) / self.wheelbase
+
+    def steer_for(self, curvature: Real, sideslip: Real) -> tuple[Real, Real]:
+        """Axle angles (front, rear) for a path curvature (1/m) and sideslip at C: exact inverse of 2.34 and 2.38."""
+        require_finite("curvature", curvature)
+        require_within("sideslip", sideslip, -STEEPEST, STEEPEST)
+        tan_b = tan(sideslip)
+        turn = curvature / cos(sideslip)
+        return atan(tan_b + self.l_f * turn), atan(tan_b - self.l_r * turn)
+
+    def steer_for_twist(self, vx: Real, vy: Real, wz: Real) -> tuple[Real, Real, Real]:
+        """Speed and axle angles (speed, front, rear) that give C the velocity (vx, vy, wz).
+
+        Raises:
+            KinematicsError: vx = 0: two steered axles cannot move purely sideways nor turn on the spot.
+        """
+        require_finite("vy", vy)
+        require_finite("wz", wz)
+        if any_zero(vx):
+            raise KinematicsError("vx is 0: two steered axles need a forward speed")
+        require_finite("vx", vx)
+        return sign(vx) * hypot(vx, vy), atan((vy + self.l_f * wz) / vx), atan((vy - self.l_r * wz) / vx)
+
+    def wheel_angles(self, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
+        """Angles of the four wheels through the common ICR (eqs. 2.27-2.30), in (-90, 90) deg."""
+        tan_f, tan_r = self._tangents(front, rear)
+        left, right = self._sides(tan_f, tan_r)
+        return atan(tan_f / left), atan(tan_f / right), atan(tan_r / left), atan(tan_r / right)
+
+    def wheel_speeds(self, speed: Real, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
+        """Ground speeds of the four wheels along their own angle, m/s (eqs. 2.43-2.46).
+
+        A wheel between the ICR and the body's middle rolls backwards: its speed has the other sign.
+        """
+        vx, _, _ = self.body_twist(speed, front, rear)
+        tan_f, tan_r = tan(front), tan(rear)
+        left, right = self._sides(tan_f, tan_r)
+        from_left, from_right = vx * sign(left), vx * sign(right)
+        return (
+            from_left * hypot(left, tan_f),
+            from_right * hypot(right, tan_f),
+            from_left * hypot(left, tan_r),
+            from_right * hypot(right, tan_r),
+        )
+
+    def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
+        """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37.
+
+        Raises:
+            KinematicsError: the ICR lies under a wheel, whose angle is then undefined.
+        """
+        lean = (tan_f - tan_r) * (0.5 * self.track / self.wheelbase)
+        left, right = 1.0 - lean, 1.0 + lean
+        if any_zero(left * right):
+            raise KinematicsError("front, rear: the turning centre lies on a wheel's line, its angle is undefined")
+        return left, right
+
+    def limit_keeping_curvature(
+        self, front: Real, rear: Real, limit: float, rear_limit: float | None = None
+    ) -> tuple[Real, Real]:
+        """Axle angles within the limits that keep C's path curvature, then its sideslip, as far as possible.
+
+        The curvature is kept exactly while any pair of angles within the limits has it, else the largest possible one
+        is taken; the sideslip moves by no more than that needs. Angles within the limits come back as they were.
+
+        Args:
+            front: wanted front axle angle.
+            rear: wanted rear axle angle.
+            limit: largest front (and rear) axle angle.
+            rear_limit: largest rear axle angle, if another; 0 is a front-steered truck.
+
+        Raises:
+            KinematicsError: a limit outside 0 to 89 deg.
+        """
+        far = limit if rear_limit is None else rear_limit
+        require_within("limit", limit, 0.0, STEEPEST)
+        require_within("rear_limit", far, 0.0, STEEPEST)
+        tightest = self.curvature(limit, -far)
+        curvature = clip(self.curvature(front, rear), -tightest, tightest)
+        # tan(beta) + l_f kappa/cos(beta) = +-tan(limit) solved for beta, likewise at the rear.
+        ahead = asin(clip(self.l_f * math.cos(limit) * curvature, -1.0, 1.0))
+        behind = asin(clip(self.l_r * math.cos(far) * curvature, -1.0, 1.0))
+        low = larger(-limit - ahead, -far + behind)
+        high = smaller(limit - ahead, far + behind)
+        wanted_f, wanted_r = self.steer_for(curvature, clip(self.sideslip(front, rear), low, high))
+        return clip(wanted_f, -limit, limit), clip(wanted_r, -far, far)
+
+    def minimum_radius(self, mode: Mode, limit: float, *, every_wheel: bool = False) -> float:
+        """Least turning radius R (m): lateral distance of the ICR from the body's middle line (eq. 2.37).
+
+        Front and rear steering turn about a point beside the straight axle, counter steering beside the centre.
+
+        Args:
+            mode: steering mode; crab never turns (infinite), spot needs wheels steered one by one (0).
+            limit: largest angle of the axles, or of every wheel.
+            every_wheel: the limit holds for the inner wheels of an ideal linkage, not for the axle: adds half a track.
+
+        Raises:
+            KinematicsError: unknown mode, or a limit outside 0 to 89 deg.
+        """
+        require_within("limit", limit, 0.0, STEEPEST)
+        if mode not in ("front", "rear", "counter", "crab", "spot"):
+            raise KinematicsError(f"mode {mode!r}: expected front, rear, counter, crab or spot")
+        if mode == "spot":
+            return 0.0
+        if mode == "crab" or limit == 0.0:
+            return math.inf
+        steered = 2.0 if mode == "counter" else 1.0
+        return self.wheelbase / (steered * math.tan(limit)) + (0.5 * self.track if every_wheel else 0.0)
+
+    def integrate(
+        self, pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: float
+    ) -> tuple[Real, Real, Real]:
+        """Pose of C after dt at a constant twist: see ``motion.integrate``."""
+        return integrate(pose, vx, vy, wz, dt)
