@@ -49,7 +49,8 @@ class Link:
         self._wake()
 
     def lose(self, why: str) -> None:
-        """The peer is gone; pending and later reads raise ``DeviceLostError``."""
+        """The transport is gone; pending and later reads raise ``DeviceLostError``."""
+        self._hang_up = _nothing
         if self._lost is None:
             self._lost = why
             self._wake()

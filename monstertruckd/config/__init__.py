@@ -1,0 +1,1 @@
+"""Configuration: YAML with line numbers in, one resolved and typed tree out."""

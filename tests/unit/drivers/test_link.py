@@ -1,0 +1,209 @@
+"""Links and ports: buffering, losing the peer, exclusivity, pacing and line faults."""
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+
+from monstertruck_drivers.link import BUFFER_LIMIT, MemoryPort, SerialPort
+from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
+
+
+async def plugged() -> MemoryPort:
+    port = MemoryPort("port")
+    port.plug()
+    return port
+
+
+async def test_bytes_go_both_ways_and_are_buffered():
+    port = await plugged()
+    async with await port.open() as link:
+        port.device.write(b"hello\nworld")
+        assert await link.until(b"\n") == b"hello\n"
+        assert await link.exactly(3) == b"wor"
+        assert await link.read() == b"ld"
+        link.write(b"ping")
+        assert await port.device.read() == b"ping"
+
+
+async def test_a_reader_wakes_when_enough_bytes_came():
+    port = await plugged()
+    async with await port.open() as link:
+        waiting = asyncio.create_task(link.exactly(4))
+        for byte in b"abcd":
+            await asyncio.sleep(0)
+            port.device.write(bytes([byte]))
+        assert await waiting == b"abcd"
+
+
+async def test_until_gives_up_on_endless_garbage():
+    port = await plugged()
+    async with await port.open() as link:
+        port.device.write(b"x" * 5000)
+        with pytest.raises(ProtocolError):
+            await link.until(b"\n", limit=4096)
+
+
+async def test_the_buffer_is_bounded_and_keeps_the_newest():
+    port = await plugged()
+    async with await port.open() as link:
+        for _ in range(5):
+            port.device.write(b"a" * (BUFFER_LIMIT // 2))
+        port.device.write(b"end")
+        data = await link.read()
+        assert len(data) == BUFFER_LIMIT
+        assert data.endswith(b"end")
+
+
+async def test_unplugging_ends_pending_and_later_reads_and_writes():
+    port = await plugged()
+    link = await port.open()
+    pending = asyncio.create_task(link.read())
+    await asyncio.sleep(0)
+    port.unplug()
+    with pytest.raises(DeviceLostError):
+        await pending
+    with pytest.raises(DeviceLostError):
+        await link.read()
+    with pytest.raises(DeviceLostError):
+        link.write(b"x")
+    with pytest.raises(DeviceLostError):
+        await port.open()
+    port.plug()
+    (await port.open()).close()
+
+
+async def test_bytes_that_came_before_the_loss_can_still_be_read():
+    port = await plugged()
+    link = await port.open()
+    port.device.write(b"last words")
+    port.unplug()
+    assert await link.read() == b"last words"
+    with pytest.raises(DeviceLostError):
+        await link.read()
+
+
+async def test_a_port_is_exclusive():
+    port = await plugged()
+    async with await port.open():
+        with pytest.raises(PortBusyError):
+            await port.open()
+    (await port.open()).close()
+
+
+async def test_cancelled_read_leaves_the_link_usable():
+    port = await plugged()
+    async with await port.open() as link:
+        reading = asyncio.create_task(link.read())
+        await asyncio.sleep(0)
+        reading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await reading
+        port.device.write(b"later")
+        assert await link.read() == b"later"
+
+
+def test_baud_rate_paces_both_directions():
+    async def main(clock: VirtualClock) -> tuple[float, float]:
+        port = await plugged()
+        port.device.baud = 38400
+        async with await port.open() as link:
+            start = clock.now()
+            port.device.write(b"x" * 48)
+            await link.exactly(48)
+            down = clock.now() - start
+            start = clock.now()
+            link.write(b"y" * 24)
+            link.write(b"y" * 24)
+            received = 0
+            while received < 48:
+                received += len(await port.device.read())
+            return down / SECOND, (clock.now() - start) / SECOND
+
+    assert run_virtual(main) == pytest.approx((0.0125, 0.0125), abs=1e-6)
+
+
+async def test_line_faults():
+    port = await plugged()
+    line = port.device.faults
+    line.seed(3)
+    async with await port.open() as link:
+        line.garbage = b"\xff\x00"
+        port.device.write(b"ok")
+        assert await link.read() == b"\xff\x00ok"
+        line.chunk = 1
+        port.device.write(b"abc")
+        assert await link.exactly(3) == b"abc"
+        line.chunk = None
+        line.drop_rate = 0.5
+        port.device.write(bytes(1000))
+        assert 350 < len(await link.read()) < 650
+        line.drop_rate, line.flip_rate = 0.0, 0.5
+        port.device.write(bytes(1000))
+        flipped = sum(byte != 0 for byte in await link.read())
+        assert 350 < flipped < 650
+        line.flip_rate = 0.0
+        line.stalled = True
+        port.device.write(b"lost")
+        line.stalled = False
+        port.device.write(b"seen")
+        assert await link.read() == b"seen"
+        line.deaf = True
+        link.write(b"unheard")
+        line.deaf = False
+        link.write(b"heard")
+        assert await port.device.read() == b"heard"
+
+
+async def test_serial_port_over_a_pty(tmp_path: Path):
+    pty = PtyPort(tmp_path / "dev")
+    port = SerialPort(tmp_path / "dev")
+    with pytest.raises(DeviceLostError, match="not plugged in"):
+        await port.open()
+    pty.plug()
+    link = await port.open()
+    pty.device.write(b"\x00\x0a\x0d\xff")
+    assert await link.exactly(4) == b"\x00\x0a\x0d\xff"
+    link.write(b"\x03\x11\x13")
+    assert await pty.device.read() == b"\x03\x11\x13"
+    with pytest.raises(PortBusyError):
+        await port.open()
+    pty.unplug()
+    async with asyncio.timeout(1):
+        with pytest.raises(DeviceLostError):
+            await link.read()
+    link.close()
+    pty.plug()
+    async with await port.open() as again:
+        pty.device.write(b"back")
+        assert await again.read() == b"back"
+    pty.unplug()
+
+
+async def test_a_vanished_pty_does_not_spin_the_loop(tmp_path: Path):
+    pty = PtyPort(tmp_path / "dev")
+    pty.plug()
+    link = await SerialPort(tmp_path / "dev").open()
+    pty.unplug()
+    await asyncio.sleep(0.05)
+    before = os.times()
+    await asyncio.sleep(0.3)
+    after = os.times()
+    assert (after.user + after.system) - (before.user + before.system) < 0.1
+    link.close()
+
+
+async def test_a_pty_nobody_reads_never_blocks_the_emulator(tmp_path: Path):
+    pty = PtyPort(tmp_path / "dev")
+    pty.plug()
+    for _ in range(100):
+        pty.device.write(b"z" * 4096)
+    async with await SerialPort(tmp_path / "dev").open() as link:
+        link.discard()
+        await asyncio.sleep(0.01)
+        pty.device.write(b"fresh")
+        assert (await link.until(b"fresh", limit=1 << 20)).endswith(b"fresh")
+    pty.unplug()

@@ -1,0 +1,120 @@
+"""Supervision: which failures are retried, when, and what is reported."""
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError
+from monstertruck_runtime.ports import Ready
+from monstertruck_runtime.service import OnBug, RestartPolicy, supervise
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
+
+STEADY = RestartPolicy(first_delay=1.0, factor=2.0, max_delay=5.0, jitter=0.0, settled_after=10.0)
+
+
+class Scripted:
+    """A service whose n-th session is the n-th script."""
+
+    name = "scripted"
+
+    def __init__(self, clock: VirtualClock, *scripts: Callable[[Ready], object]) -> None:
+        self.clock = clock
+        self.scripts = list(scripts)
+        self.starts: list[float] = []
+
+    async def run(self, ready: Ready) -> None:
+        self.starts.append(self.clock.now() / SECOND)
+        result = self.scripts.pop(0)(ready)
+        if asyncio.iscoroutine(result):
+            await result
+
+
+def lost(_: Ready) -> None:
+    raise DeviceLostError("cable")
+
+
+def run(*scripts: Callable[[Ready], object], policy: RestartPolicy = STEADY, on_bug: OnBug = OnBug.FAIL):
+    health: list[ServiceHealth] = []
+    starts: list[float] = []
+
+    async def main(clock: VirtualClock) -> None:
+        service = Scripted(clock, *scripts)
+        await supervise(service, policy, clock, health.append, np.random.default_rng(1), on_bug)
+        starts.extend(service.starts)
+
+    run_virtual(main, start=0)
+    return health, starts
+
+
+def test_lost_sessions_are_tried_again_with_growing_capped_delays():
+    health, starts = run(lost, lost, lost, lost, lost, lambda ready: ready())
+    assert starts == pytest.approx([0, 1, 3, 7, 12, 17])
+    assert [row.state for row in health[-3:]] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
+    assert health[-1].restarts == 5
+    assert {row.reason for row in health if row.state is ServiceState.BACKOFF} == {Reason.DEVICE_LOST}
+    assert all(row.detail == "cable" for row in health if row.state is ServiceState.BACKOFF)
+
+
+def test_a_session_that_settled_starts_the_delays_anew():
+    async def works_a_while(ready: Ready) -> None:
+        ready()
+        await asyncio.sleep(20)
+        raise DeviceLostError("later")
+
+    _, starts = run(lost, lost, works_a_while, lost, lambda ready: ready())
+    assert starts == pytest.approx([0, 1, 3, 24, 26])
+
+
+def test_a_mismatch_is_never_retried():
+    def mismatch(_: Ready) -> None:
+        raise DeviceMismatchError("motor type 10, expected 1")
+
+    health, starts = run(mismatch)
+    assert len(starts) == 1
+    assert health[-1].state is ServiceState.FAILED
+    assert health[-1].reason is Reason.DEVICE_MISMATCH
+
+
+def test_an_exhausted_budget_gives_up():
+    health, starts = run(*[lost] * 9, policy=RestartPolicy(first_delay=0.1, max_delay=0.1, jitter=0, budget=3))
+    assert len(starts) == 4
+    assert health[-1].state is ServiceState.FAILED
+
+
+def bug(_: Ready) -> None:
+    raise ZeroDivisionError
+
+
+def test_a_bug_fails_an_ordinary_service_alone():
+    health, _ = run(bug)
+    assert health[-1].state is ServiceState.FAILED
+    assert health[-1].reason is Reason.INTERNAL
+
+
+def test_a_bug_in_a_critical_service_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        run(bug, on_bug=OnBug.EXIT)
+
+
+def test_cancellation_is_reported_and_passes():
+    async def forever(ready: Ready) -> None:
+        ready()
+        await asyncio.Event().wait()
+
+    health: list[ServiceHealth] = []
+
+    async def main(clock: VirtualClock) -> None:
+        task = asyncio.create_task(
+            supervise(Scripted(clock, forever), STEADY, clock, health.append, np.random.default_rng(1))
+        )
+        await clock.sleep(1)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_virtual(main)
+    assert [row.state for row in health] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
