@@ -204,6 +204,17 @@ class FourWheelSteering:
             from_right * hypot(right, tan_r),
         )
 
+    def drive_speed(self, speed: Real, front: Real, rear: Real) -> Real:
+        """Ground speed, m/s, that the one motor sees at the wheels when C travels at ``speed``.
+
+        Each open differential turns with the mean of its two wheels, which the truck's nearly parallel linkage makes
+        the speed of the axle's middle along its wheels; the rigid transfer case turns with the mean of both axles.
+        Proportional to ``speed``: divide by ``drive_speed(1.0, front, rear)`` for the way back.
+        """
+        vx, _, _ = self.body_twist(speed, front, rear)
+        tan_f, tan_r = tan(front), tan(rear)
+        return vx * (0.5 * (hypot(1.0 + 0.0 * tan_f, tan_f) + hypot(1.0 + 0.0 * tan_r, tan_r)))
+
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
         """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37.
 
