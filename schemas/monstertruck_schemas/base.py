@@ -19,6 +19,7 @@ class Schema(BaseModel):
         strict=True,
         extra="forbid",
         allow_inf_nan=False,
+        ser_json_inf_nan="constants",  # a non-finite request must reach the gate to be refused by name
         arbitrary_types_allowed=True,
         use_attribute_docstrings=True,
     )

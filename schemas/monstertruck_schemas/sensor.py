@@ -121,7 +121,7 @@ class BatteryLevel(StrEnum):
 class Battery(Message):
     """Pack voltage and its judgement."""
 
-    voltage: float | None
+    voltage: float | None = None
     """Filtered pack voltage, V; None while the sensor is at fault."""
     raw_voltage: float
     """Newest single sample, V."""

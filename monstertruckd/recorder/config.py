@@ -1,0 +1,41 @@
+"""Recorder settings."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Seconds = Annotated[float, Field(gt=0)]
+Bytes = Annotated[int, Field(gt=0)]
+
+
+class Compression(StrEnum):
+    """Compression of the log's chunks."""
+
+    NONE = "none"
+    LZ4 = "lz4"
+    ZSTD = "zstd"
+
+
+class RecorderConfig(Schema):
+    """Where and how the log is written."""
+
+    directory: str = "logs"
+    """Folder of the log files; made when missing."""
+    compression: Compression = Compression.LZ4
+    chunk_size: Bytes = 256 * 1024
+    """Bytes after which a chunk is closed."""
+    chunk_seconds: Annotated[float, Field(gt=0, le=0.5)] = 0.5
+    """Seconds after which a chunk is closed: what a crash can lose, and half as much again."""
+    rotate_bytes: Bytes = 512 * 1024 * 1024
+    """Size after which the next file is begun."""
+    rotate_seconds: Seconds = 1800.0
+    """Duration after which the next file is begun."""
+    quota_bytes: Bytes = 8 * 1024 * 1024 * 1024
+    """Size of all logs in the folder above which the oldest are removed."""
+    fsync_seconds: Seconds = 5.0
+    """Seconds between two fsync, which is what a power cut can lose."""
+    queue_size: Annotated[int, Field(gt=0)] = 8192
+    """Messages waiting for the disk before newer ones are dropped and counted."""
