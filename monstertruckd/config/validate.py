@@ -32,6 +32,7 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
     if version != VERSION:
         origin = tree.origin(("version",)) or f"{path}:1"
         raise ConfigError(f"{origin}: version: expected {VERSION}, found {version!r}")
+    _locate_files(tree, getattr(model, "FILE_KEYS", ()))
     try:
         text = json.dumps(tree.data)
     except TypeError as error:
@@ -42,6 +43,22 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
         return model.model_validate_json(text), tree
     except ValidationError as error:
         raise ConfigError("\n".join(_explain(tree, path, model, error))) from error
+
+
+def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
+    """Make the values at ``keys`` absolute, relative to the file that says them."""
+    for key in keys:
+        section: Any = tree.data
+        for part in key[:-1]:
+            section = section.get(part) if isinstance(section, dict) else None
+        name = section.get(key[-1]) if isinstance(section, dict) else None
+        if not isinstance(name, str):
+            continue
+        origin = tree.origins[key]
+        file = (origin.file.parent / name).resolve()
+        if not file.is_file():
+            raise ConfigError(f"{origin}: {'.'.join(key)}: no such file: {file}")
+        section[key[-1]] = str(file)
 
 
 def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:

@@ -1,0 +1,159 @@
+"""The configuration of one robot or experiment: the root of the YAML file."""
+
+import math
+from pathlib import Path
+from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
+from monstertruck_runtime.service import RestartPolicy
+from monstertruck_schemas.base import Schema
+from monstertruckd.bus.config import ZenohConfig
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.recorder.config import RecorderConfig
+
+C = TypeVar("C", bound=Schema)
+
+Metres = Annotated[float, Field(gt=0, le=10)]
+
+
+class PortConfig(Schema):
+    """Where a device hangs."""
+
+    path: Path
+    """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
+    baud: Annotated[int, Field(ge=4800, le=1_000_000)] = 115200
+    """Bits per second; USB-CDC devices ignore it"""
+
+
+class Mount(Schema):
+    """Pose of a sensor in the base frame."""
+
+    x: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres forward of the base point"""
+    y: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres left of the base point"""
+    z: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres above the base point"""
+    roll: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about x"""
+    pitch: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about y"""
+    yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about z"""
+
+
+class Device(Schema, Generic[C]):
+    """One device: its port, its mount, its driver."""
+
+    port: PortConfig
+    mount: Mount = Mount()
+    restart: RestartPolicy = RestartPolicy()
+    driver: C
+
+
+class Devices(Schema):
+    """The truck's devices by role; a role that is left out is not there."""
+
+    lidar: Device[HokuyoConfig] | None = None
+    drive: Device[EposConfig] | None = None
+    steering: Device[MaestroConfig] | None = None
+    compass: Device[Os4000Config] | None = None
+
+    def present(self) -> dict[str, Device[Schema]]:
+        """The devices that are configured, by role."""
+        return {role: device for role in type(self).model_fields if (device := getattr(self, role)) is not None}
+
+    @model_validator(mode="after")
+    def _one_port_each(self) -> Self:
+        taken: dict[Path, str] = {}
+        for role, device in self.present().items():
+            if other := taken.get(device.port.path):
+                raise ValueError(f"{other} and {role} share the port {device.port.path}; every device needs its own")
+            taken[device.port.path] = role
+        return self
+
+
+class Geometry(Schema):
+    """The truck's body (navigation-relevant lengths, author's robot as default)."""
+
+    wheelbase: Metres = 0.32
+    """Metres between front and rear axle"""
+    track: Metres = 0.26
+    """Metres between left and right wheel centres"""
+    wheel_radius: Metres = 0.075
+    """Metres"""
+    drive_ratio: Annotated[float, Field(gt=1, le=5000)] = 644.0
+    """Motor turns per wheel turn"""
+    length: Metres = 0.47
+    """Metres, bumper to bumper"""
+    width: Metres = 0.34
+    """Metres, over the wheels"""
+    max_axle_angle: Annotated[float, Field(gt=0, le=0.7)] = 0.4
+    """Radians, greatest angle of either axle"""
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.length < self.wheelbase:
+            raise ValueError(f"impossible geometry: length {self.length} m is less than the wheelbase {self.wheelbase} m")
+        if self.width < self.track:
+            raise ValueError(f"impossible geometry: width {self.width} m is less than the track {self.track} m")
+        if self.wheelbase <= 2 * self.wheel_radius:
+            raise ValueError(
+                f"impossible geometry: wheels of radius {self.wheel_radius} m touch at a wheelbase of {self.wheelbase} m"
+            )
+        return self
+
+
+class PathSource(Schema):
+    """A path drawn beforehand, to be tracked as soon as the truck is armed."""
+
+    file: Path
+    """CSV with the header x,y,yaw,direction: metres, metres, radians, +1 or -1"""
+    closed: bool = False
+    """The path is a lap: its end is its start"""
+
+
+class MapRender(Schema):
+    """The picture of path over scan map that the worker draws."""
+
+    latency: Annotated[float, Field(gt=0, le=5)] = 0.05
+    """Seconds after which its results count on the virtual clock"""
+    deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """Seconds after which a silent worker is killed"""
+    period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
+    """Seconds between two scans it is given"""
+
+
+class TruckConfig(Schema):
+    """Everything the daemon needs to know."""
+
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"),)
+    """Keys that name files which must exist; they are relative to the file that says them."""
+
+    version: Literal[1]
+    robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = "truck"
+    """Name of this robot in every key"""
+    geometry: Geometry = Geometry()
+    devices: Devices
+    gate: GateConfig = GateConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    tracker: PurePursuitConfig | None = None
+    path: PathSource | None = None
+    map: MapRender | None = None
+    recorder: RecorderConfig | None = None
+    zenoh: ZenohConfig = ZenohConfig()
+    state_directory: Path = Path("runs/state")
+    """Where the e-stop latch is kept"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.tracker is not None and (self.devices.drive is None or self.devices.steering is None):
+            raise ValueError("a tracker needs the devices drive and steering")
+        return self

@@ -1,0 +1,138 @@
+"""YAML with origins: merging, and one clear line for every mistake."""
+
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import pytest
+from pydantic import Field
+
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_schemas.base import Schema
+from monstertruckd.config.validate import load_config, resolved
+from monstertruckd.config.yaml_tree import load_tree
+
+
+class Wheel(Schema):
+    radius: Annotated[float, Field(gt=0, le=1)] = 0.075
+    """Metres from hub to ground"""
+    count: int = 4
+
+
+class Lidar(Schema):
+    kind: Literal["lidar"] = "lidar"
+    beams: int = 682
+
+
+class Sonar(Schema):
+    kind: Literal["sonar"] = "sonar"
+    cone: float = 0.87
+
+
+class Root(Schema):
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("map",),)
+    version: Literal[1]
+    name: str
+    wheel: Wheel = Wheel()
+    sensors: tuple[Annotated[Lidar | Sonar, Field(discriminator="kind")], ...] = ()
+    map: Path | None = None
+
+
+def write(folder: Path, text: str, name: str = "truck.yaml") -> Path:
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def complaint(folder: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(write(folder, text), Root)
+    return str(caught.value)
+
+
+def test_a_good_file(tmp_path: Path):
+    config, tree = load_config(
+        write(tmp_path, "version: 1\nname: t\nwheel:\n  radius: 0.1\nsensors:\n  - {kind: sonar, cone: 1}\n"), Root
+    )
+    assert config.wheel == Wheel(radius=0.1)
+    assert config.sensors == (Sonar(cone=1.0),)
+    assert str(tree.origin(("wheel", "radius"))) == f"{tmp_path / 'truck.yaml'}:4"
+    assert resolved(config)["wheel"] == {"radius": 0.1, "count": 4}
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "expected"),
+    [
+        ("version: 1\nname: t\nwhele: {}\n", 3, "whele: unknown key (did you mean wheel?)"),
+        ("version: 1\nname: t\nwheel:\n  radios: 1\n", 4, "wheel.radios: unknown key (did you mean radius?)"),
+        ("version: 1\nname: t\nwheel:\n  zzz: 1\n", 4, "wheel.zzz: unknown key; known here: count, radius"),
+        (
+            "version: 1\nname: t\nwheel:\n  radius: 75\n",
+            4,
+            "equal to 1, found 75 (Metres from hub to ground)",
+        ),
+        ("version: 1\nname: t\nwheel:\n  radius: 7.5 cm\n", 4, "found '7.5 cm' (Metres from hub to ground)"),
+        ("version: 1\nname: t\nwheel:\n  count: 1.5\n", 4, "wheel.count: "),
+        ("version: 1\n", 1, "name: missing; it has no default"),
+        ("version: 2\nname: t\n", 1, "version: expected 1, found 2"),
+        ("name: t\n", 1, "version: expected 1, found None"),
+        ("version: 1\nname: t\nname: u\n", 3, "name: given twice in one section"),
+        ("version: 1\nname: t\nmap: nowhere.yaml\n", 3, "map: no such file"),
+        ("version: 1\nname: t\ninclude: nowhere.yaml\n", 3, "include: no such file"),
+        ("version: 1\nname: t\ninclude: 7\n", 3, "include: expected a file name or a list"),
+        ("version: 1\nname: t\nwheel: [1]\n", 3, "wheel: "),
+        ("version: 1\nname: [t\n", 3, "not valid YAML"),
+        ("- 1\n", 1, "expected a mapping of sections, found a list"),
+        ("version: 1\nname: t\n? [a]\n: 1\n", 3, "a key must be plain text"),
+        ("version: 1\nname: t\nsensors:\n  - {kind: radar}\n", 4, "sensors.0"),
+        ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "sensors.0.beems: unknown key"),
+        ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "known here: cone, kind"),
+        ("version: 1\nname: 2026-11-21\n", 1, "neither text, number, list nor mapping"),
+        ("version: 1\nname: .nan\nwheel:\n  radius: .nan\n", 2, "name: "),
+    ],
+)
+def test_every_mistake_names_file_line_and_expectation(tmp_path: Path, text: str, line: int, expected: str):
+    said = complaint(tmp_path, text)
+    assert f"{tmp_path / 'truck.yaml'}:{line}" in said or "neither text" in expected
+    assert expected in said
+
+
+def test_several_mistakes_are_several_lines(tmp_path: Path):
+    said = complaint(tmp_path, "version: 1\nname: 3\nwheel:\n  radios: 1\n  count: many\n")
+    assert len(said.splitlines()) == 3
+
+
+def test_an_unreadable_file_is_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"absent.yaml: cannot be read: No such file"):
+        load_tree(tmp_path / "absent.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        load_tree(tmp_path / "binary.yaml")
+
+
+def test_includes_merge_deeply_and_later_wins(tmp_path: Path):
+    write(tmp_path, "wheel: {radius: 0.2, count: 3}\nname: base\n", "base.yaml")
+    write(tmp_path, "wheel: {count: 6}\nsensors: [{kind: lidar}]\n", "more.yaml")
+    top = write(tmp_path, "include: [base.yaml, more.yaml]\nversion: 1\nwheel:\n  radius: 0.3\n")
+    config, tree = load_config(top, Root)
+    assert config.name == "base"
+    assert config.wheel == Wheel(radius=0.3, count=6)
+    origins = {key: tree.origin(key) for key in (("wheel", "radius"), ("wheel", "count"), ("name",))}
+    assert [str(origin.file.name) for origin in origins.values() if origin] == ["truck.yaml", "more.yaml", "base.yaml"]
+
+
+def test_files_are_relative_to_the_file_that_names_them(tmp_path: Path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "arena.yaml").touch()
+    write(tmp_path, "map: arena.yaml\n", "sub/maps.yaml")
+    config, _ = load_config(write(tmp_path, "include: sub/maps.yaml\nversion: 1\nname: t\n"), Root)
+    assert config.map == tmp_path / "sub" / "arena.yaml"
+
+
+def test_a_circle_of_includes_is_refused(tmp_path: Path):
+    write(tmp_path, "include: truck.yaml\n", "other.yaml")
+    with pytest.raises(ConfigError, match="includes itself"):
+        load_tree(write(tmp_path, "include: other.yaml\n"))
+
+
+def test_an_empty_file_is_an_empty_tree(tmp_path: Path):
+    assert load_tree(write(tmp_path, "")).data == {}

@@ -1,0 +1,136 @@
+"""Messages are strict and frozen, their arrays read-only, absent is None."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid, Odometry
+
+HEADER = {"stamp": 1, "received": 2, "seq": 3}
+
+
+def scan(ranges: np.ndarray, **changes: object) -> LaserScan:
+    values = {
+        "start_angle": -2.0,
+        "end_angle": 2.0,
+        "time_increment": 1e-4,
+        "scan_time": 0.1,
+        "range_min": 0.02,
+        "range_max": 5.6,
+        "ranges": ranges,
+        "codes": np.full(len(ranges), 255, np.uint8),
+    }
+    return LaserScan(**HEADER, frame="lidar", **(values | changes))  # type: ignore[arg-type]
+
+
+def odometry(**changes: object) -> Odometry:
+    values: dict[str, object] = {
+        "pose": Pose2D(x=1.0, y=2.0, yaw=0.5),
+        "twist": Twist2D(vx=0.2, vy=0.0, wz=0.1),
+        "pose_covariance": np.zeros(9),
+        "twist_covariance": np.zeros(9),
+        "age": 0.01,
+    }
+    return Odometry(**HEADER, frame="odom", **(values | changes))  # type: ignore[arg-type]
+
+
+def test_messages_are_frozen():
+    message = odometry()
+    with pytest.raises(ValidationError):
+        message.age = 1.0  # type: ignore[misc]
+
+
+def test_arrays_are_read_only_and_never_alias_the_callers():
+    mine = np.array([1.0, np.inf, 2.0])
+    message = scan(mine)
+    mine[0] = 9.0
+    assert message.ranges[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        message.ranges[0] = 3.0
+
+
+def test_a_frozen_array_is_taken_without_a_copy():
+    array = np.ones(5)
+    array.flags.writeable = False
+    assert scan(array).ranges is array
+
+
+def test_strict_types_and_no_unknown_fields():
+    with pytest.raises(ValidationError):
+        odometry(age="0.1")
+    with pytest.raises(ValidationError):
+        odometry(unknown=1)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_not_finite_is_refused_where_absent_must_be_none(value: float):
+    with pytest.raises(ValidationError):
+        odometry(age=value)
+
+
+def test_a_drive_request_may_carry_nan_so_that_the_gate_can_name_it():
+    request = DriveRequest(
+        **HEADER, source="me", role=Role.STATION, lease=0.3, nonce="n", speed=float("nan"), front=0.0
+    )
+    assert request.speed != request.speed
+
+
+@pytest.mark.parametrize("shape", [8, 10])
+def test_covariances_have_nine_elements(shape: int):
+    with pytest.raises(ValidationError, match="shape"):
+        odometry(pose_covariance=np.zeros(shape))
+    with pytest.raises(ValidationError, match="shape"):
+        odometry(twist_covariance=np.zeros(shape))
+
+
+def test_json_round_trip():
+    for message in (
+        odometry(),
+        Event(
+            **HEADER, reason=Reason.TILT_STOP, severity=Severity.ERROR, source="gate", values={"tilt": 0.4, "n": None}
+        ),
+        Grid(
+            **HEADER,
+            resolution=0.05,
+            width=2,
+            height=1,
+            origin=Pose2D(x=0, y=0, yaw=0),
+            cells=np.array([-1, 100], np.int8),
+        ),
+    ):
+        assert type(message).model_validate_json(message.model_dump_json()) == message
+
+
+def test_the_wire_ignores_unknown_fields_but_construction_does_not():
+    text = odometry().model_dump_json()[:-1] + ', "from_the_future": 1}'
+    assert Odometry.model_validate_json(text, extra="ignore") == odometry()
+    with pytest.raises(ValidationError):
+        Odometry.model_validate_json(text)
+
+
+def test_equality_is_by_value_and_type():
+    assert scan(np.ones(3)) == scan(np.ones(3))
+    assert scan(np.ones(3)) != scan(np.array([1.0, 1.0, 2.0]))
+    assert scan(np.ones(3)) != odometry()
+
+
+def test_angle_increment():
+    assert scan(np.ones(5)).angle_increment == pytest.approx(1.0)
+    assert scan(np.ones(1)).angle_increment == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("source", ["", "a b", "x" * 65, "née"])
+def test_sources_are_plain_names(source: str):
+    with pytest.raises(ValidationError):
+        DriveRequest(**HEADER, source=source, role=Role.STATION, lease=0.3, nonce="n", speed=0.0, front=0.0)
+
+
+@pytest.mark.parametrize("lease", [0.0, -1.0, 2.5])
+def test_leases_are_bounded(lease: float):
+    with pytest.raises(ValidationError):
+        DriveRequest(**HEADER, source="a", role=Role.STATION, lease=lease, nonce="n", speed=0.0, front=0.0)
