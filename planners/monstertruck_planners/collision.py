@@ -1,0 +1,280 @@
+"""The one collision checker of the project: truck footprint against scan points and occupancy grids.
+
+Gate, trackers and planners all ask here. Poses are rows (x, y, yaw) in the same frame as the points or the grid;
+distances are metres, negative inside the footprint.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+from monstertruck_schemas.state import Grid
+
+Array = NDArray[np.float64]
+
+OCCUPIED = 50
+"""Occupancy, percent, from which a grid cell is an obstacle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """Rectangle centred on the base frame, grown by ``padding`` on every side.
+
+    Args:
+        length: along x, m.
+        width: along y, m.
+        padding: added on each side, m.
+
+    Raises:
+        InputError: length or width not above zero, or padding below it.
+    """
+
+    length: float = 0.47
+    width: float = 0.34
+    padding: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not (self.length > 0 and self.width > 0 and self.padding >= 0):
+            msg = (
+                f"footprint {self.length} x {self.width} m, padding {self.padding} m: "
+                "expected length and width above 0 and padding not below 0"
+            )
+            raise InputError(msg)
+
+    @property
+    def half_length(self) -> float:
+        """Half the padded length, m."""
+        return self.length / 2 + self.padding
+
+    @property
+    def half_width(self) -> float:
+        """Half the padded width, m."""
+        return self.width / 2 + self.padding
+
+    @property
+    def circumscribed_radius(self) -> float:
+        """Radius of the circle through the padded corners, m."""
+        return math.hypot(self.half_length, self.half_width)
+
+    @property
+    def inscribed_radius(self) -> float:
+        """Radius of the largest circle inside the padded rectangle, m."""
+        return min(self.half_length, self.half_width)
+
+    def covering_discs(self, count: int = 3) -> tuple[Array, float]:
+        """``count`` discs along x that together cover the rectangle.
+
+        Returns:
+            Their centres on the x axis, shape (count,), m, and their common radius, m.
+        """
+        half = self.half_length / count
+        centres = np.array([-self.half_length + half * (2 * i + 1) for i in range(count)])
+        return centres, math.hypot(half, self.half_width)
+
+
+def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Array:
+    """Signed distance of every point from the footprint at every pose, exact.
+
+    Args:
+        footprint: the rectangle.
+        poses: shape (m, 3).
+        points: shape (n, 2), same frame.
+
+    Returns:
+        Shape (m, n), m; negative inside.
+    """
+    dx = points[None, :, 0] - poses[:, None, 0]
+    dy = points[None, :, 1] - poses[:, None, 1]
+    c, s = np.cos(poses[:, None, 2]), np.sin(poses[:, None, 2])
+    beyond_x = np.abs(dx * c + dy * s) - footprint.half_length
+    beyond_y = np.abs(dy * c - dx * s) - footprint.half_width
+    outside = np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0))
+    return np.asarray(outside + np.minimum(np.maximum(beyond_x, beyond_y), 0.0))
+
+
+def clearance_to_points(footprint: Footprint, poses: Array, points: Array) -> Array:
+    """Signed distance from the footprint to the nearest point, for every pose.
+
+    Args:
+        footprint: the rectangle.
+        poses: shape (m, 3).
+        points: shape (n, 2), same frame.
+
+    Returns:
+        Shape (m,), m; +inf where there are no points.
+    """
+    if len(points) == 0:
+        return np.full(len(poses), np.inf)
+    return np.asarray(rectangle_distance(footprint, poses, points).min(axis=1))
+
+
+def first_contact(footprint: Footprint, poses: Array, points: Array, margin: float = 0.0) -> int | None:
+    """Index of the first pose at which the moving footprint comes within ``margin`` of a point.
+
+    A point that is no nearer than it was at the first pose is no obstacle to this motion: a truck that stands at a
+    wall may leave it.
+
+    Args:
+        footprint: the rectangle.
+        poses: shape (m, 3), in the order driven, the first one being the present pose.
+        points: shape (n, 2), same frame.
+        margin: m.
+
+    Returns:
+        The index, at least 1, or None when all poses are free.
+    """
+    reach = footprint.circumscribed_radius + margin
+    low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+    near = points[((points >= low) & (points <= high)).all(axis=1)]
+    if len(near) == 0:
+        return None
+    distance = rectangle_distance(footprint, poses, near)
+    hits = ((distance < margin) & (distance < distance[0] - 1e-9)).any(axis=1)
+    return int(np.argmax(hits)) if hits.any() else None
+
+
+def swept_poses(steering: FourWheelSteering, front: float, rear: float, distances: Array) -> Array:
+    """Poses of the base, starting at the origin, after each signed distance at constant axle angles.
+
+    Args:
+        steering: the truck's geometry.
+        front: axle angle, rad.
+        rear: axle angle, rad.
+        distances: shape (m,), m along the direction of travel; negative backwards.
+
+    Returns:
+        Shape (m, 3).
+    """
+    vx, vy, wz = steering.body_twist(1.0, front, rear)
+    still = np.zeros_like(distances)
+    poses = steering.integrate((still, still, still), vx * distances, vy * distances, wz * distances, 1.0)
+    return np.column_stack(poses)
+
+
+def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:
+    """Valid returns of a scan in the base frame.
+
+    Args:
+        scan: the revolution.
+        mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
+
+    Returns:
+        Shape (n, 2), m.
+    """
+    valid = (scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)
+    ranges = scan.ranges[valid]
+    bearing = mount[2] + scan.start_angle + scan.angle_increment * np.flatnonzero(valid)
+    return np.column_stack((mount[0] + ranges * np.cos(bearing), mount[1] + ranges * np.sin(bearing)))
+
+
+class DistanceField:
+    """Distance to the nearest occupied cell of a grid, and footprint-true checks on it.
+
+    Obstacles are the centres of occupied cells, half a cell wide; everything outside the grid is occupied.
+    Built in workers only: the constructor loads scipy.
+
+    Args:
+        occupied: shape (rows, columns), bool, row 0 at the lowest y.
+        resolution: metres per cell.
+        origin: pose (x, y, yaw) of the outer corner of cell (0, 0).
+
+    Raises:
+        InputError: a grid that is not two-dimensional, or empty, or a resolution not above zero.
+    """
+
+    def __init__(
+        self, occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        from scipy.ndimage import binary_erosion, distance_transform_edt  # noqa: PLC0415 - workers only
+
+        if occupied.ndim != 2 or occupied.size == 0 or not resolution > 0:
+            msg = (
+                f"grid of shape {occupied.shape}, resolution {resolution} m: "
+                "expected rows x columns, resolution above 0"
+            )
+            raise InputError(msg)
+        self.resolution = resolution
+        self.origin = origin
+        # One ring of occupied cells stands for everything outside.
+        ringed = np.pad(occupied, 1, constant_values=True)
+        self._distance: Array = np.asarray(distance_transform_edt(~ringed)) * resolution
+        self._edge: NDArray[np.bool_] = ringed & ~binary_erosion(ringed, np.ones((3, 3), np.bool_), border_value=1)
+
+    @classmethod
+    def from_grid(cls, grid: Grid, *, unknown_blocks: bool = True) -> "DistanceField":
+        """Field of a ``state/map`` grid; unknown cells count as occupied unless told otherwise."""
+        cells = grid.cells.reshape(grid.height, grid.width)
+        occupied = cells >= OCCUPIED
+        if unknown_blocks:
+            occupied |= cells < 0
+        return cls(occupied, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
+
+    def lookup(self, points: Array) -> Array:
+        """Distance to the nearest occupied cell centre, bilinear between cell centres.
+
+        Args:
+            points: shape (..., 2), in the grid's parent frame.
+
+        Returns:
+            Shape (...), m; 0 outside the grid.
+        """
+        column, row = self._cells(points)
+        rows, columns = self._distance.shape
+        inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
+        r0 = np.clip(np.floor(row), 0, rows - 2).astype(np.intp)
+        c0 = np.clip(np.floor(column), 0, columns - 2).astype(np.intp)
+        fr, fc = row - r0, column - c0
+        field = self._distance
+        low = field[r0, c0] * (1 - fc) + field[r0, c0 + 1] * fc
+        high = field[r0 + 1, c0] * (1 - fc) + field[r0 + 1, c0 + 1] * fc
+        return np.where(inside, low * (1 - fr) + high * fr, 0.0)
+
+    def _cells(self, points: Array) -> tuple[Array, Array]:
+        """Fractional (column, row) of the ringed grid, whole at cell centres."""
+        x, y, yaw = self.origin
+        dx, dy = points[..., 0] - x, points[..., 1] - y
+        c, s = math.cos(yaw), math.sin(yaw)
+        return (dx * c + dy * s) / self.resolution + 0.5, (dy * c - dx * s) / self.resolution + 0.5
+
+    def free(self, footprint: Footprint, poses: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Whether the footprint keeps ``margin`` and half a cell from every occupied cell centre.
+
+        Covering discs accept, the inscribed circle rejects; what neither decides is checked exactly.
+
+        Args:
+            footprint: the rectangle.
+            poses: shape (m, 3), in the grid's parent frame.
+            margin: m.
+
+        Returns:
+            Shape (m,).
+        """
+        keep = margin + self.resolution / 2
+        # Bilinear values stray from the true distance by less than a cell's diagonal.
+        slack = self.resolution * math.sqrt(2)
+        offsets, radius = footprint.covering_discs()
+        heading = np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=-1)
+        discs = poses[:, None, :2] + offsets[None, :, None] * heading[:, None, :]
+        result = np.asarray((self.lookup(discs) >= radius + keep + slack).all(axis=1))
+        hopeless = np.asarray(self.lookup(poses[:, :2]) < footprint.inscribed_radius + keep - slack)
+        for i in np.flatnonzero(~result & ~hopeless):
+            pose = poses[i : i + 1]
+            points = self._edges_near(pose[0], footprint.circumscribed_radius + keep)
+            result[i] = bool(clearance_to_points(footprint, pose, points)[0] >= keep)
+        return result
+
+    def _edges_near(self, pose: Array, reach: float) -> Array:
+        """Centres of the occupied cells with a free neighbour within ``reach``, shape (n, 2)."""
+        column, row = self._cells(pose[:2])
+        span = reach / self.resolution + 1
+        top, left = max(int(row - span), 0), max(int(column - span), 0)
+        r, c = np.nonzero(self._edge[top : int(row + span) + 2, left : int(column + span) + 2])
+        along, across = (c + left - 0.5) * self.resolution, (r + top - 0.5) * self.resolution
+        x, y, yaw = self.origin
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return np.column_stack((x + along * cos - across * sin, y + along * sin + across * cos))
