@@ -29,6 +29,18 @@ class NotFoundError(TruckError):
     reason = Reason.NOT_FOUND
 
 
+class BusyError(TruckError):
+    """Another process already uses an endpoint or a robot's name."""
+
+    reason = Reason.BUSY
+
+
+class NoAnswerError(TruckError):
+    """A robot did not answer in time."""
+
+    reason = Reason.TIMEOUT
+
+
 class RequestRefusedError(TruckError):
     """The robot refused a request."""
 

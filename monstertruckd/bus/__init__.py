@@ -1,0 +1,1 @@
+"""Message bus: hand-over inside the process, and its bridge to Zenoh."""

@@ -1,0 +1,203 @@
+"""In-process hand-over: one write end per topic, any number of read ends, messages passed by reference.
+
+Everything happens on the event loop. A message reaches its readers in the order in which they subscribed; then
+the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all of them.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Generic, TypeVar
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import Delivery, Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Value
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import CMD_DRIVE, CMD_STEERING, EVENT, Topic, Writer
+
+M = TypeVar("M", bound=Message)
+
+TapCallback = Callable[[Topic[Any], Message, bytes], None]
+"""Gets every message of its topics with the bytes that stand for it outside; must not block."""
+
+
+class LocalPublisher(Generic[M]):
+    """Write end of one topic, made by ``Bus``."""
+
+    def __init__(self, bus: "Bus", topic: Topic[M]) -> None:
+        self._bus = bus
+        self._topic = topic
+        self._seq = 0
+
+    def next_seq(self) -> int:
+        """Sequence number for the next message of this topic."""
+        seq = self._seq
+        self._seq += 1
+        return seq
+
+    def put(self, message: M) -> None:
+        """Hand ``message`` to every reader and tap; never blocks."""
+        self._bus.hand_over(self._topic, message)
+
+
+class Tap:
+    """A running tap; ``close()`` ends it."""
+
+    def __init__(self, bus: "Bus", callback: TapCallback, topics: frozenset[str]) -> None:
+        self.callback = callback
+        self.topics = topics
+        self._bus = bus
+
+    def close(self) -> None:
+        """Stop calling back. Closing twice is harmless."""
+        self._bus.untap(self)
+
+
+class Bus:
+    """Topics of one daemon.
+
+    Write ends are handed out once each and only to the writer the topic table names, so that who may write what
+    is settled while the daemon is put together.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._claimed: set[str] = set()
+        self._readers: defaultdict[str, list[Mailbox[Any]]] = defaultdict(list)
+        self._taps: defaultdict[str, list[Tap]] = defaultdict(list)
+        self._retained: dict[str, tuple[Topic[Any], Any]] = {}
+        self._drops = 0
+        self._events = LocalPublisher(self, EVENT)
+
+    def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
+        """The one write end of ``topic``.
+
+        Raises:
+            RuntimeError: ``writer`` is not the topic's writer, the write end is taken, or the topic has none
+                (commands: ``actuators``; events: ``event_sink``; requests: ``inject``).
+        """
+        if topic.group == "cmd" or topic.writer is Writer.OUTSIDE or topic.name == EVENT.name:
+            msg = f"{topic.name} has no plain write end"
+            raise RuntimeError(msg)
+        if writer is not topic.writer:
+            msg = f"{topic.name} is written by {topic.writer}, not by {writer}"
+            raise RuntimeError(msg)
+        return self._claim(topic)
+
+    def actuators(self) -> tuple[Publisher[DriveCommand], Publisher[SteeringCommand]]:
+        """Write ends of the actuators, for the safety gate alone.
+
+        Raises:
+            RuntimeError: they were handed out before.
+        """
+        return self._claim(CMD_DRIVE), self._claim(CMD_STEERING)
+
+    def event_sink(self) -> EventSink:
+        """Where any service reports what happened; all share one topic and its sequence numbers."""
+        return self._emit
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """A read end of ``topic``; of a retained topic it holds the newest message at once."""
+        mailbox: Mailbox[M] = Mailbox(delivery, lambda closed: self._forget(topic.name, closed))
+        self._readers[topic.name].append(mailbox)
+        if (newest := self.newest(topic)) is not None:
+            mailbox.put(newest)
+        return mailbox
+
+    def newest(self, topic: Topic[M]) -> M | None:
+        """Newest message of a retained topic; None before the first, and for every other topic."""
+        held = self._retained.get(topic.name)
+        return None if held is None else held[1]
+
+    def retained(self) -> Iterator[tuple[Topic[Any], Message, bytes]]:
+        """Newest message of every retained topic with its bytes, e.g. for the head of a new log file."""
+        for topic, message in list(self._retained.values()):
+            yield topic, message, wire.encode(topic, message)
+
+    def tap(self, callback: TapCallback, topics: Iterable[Topic[Any]]) -> Tap:
+        """Call back with every message of ``topics``; those of retained topics at once.
+
+        All taps of a topic share one encoding; a topic without taps is never encoded.
+        """
+        chosen = tuple(topics)
+        tap = Tap(self, callback, frozenset(topic.name for topic in chosen))
+        for topic in chosen:
+            self._taps[topic.name].append(tap)
+        for topic, message, data in self.retained():
+            if topic.name in tap.topics:
+                callback(topic, message, data)
+        return tap
+
+    def inject(self, topic: Topic[M], message: M) -> None:
+        """Take in a request from outside; ``received`` becomes the daemon's own time, whatever it claimed.
+
+        Raises:
+            RuntimeError: ``topic`` is not one that outsiders write.
+        """
+        if topic.writer is not Writer.OUTSIDE:
+            msg = f"{topic.name} is written by {topic.writer}, not from outside"
+            raise RuntimeError(msg)
+        self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
+
+    @property
+    def drops(self) -> int:
+        """Messages lost in bounded queues since the start: all FIFO subscriptions, and what ``add_drops`` told."""
+        return self._drops + sum(mailbox.drops for readers in self._readers.values() for mailbox in readers)
+
+    def add_drops(self, count: int) -> None:
+        """Count losses in a queue of someone else."""
+        self._drops += count
+
+    def hand_over(self, topic: Topic[M], message: M) -> None:
+        """Deliver to readers, then to taps; called by the topic's own write end."""
+        name = topic.name
+        if topic.retained:
+            self._retained[name] = (topic, message)
+        for mailbox in tuple(self._readers[name]):
+            mailbox.put(message)
+        taps = tuple(self._taps[name])
+        if taps:
+            data = wire.encode(topic, message)
+            for tap in taps:
+                tap.callback(topic, message, data)
+
+    def untap(self, tap: Tap) -> None:
+        """End ``tap``; see ``Tap.close``."""
+        for name in tap.topics:
+            if tap in self._taps[name]:
+                self._taps[name].remove(tap)
+
+    def _claim(self, topic: Topic[M]) -> LocalPublisher[M]:
+        if topic.name in self._claimed:
+            msg = f"the write end of {topic.name} is already handed out"
+            raise RuntimeError(msg)
+        self._claimed.add(topic.name)
+        return LocalPublisher(self, topic)
+
+    def _forget(self, name: str, mailbox: Mailbox[Any]) -> None:
+        self._drops += mailbox.drops
+        self._readers[name].remove(mailbox)
+
+    def _emit(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
+        now = self._clock.now()
+        self._events.put(
+            Event(
+                stamp=now,
+                received=now,
+                seq=self._events.next_seq(),
+                reason=reason,
+                severity=severity,
+                source=source,
+                text=text,
+                values={name: _plain(value) for name, value in values.items()},
+            )
+        )
+
+
+def _plain(value: Value) -> Value:
+    """A value the wire can carry: non-finite numbers as their name."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,116 @@
+"""Remote calls: named coroutine handlers that take and return JSON objects."""
+
+import json
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import TOPICS
+
+log = logging.getLogger(__name__)
+
+Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Gets the caller's JSON object, returns the answer; refuses by raising ``TruckError``."""
+
+
+class Rpc:
+    """Registry of handlers.
+
+    Args:
+        clock: time of the deadlines.
+        deadline: seconds a handler may take.
+    """
+
+    def __init__(self, clock: Clock, deadline: float = 5.0) -> None:
+        self._clock = clock
+        self._deadline = deadline
+        self._handlers: dict[str, Handler] = {}
+
+    def register(self, name: str, handler: Handler) -> None:
+        """Serve ``name`` by ``handler``.
+
+        Raises:
+            RuntimeError: the name is taken.
+        """
+        if name in self._handlers:
+            msg = f"rpc {name} is registered twice"
+            raise RuntimeError(msg)
+        self._handlers[name] = handler
+
+    async def call(self, name: str, payload: dict[str, Any]) -> dict[str, Any]:
+        """Run one handler.
+
+        Raises:
+            NotFoundError: no such name; the text lists those there are.
+            NoAnswerError: the handler missed its deadline and was cancelled.
+            TruckError: whatever the handler refused with.
+        """
+        handler = self._handlers.get(name)
+        if handler is None:
+            msg = f"no rpc {name!r}; there are {', '.join(sorted(self._handlers)) or 'none'}"
+            raise NotFoundError(msg)
+        try:
+            async with self._clock.deadline(self._deadline) as deadline:
+                return await handler(payload)
+        except TimeoutError:
+            if not deadline.expired():
+                raise
+            msg = f"rpc {name} did not end within {self._deadline} s"
+            raise NoAnswerError(msg) from None
+
+    async def answer(self, name: str, payload: bytes) -> tuple[bool, bytes]:
+        """Serve one call from outside: JSON in, (success, JSON) out; never raises, a handler's bug is logged.
+
+        A failure is ``{"reason": ..., "text": ...}``.
+        """
+        try:
+            return True, json.dumps(await self.call(name, _parse(payload)), allow_nan=False).encode()
+        except TruckError as error:
+            reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+            return False, _failure(reason, str(error))
+        except Exception:
+            log.exception("rpc %s: bug", name)
+            return False, _failure(Reason.INTERNAL, Reason.INTERNAL.text)
+
+
+def topic_rows(robot: str) -> list[dict[str, Any]]:
+    """The topic table as JSON, for tools that know nothing of this program."""
+    return [
+        {
+            "name": topic.name,
+            "key": topic.key(robot),
+            "group": topic.group,
+            "model": topic.model.__name__,
+            "schema": topic.schema_name,
+            "encoding": wire.encoding(topic),
+            "writer": topic.writer.value,
+            "rate": topic.rate,
+            "stale_after": topic.stale_after,
+            "logged": topic.logged,
+            "retained": topic.retained,
+            "doc": topic.doc,
+        }
+        for topic in TOPICS
+    ]
+
+
+def _parse(payload: bytes) -> dict[str, Any]:
+    if not payload:
+        return {}
+    try:
+        value = json.loads(payload)
+    except ValueError as error:
+        msg = f"payload is not JSON: {error}"
+        raise InputError(msg) from None
+    if not isinstance(value, dict):
+        msg = f"payload must be a JSON object, not {type(value).__name__}"
+        raise InputError(msg)
+    return value
+
+
+def _failure(reason: Reason, text: str) -> bytes:
+    return json.dumps({"reason": reason.value, "text": text}).encode()

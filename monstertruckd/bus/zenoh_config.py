@@ -1,0 +1,77 @@
+"""Where and how the robot is reachable over Zenoh."""
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+from monstertruckd.bus.access import access_rules
+
+
+class TlsConfig(Schema):
+    """Mutual TLS for ``tls/...`` endpoints; identities are the common names of the clients' certificates."""
+
+    ca: Path
+    """Certificate of the authority that signed all others."""
+    certificate: Path
+    """The robot's own certificate; must name every address a client dials."""
+    key: Path
+    """Its private key."""
+    pilots: tuple[str, ...] = ()
+    """Common names that may see, ask and drive."""
+    observers: tuple[str, ...] = ()
+    """Common names that may only see."""
+
+
+class ZenohConfig(Schema):
+    """The robot's Zenoh session; the default is reachable from this machine only."""
+
+    mode: Literal["router", "peer"] = "router"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints stations connect to."""
+    connect: tuple[str, ...] = ()
+    """Routers of a fleet to connect to; tried again for ever."""
+    tls: TlsConfig | None = None
+    access_control: bool = False
+    """Refuse forged state from everybody who can connect; always on with ``tls``. Subscribers must then ask for
+    one group (``mt/truck/state/**``): wider expressions get nothing."""
+    max_sessions: int = Field(default=64, ge=1)
+
+
+def session_config(robot: str, config: ZenohConfig) -> str:
+    """Zenoh's own JSON configuration of the robot's session.
+
+    No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
+    (``wait_before_drop`` 0) because a put happens on the event loop; it is deep enough for the largest message.
+    """
+    transport: dict[str, Any] = {
+        "unicast": {"max_sessions": config.max_sessions},
+        "link": {
+            "tx": {"queue": {"size": {"data": 16}, "congestion_control": {"drop": {"wait_before_drop": 0}}}},
+        },
+    }
+    session: dict[str, Any] = {
+        "mode": config.mode,
+        "listen": {"endpoints": config.listen, "exit_on_failure": True},
+        "connect": {"endpoints": config.connect, "timeout_ms": 500, "exit_on_failure": False},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": True},
+        "adminspace": {"enabled": False},
+        "transport": transport,
+    }
+    if config.tls is not None:
+        transport["link"]["tls"] = {
+            "root_ca_certificate": str(config.tls.ca),
+            "listen_certificate": str(config.tls.certificate),
+            "listen_private_key": str(config.tls.key),
+            "connect_certificate": str(config.tls.certificate),
+            "connect_private_key": str(config.tls.key),
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+        }
+        session["access_control"] = access_rules(robot, config.tls.pilots, config.tls.observers)
+    elif config.access_control:
+        session["access_control"] = access_rules(robot)
+    return json.dumps(session)

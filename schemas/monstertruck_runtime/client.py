@@ -1,0 +1,371 @@
+"""What a station or a script uses to watch and drive a robot: typed messages over Zenoh."""
+
+import asyncio
+import getpass
+import json
+import logging
+import os
+import re
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import zenoh
+from zenoh import ext, handlers
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import Clock, WallClock
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.hop import ThreadHop
+from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_schemas.base import Message, Pose2D, Schema
+from monstertruck_schemas.plan import Path as DrivePath
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.topics import (
+    GATE,
+    REQ_CONTROL,
+    REQ_DRIVE,
+    REQ_GOAL,
+    REQ_PATH,
+    Topic,
+    Writer,
+    alive_key,
+    rpc_key,
+)
+
+log = logging.getLogger(__name__)
+
+M = TypeVar("M", bound=Message)
+
+_HOP_DEPTH = 1024
+
+
+class ClientTls(Schema):
+    """Files of a station with its own certificate."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+class TruckClient:
+    """Session with one robot; an async context manager.
+
+    It never listens and never discovers: it dials one endpoint, and again for ever when the robot restarts.
+    Messages that cannot be decoded are logged and skipped.
+
+    Args:
+        robot: name in the keys ``mt/<robot>/...``.
+        endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``.
+        source: this program's name in requests; default ``user@host:pid``.
+        role: what it acts as; decides its priority.
+        clock: time of stamps and deadlines; its own, robots do not trust it.
+        timeout: seconds to wait for the link and for answers.
+        tls: certificate files for ``tls/...`` endpoints.
+    """
+
+    def __init__(
+        self,
+        robot: str = "truck",
+        endpoint: str = "tcp/127.0.0.1:7447",
+        *,
+        source: str | None = None,
+        role: Role = Role.STATION,
+        clock: Clock | None = None,
+        timeout: float = 2.5,
+        tls: ClientTls | None = None,
+    ) -> None:
+        self.robot = robot
+        self.endpoint = endpoint
+        self.source = source or _default_source()
+        self.role = role
+        self._clock = clock or WallClock()
+        self._timeout = timeout
+        self._tls = tls
+        self._session: zenoh.Session | None = None
+        self._subscriptions: dict[Mailbox[Any], Callable[[], None]] = {}
+        self._gate: Mailbox[Any] | None = None
+        # Must grow for each source over runs of this program, too.
+        self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
+
+    async def __aenter__(self) -> Self:
+        """Dial the endpoint.
+
+        Raises:
+            NotFoundError: nothing answers there.
+        """
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open))
+        try:
+            self._session = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            await asyncio.wait([opening])
+            if opening.exception() is None:
+                await asyncio.to_thread(opening.result().close)
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End all subscriptions and the session."""
+        for mailbox in list(self._subscriptions):
+            mailbox.close()
+        session, self._session = self._session, None
+        if session is not None:
+            await asyncio.shield(asyncio.to_thread(session.close))
+
+    # Watching
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Follow ``topic``; of a retained topic the newest message comes at once.
+
+        Args:
+            topic: row of the topic table.
+            delivery: ``latest()`` or ``fifo(n)``.
+        """
+        mailbox: Mailbox[M] = Mailbox(delivery, self._unsubscribe)
+        hop: ThreadHop[bytes] = ThreadHop(
+            lambda data: _deliver(topic, data, mailbox), max(_HOP_DEPTH, delivery.depth), mailbox.lose
+        )
+
+        def receive(sample: zenoh.Sample) -> None:
+            hop.put(sample.payload.to_bytes())
+
+        key = topic.key(self.robot)
+        subscriber = (
+            ext.declare_advanced_subscriber(
+                self._open_session(),
+                key,
+                receive,
+                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            )
+            if topic.retained
+            else self._open_session().declare_subscriber(key, receive)
+        )
+
+        def end() -> None:
+            hop.close()
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        self._subscriptions[mailbox] = end
+        return mailbox
+
+    async def get_retained(self, topic: Topic[M]) -> M | None:
+        """Newest message of a retained topic; None if the robot has published none yet.
+
+        Raises:
+            NoAnswerError: no answer in time.
+            NotFoundError: the robot is not there.
+        """
+        for reply in await self._get(topic.key(self.robot)):
+            return wire.decode(topic, _payload(reply))
+        if await self.alive():
+            return None
+        raise self._absent()
+
+    async def alive(self) -> bool:
+        """Whether the robot's daemon serves at this moment."""
+        replies = await self._collect(
+            lambda handler: self._open_session().liveliness().get(alive_key(self.robot), handler, timeout=self._timeout)
+        )
+        return any(reply.ok is not None for reply in replies)
+
+    # Asking
+
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Call ``rpc`` on the robot with a JSON object; returns its answer.
+
+        Raises:
+            NotFoundError: no such robot or rpc.
+            InputError: the payload was refused.
+            NoAnswerError: no answer in time.
+            RequestRefusedError: refused; carries the reason.
+        """
+        replies = await self._get(rpc_key(self.robot, rpc), json.dumps(payload or {}))
+        if not replies:
+            raise self._absent()
+        answer: dict[str, Any] = json.loads(_payload(replies[0]))
+        return answer
+
+    # Requests
+
+    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
+        """Ask for a speed (m/s) and axle angles (rad, left positive), to stand for ``lease`` seconds.
+
+        Whether it is granted shows in ``state/gate`` (holder, last_seq) and in events.
+
+        Raises:
+            NoAnswerError: the robot's nonce did not come in time.
+        """
+        header = await self._header(lease)
+        self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        """Arm, disarm, emergency stop, reset, stop. Raises as ``drive`` does."""
+        self._put(REQ_CONTROL, ControlRequest(**await self._header(lease), order=order))
+
+    async def goal(self, goal: Pose2D, frame: str = "map", lease: float = 1.0) -> None:
+        """Ask to drive to a pose in ``frame``. Raises as ``drive`` does."""
+        self._put(REQ_GOAL, GoalRequest(**await self._header(lease), frame=frame, goal=goal))
+
+    async def path(self, path: DrivePath, lease: float = 1.0) -> None:
+        """Ask to follow a path computed here. Raises as ``drive`` does."""
+        self._put(REQ_PATH, PathRequest(**await self._header(lease), frame=path.frame, path=path))
+
+    def _put(self, topic: Topic[M], message: M) -> None:
+        assert topic.writer is Writer.OUTSIDE
+        # Requests overtake everything else on the link, and an order is never dropped for lack of room.
+        driving = topic.name == REQ_DRIVE.name
+        self._open_session().put(
+            topic.key(self.robot),
+            wire.encode(topic, message),
+            encoding=wire.encoding(topic),
+            congestion_control=zenoh.CongestionControl.DROP if driving else zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.INTERACTIVE_HIGH if driving else zenoh.Priority.REAL_TIME,
+            express=True,
+        )
+
+    async def _header(self, lease: float) -> dict[str, Any]:
+        if self._gate is None:
+            self._gate = self.subscribe(GATE, latest())
+        if self._gate.latest is None:
+            try:
+                async with self._clock.deadline(self._timeout):
+                    await self._gate.next()
+            except TimeoutError:
+                msg = f"robot {self.robot!r} does not publish its gate state at {self.endpoint}"
+                raise NoAnswerError(msg) from None
+        state = self._gate.latest
+        assert state is not None
+        if state.holder == self.source and state.last_seq is not None:
+            self._seq = max(self._seq, state.last_seq)
+        self._seq += 1
+        now = self._clock.now()
+        return {
+            "stamp": now,
+            "received": now,
+            "seq": self._seq,
+            "source": self.source,
+            "role": self.role,
+            "lease": lease,
+            "nonce": state.nonce,
+        }
+
+    # Zenoh
+
+    def _open(self) -> zenoh.Session:
+        config: dict[str, Any] = {
+            "mode": "client",
+            "connect": {
+                "endpoints": [self.endpoint],
+                "timeout_ms": round(self._timeout * 1000),
+                "exit_on_failure": True,
+            },
+            "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        }
+        if self._tls is not None:
+            config["transport"] = {
+                "link": {
+                    "tls": {
+                        "root_ca_certificate": str(self._tls.ca),
+                        "connect_certificate": str(self._tls.certificate),
+                        "connect_private_key": str(self._tls.key),
+                        "enable_mtls": True,
+                    }
+                }
+            }
+        try:
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        except zenoh.ZError as error:
+            msg = f"no robot answers at {self.endpoint} within {self._timeout} s"
+            raise NotFoundError(msg) from error
+
+    def _open_session(self) -> zenoh.Session:
+        if self._session is None:
+            msg = "use the client inside its 'async with'"
+            raise RuntimeError(msg)
+        return self._session
+
+    def _unsubscribe(self, mailbox: Mailbox[Any]) -> None:
+        self._subscriptions.pop(mailbox)()
+
+    async def _get(self, key: str, payload: str | None = None) -> list[zenoh.Reply]:
+        return await self._collect(
+            lambda handler: self._open_session().get(
+                key,
+                handler,
+                payload=payload,
+                encoding=None if payload is None else "application/json",
+                timeout=self._timeout,
+            )
+        )
+
+    async def _collect(self, ask: Callable[[handlers.Callback[zenoh.Reply]], object]) -> list[zenoh.Reply]:
+        """All replies of a query, gathered without blocking the loop."""
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
+        replies: list[zenoh.Reply] = []
+
+        def finish() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        def ended() -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(finish)
+
+        ask(handlers.Callback(replies.append, ended))
+        await done
+        return replies
+
+    def _absent(self) -> NotFoundError:
+        return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}")
+
+
+def _deliver(topic: Topic[M], data: bytes, mailbox: Mailbox[M]) -> None:
+    try:
+        message = wire.decode(topic, data)
+    except InputError as error:
+        log.warning("message skipped: %s", error)
+    else:
+        mailbox.put(message)
+
+
+def _payload(reply: zenoh.Reply) -> bytes:
+    """Bytes of a good reply.
+
+    Raises:
+        TruckError: the reply is a refusal.
+    """
+    if reply.ok is not None:
+        return reply.ok.payload.to_bytes()
+    assert reply.err is not None
+    raise _refusal(reply.err.payload.to_bytes())
+
+
+def _refusal(data: bytes) -> TruckError:
+    """What an error reply means; Zenoh's own come as plain text."""
+    try:
+        fields = json.loads(data)
+        reason, text = Reason(fields["reason"]), str(fields["text"])  # type: ignore[call-arg]  # look-up by value
+    except (ValueError, KeyError, TypeError):
+        text = data.decode(errors="replace")
+        return NoAnswerError("no answer in time") if text == "Timeout" else RequestRefusedError(Reason.INTERNAL, text)
+    kinds: dict[Reason, type[TruckError]] = {
+        Reason.NOT_FOUND: NotFoundError,
+        Reason.BAD_INPUT: InputError,
+        Reason.TIMEOUT: NoAnswerError,
+    }
+    kind = kinds.get(reason)
+    return RequestRefusedError(reason, text) if kind is None else kind(text)
+
+
+def _default_source() -> str:
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user id without a name
+        user = str(os.getuid())
+    return re.sub(r"[^A-Za-z0-9_.@:-]", "-", f"{user}@{socket.gethostname()}")[:56] + f":{os.getpid()}"

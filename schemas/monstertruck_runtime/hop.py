@@ -1,0 +1,58 @@
+"""The hop from foreign threads onto the event loop."""
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class ThreadHop(Generic[T]):
+    """Bounded queue from any thread to one loop; a burst costs the loop a single wake-up.
+
+    Args:
+        deliver: called on the loop for every item, in the order of ``put``.
+        depth: items that may wait; beyond that the oldest is lost.
+        on_loss: told on the loop how many were lost since the last delivery.
+    """
+
+    def __init__(self, deliver: Callable[[T], None], depth: int, on_loss: Callable[[int], None]) -> None:
+        self._deliver = deliver
+        self._on_loss = on_loss
+        self._items: deque[T] = deque(maxlen=depth)
+        self._loop = asyncio.get_running_loop()
+        self._lock = threading.Lock()
+        self._scheduled = False
+        self._closed = False
+        self._lost = 0
+
+    def put(self, item: T) -> None:
+        """Queue ``item``; callable from any thread, never blocks."""
+        with self._lock:
+            if self._closed:
+                return
+            if len(self._items) == self._items.maxlen:
+                self._lost += 1
+            self._items.append(item)
+            if not self._scheduled:
+                self._scheduled = True
+                self._loop.call_soon_threadsafe(self._drain)
+
+    def close(self) -> None:
+        """Discard what waits and everything to come; to be called while the loop lives."""
+        with self._lock:
+            self._closed = True
+            self._items.clear()
+
+    def _drain(self) -> None:
+        with self._lock:
+            self._scheduled = False
+            batch = list(self._items)
+            self._items.clear()
+            lost, self._lost = self._lost, 0
+        if lost:
+            self._on_loss(lost)
+        for item in batch:
+            self._deliver(item)

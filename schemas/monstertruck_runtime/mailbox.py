@@ -1,0 +1,130 @@
+"""Read ends of topics: a mailbox per subscription, with the delivery chosen by its reader."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+from monstertruck_schemas.base import Message
+
+M = TypeVar("M", bound=Message)
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """How many unread messages wait, and whether losing the oldest one is a loss; see ``latest`` and ``fifo``."""
+
+    depth: int
+    counted: bool
+
+
+def latest() -> Delivery:
+    """Only the newest message waits; older ones are superseded, which is no loss."""
+    return Delivery(1, counted=False)
+
+
+def fifo(depth: int) -> Delivery:
+    """Up to ``depth`` messages wait in order; beyond that the oldest is lost and counted."""
+    if depth < 1:
+        msg = f"a FIFO holds at least one message, not {depth}"
+        raise ValueError(msg)
+    return Delivery(depth, counted=True)
+
+
+class Mailbox(Generic[M]):
+    """Subscription of one reader; iterate it, or await ``next()``.
+
+    Args:
+        delivery: what waits while the reader is busy.
+        on_close: told once when the mailbox is closed.
+    """
+
+    def __init__(self, delivery: Delivery, on_close: Callable[["Mailbox[M]"], None] = lambda _: None) -> None:
+        self._unread: deque[M] = deque(maxlen=delivery.depth)
+        self._counted = delivery.counted
+        self._on_close = on_close
+        self._latest: M | None = None
+        self._drops = 0
+        self._reader: asyncio.Future[None] | None = None
+        self._closed = False
+
+    @property
+    def latest(self) -> M | None:
+        """Newest message, or None before the first; reading it consumes nothing."""
+        return self._latest
+
+    @property
+    def drops(self) -> int:
+        """Messages lost because the FIFO was full."""
+        return self._drops
+
+    def lose(self, count: int) -> None:
+        """Count messages that were lost on their way here."""
+        if self._counted:
+            self._drops += count
+
+    def put(self, message: M) -> None:
+        """Deliver ``message``; never blocks. A waiting reader runs in the loop's next turn."""
+        if self._closed:
+            return
+        self._latest = message
+        if self._counted and len(self._unread) == self._unread.maxlen:
+            self._drops += 1
+        self._unread.append(message)
+        self._wake()
+
+    async def next(self) -> M:
+        """Wait for a message not returned by ``next`` yet.
+
+        Raises:
+            RuntimeError: the mailbox is closed, or another task already waits on it.
+        """
+        while not self._unread:
+            if self._closed:
+                msg = "the subscription is closed"
+                raise RuntimeError(msg)
+            if self._reader is not None:
+                msg = "a subscription has one reader; subscribe again for another"
+                raise RuntimeError(msg)
+            self._reader = asyncio.get_running_loop().create_future()
+            try:
+                await self._reader
+            finally:
+                self._reader = None
+        return self._unread.popleft()
+
+    def close(self) -> None:
+        """End the subscription; unread messages are gone and iteration ends. Closing twice is harmless."""
+        if self._closed:
+            return
+        self._closed = True
+        self._unread.clear()
+        self._wake()
+        self._on_close(self)
+
+    def _wake(self) -> None:
+        if self._reader is not None and not self._reader.done():
+            self._reader.set_result(None)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> M:
+        while True:
+            if self._closed:
+                raise StopAsyncIteration
+            try:
+                return await self.next()
+            except RuntimeError:
+                if not self._closed:
+                    raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,153 @@
+"""Mailboxes: delivery, counting, waking, closing; and the hop from foreign threads."""
+
+import asyncio
+import threading
+
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.hop import ThreadHop
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_schemas.base import Message
+
+
+def message(seq: int) -> Message:
+    return Message(stamp=seq, received=seq, seq=seq)
+
+
+async def test_latest_supersedes_without_counting():
+    box: Mailbox[Message] = Mailbox(latest())
+    for seq in range(5):
+        box.put(message(seq))
+    assert (await box.next()).seq == 4
+    assert box.drops == 0
+    box.lose(3)
+    assert box.drops == 0
+
+
+async def test_fifo_keeps_the_newest_in_order_and_counts():
+    box: Mailbox[Message] = Mailbox(fifo(3))
+    for seq in range(5):
+        box.put(message(seq))
+    assert [(await box.next()).seq for _ in range(3)] == [2, 3, 4]
+    assert box.drops == 2
+    box.lose(3)
+    assert box.drops == 5
+
+
+def test_a_fifo_needs_room():
+    with pytest.raises(ValueError, match="at least one"):
+        fifo(0)
+
+
+async def test_reading_latest_consumes_nothing():
+    box: Mailbox[Message] = Mailbox(fifo(2))
+    assert box.latest is None
+    first = message(0)
+    box.put(first)
+    assert box.latest is first
+    assert await box.next() is first
+    assert box.latest is first
+
+
+async def test_next_waits_and_a_cancelled_wait_loses_nothing():
+    box: Mailbox[Message] = Mailbox(latest())
+    waiting = asyncio.create_task(box.next())
+    await asyncio.sleep(0)
+    box.put(message(1))
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert (await box.next()).seq == 1
+
+
+async def test_a_mailbox_has_one_reader():
+    box: Mailbox[Message] = Mailbox(latest())
+    waiting = asyncio.create_task(box.next())
+    await asyncio.sleep(0)
+    with pytest.raises(RuntimeError, match="one reader"):
+        await box.next()
+    with pytest.raises(RuntimeError, match="one reader"):
+        await anext(aiter(box))
+    box.put(message(1))
+    await waiting
+
+
+async def test_close_ends_iteration_and_tells_once():
+    told: list[Mailbox[Message]] = []
+    box: Mailbox[Message] = Mailbox(fifo(4), told.append)
+    box.put(message(0))
+
+    async def read() -> list[int]:
+        return [m.seq async for m in box]
+
+    reading = asyncio.create_task(read())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    with box:
+        pass
+    box.close()
+    box.put(message(1))
+    assert await reading == [0]
+    assert told == [box]
+    assert [m async for m in box] == []
+    with pytest.raises(RuntimeError, match="closed"):
+        await box.next()
+
+
+def test_readers_wake_in_the_order_of_delivery():
+    async def main(_: VirtualClock) -> list[str]:
+        boxes = {name: Mailbox[Message](latest()) for name in "abcde"}
+        woken: list[str] = []
+
+        async def read(name: str) -> None:
+            await boxes[name].next()
+            woken.append(name)
+
+        tasks = [asyncio.create_task(read(name)) for name in "edcba"]
+        await asyncio.sleep(0)
+        for box in boxes.values():
+            box.put(message(0))
+        await asyncio.gather(*tasks)
+        return woken
+
+    assert run_virtual(main) == list("abcde")
+
+
+async def test_a_burst_from_a_thread_wakes_the_loop_once_and_keeps_order():
+    loop = asyncio.get_running_loop()
+    wakes = 0
+    original = loop.call_soon_threadsafe
+
+    def counting(*args, **kwargs):
+        nonlocal wakes
+        wakes += 1
+        return original(*args, **kwargs)
+
+    loop.call_soon_threadsafe = counting
+    got: list[int] = []
+    lost: list[int] = []
+    hop: ThreadHop[int] = ThreadHop(got.append, 100, lost.append)
+    thread = threading.Thread(target=lambda: [hop.put(i) for i in range(50)])
+    thread.start()
+    thread.join()  # the loop cannot run meanwhile
+    assert wakes == 1
+    await asyncio.sleep(0.01)
+    assert got == list(range(50))
+    assert lost == []
+
+
+async def test_a_full_hop_loses_the_oldest_and_says_how_many():
+    got: list[int] = []
+    lost: list[int] = []
+    hop: ThreadHop[int] = ThreadHop(got.append, 3, lost.append)
+    for i in range(5):
+        hop.put(i)
+    await asyncio.sleep(0)
+    assert got == [2, 3, 4]
+    assert lost == [2]
+    hop.put(5)
+    hop.close()
+    hop.put(6)
+    await asyncio.sleep(0)
+    assert got == [2, 3, 4]
