@@ -1,0 +1,216 @@
+"""Everything that can be chosen about the simulated world; the defaults are the truck's.
+
+These are the *true* values of the plant. What the daemon believes stands in its own calibration, so a hidden error
+is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Pose2D, Schema
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class ServoConfig(Schema):
+    """One steering servo; a positive angle turns its wheels to the left."""
+
+    channel: Annotated[int, Field(ge=0, le=5)]
+    """Output of the servo controller."""
+    centre_us: Positive = 1439.2
+    """Pulse at which the servo arm stands straight, us."""
+    us_per_degree: float = -10.48
+    """Pulse change per degree of servo angle, us."""
+    rate: Positive = 6.0
+    """Greatest servo speed, rad/s (0.17 s for 60 degrees)."""
+    dead_band_us: NotNegative = 2.0
+    """The servo does not move for a smaller change of its pulse, us."""
+    resolution_us: Positive = 1.0
+    """Steps in which the servo measures its pulse, us."""
+
+
+class MotorConfig(Schema):
+    """Drive motor and what lies between it and the ground."""
+
+    inverted: bool = True
+    """The controller's positive sense drives the truck backwards."""
+    ratio: Positive = 644.0
+    """Motor turns per wheel turn."""
+    lag: Positive = 0.02
+    """Time constant of the controller's speed loop, s."""
+    drivetrain_lag: Positive = 0.08
+    """Time constant with which the wheels follow the motor (wind-up of gears, shafts and tyres), s."""
+    clutch_force: Positive = 25.0
+    """Pull at the ground at which the slipper clutch slips, N (less than the grip of 35 N: wheels never spin)."""
+    coast_rpm_s: Positive = 30_000.0
+    """Deceleration of the unpowered motor by friction, rpm/s."""
+    torque_constant: Positive = 0.0127
+    """Nm/A (24 V at 18000 rpm)."""
+    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Of all gear stages together."""
+    idle_current: NotNegative = 0.08
+    """Current of the unloaded turning motor, A."""
+    rotor_inertia: NotNegative = 1e-6
+    """kg m^2."""
+    winding_resistance: NotNegative = 2.0
+    """Ohm."""
+    current_noise: NotNegative = 0.01
+    """Standard deviation of the measured current, A."""
+
+
+class TruckConfig(Schema):
+    """Body, wheels and tyres.
+
+    Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (gravity on a
+    side slope included); the body covers less ground than the wheels roll by ``slip_per_newton`` times the pull.
+    Both carry a slow random part.
+    """
+
+    wheelbase: Positive = 0.32
+    """m."""
+    track: Positive = 0.26
+    """m."""
+    wheel_radius: Positive = 0.075
+    """m."""
+    length: Positive = 0.47
+    """Of the footprint, centred on the geometric centre, m."""
+    width: Positive = 0.34
+    """Of the footprint, m."""
+    mass: Positive = 7.25
+    """kg."""
+    rolling_resistance: NotNegative = 0.05
+    """Of the weight."""
+    front_slip_angle: NotNegative = 0.06
+    """rad per m/s^2."""
+    rear_slip_angle: NotNegative = 0.04
+    """rad per m/s^2; less than in front: the truck understeers a little."""
+    slip_angle_noise: NotNegative = 0.004
+    """Standard deviation of the random part of each axle's slip angle, rad."""
+    slip_per_newton: NotNegative = 0.0005
+    """Longitudinal slip ratio per N of pull."""
+    slip_noise: NotNegative = 0.005
+    """Standard deviation of the random part of the longitudinal slip ratio."""
+    steering: Literal["corrected", "as_published", "2016"] = "corrected"
+    """Set of linkage polynomials."""
+    front_servo: ServoConfig = ServoConfig(channel=1)
+    rear_servo: ServoConfig = ServoConfig(channel=0)
+    motor: MotorConfig = MotorConfig()
+
+
+class BatteryConfig(Schema):
+    """6S LiPo pack and its measurement."""
+
+    capacity_ah: Positive = 5.0
+    charge: Fraction = 0.95
+    """At the start, of the capacity."""
+    resistance: NotNegative = 0.08
+    """Of cells and wiring, acts at once, ohm."""
+    recovery_resistance: NotNegative = 0.04
+    """Additional sag that builds up and recovers with ``recovery_time``, ohm."""
+    recovery_time: Positive = 20.0
+    """s."""
+    electronics_w: NotNegative = 25.0
+    """Constant load of computer, sensors and hubs, W."""
+    divider: Positive = 10.0
+    """Pack volts per volt at the analog input."""
+    channel: Annotated[int, Field(ge=0, le=5)] = 5
+    """Analog input of the servo controller."""
+    filter_time: Positive = 0.1
+    """Time constant of the divider's RC low-pass, s."""
+    analog_noise: NotNegative = 0.003
+    """Standard deviation at the analog input, V."""
+
+
+class LidarConfig(Schema):
+    """Hokuyo URG-04LX: steps 0..768, 1024 steps a turn, ten turns a second."""
+
+    x: float = 0.14
+    """Mount before the geometric centre, m."""
+    height: Positive = 0.25
+    """Of the scanning plane over the ground, m."""
+    first_step: Annotated[int, Field(ge=0, le=768)] = 44
+    last_step: Annotated[int, Field(ge=0, le=768)] = 725
+    min_range: NotNegative = 0.02
+    """Nearer surfaces give an error code, m."""
+    max_range: Positive = 5.6
+    """m."""
+    accuracy_sigmas: Positive = 2.0
+    """How many standard deviations the data sheet's bound (10 mm to 1 m, 1 % beyond) is."""
+    dropout: Fraction = 0.002
+    """Chance of a single beam to fail."""
+    wall_height: Positive = 0.6
+    """Of everything in the map: beams tilted upwards pass over it, m."""
+
+
+class Iron(Schema):
+    """Magnetic error of the truck's own metal: measured = soft * true + hard, per device axis x, y, z."""
+
+    hard_x: float = 0.0
+    """mG."""
+    hard_y: float = 0.0
+    """mG."""
+    hard_z: float = 0.0
+    """mG."""
+    soft_x: float = 1.0
+    soft_y: float = 1.0
+    soft_z: float = 1.0
+
+
+class CompassConfig(Schema):
+    """OS4000 on the body; its axes are x forward, y left, z up."""
+
+    north_yaw: float = 1.5707963267948966
+    """Direction of magnetic north in the map frame, rad."""
+    horizontal_field: Positive = 250.0
+    """mG."""
+    vertical_field: float = -390.0
+    """Upwards, mG (northern hemisphere: down)."""
+    deviation_deg: NotNegative = 0.4
+    """Greatest error of a fixed smooth curve over the heading."""
+    noise_deg: NotNegative = 0.1
+    """Standard deviation of heading, pitch and roll."""
+    tilt_bias_deg: NotNegative = 0.2
+    """Greatest fixed error of pitch and of roll."""
+    motor_field: float = 5.0
+    """Field along the device's y per ampere of motor current, mG/A (1.1 degrees at 1 A)."""
+    temperature_c: float = 25.0
+    iron: Iron = Iron()
+
+
+class FlatTilt(Schema):
+    """The ground is level, or follows the profile that lies beside the map."""
+
+    kind: Literal["ground"] = "ground"
+
+
+class SinusoidTilt(Schema):
+    """The body rocks with time, whatever the ground."""
+
+    kind: Literal["sinusoid"]
+    pitch_deg: float = 15.0
+    """Amplitude, nose down positive."""
+    roll_deg: float = 0.0
+    """Amplitude, right side down positive; a quarter period after pitch."""
+    frequency: Positive = 0.5
+    """Hz."""
+
+
+TiltConfig = Annotated[FlatTilt | SinusoidTilt, Field(discriminator="kind")]
+
+
+class WorldConfig(Schema):
+    """One simulated world with one truck in it."""
+
+    map: str = "loop"
+    """Name of a built-in world, or path of a map_server YAML file (a ``NAME.profile.yaml`` beside it is its ground)."""
+    start: Pose2D | None = None
+    """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
+    noise: bool = True
+    truck: TruckConfig = TruckConfig()
+    battery: BatteryConfig = BatteryConfig()
+    lidar: LidarConfig = LidarConfig()
+    compass: CompassConfig = CompassConfig()
+    tilt: TiltConfig = FlatTilt()

@@ -1,0 +1,151 @@
+"""Occupancy maps in the map_server format: one YAML file that names one image.
+
+The world's array convention differs from the image's: row 0 is the lowest y, so cell (row, column) covers
+``origin + resolution * ([column, column + 1], [row, row + 1])``.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from monstertruck_runtime.errors import InputError
+
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Cell values, as in an occupancy grid message."""
+
+_REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+_MODES = ("trinary", "scale", "raw")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldMap:
+    """A ternary occupancy map, axis-aligned with the map frame.
+
+    Args:
+        cells: int8 (rows, columns) of ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row 0 is the lowest y; read-only.
+        resolution: side of a cell, m.
+        origin: x, y of the outer corner of cell (0, 0), m.
+    """
+
+    cells: NDArray[np.int8]
+    resolution: float
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        cells = np.array(self.cells, dtype=np.int8, order="C")
+        cells.flags.writeable = False
+        object.__setattr__(self, "cells", cells)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extent in x and y, m."""
+        rows, columns = self.cells.shape
+        return columns * self.resolution, rows * self.resolution
+
+
+def load_map(path: Path) -> WorldMap:
+    """Read a map_server YAML file and the image it names (relative to the YAML).
+
+    Thresholds apply as in map_server: with p = darkness in 0..1 (lightness if ``negate``), p > occupied_thresh
+    is occupied, p < free_thresh free, the rest unknown. ``mode: raw`` takes the pixel value itself as percent.
+    Colour images count by the mean of their colours; alpha matters only in ``mode: scale``: transparent is unknown.
+
+    Raises:
+        InputError: file, key and expectation of whatever is wrong.
+    """
+    keys = _read_yaml(path)
+    values, opaque = _read_image(path, path.parent / str(keys["image"]))
+    mode, negate = keys["mode"], bool(keys["negate"])
+    if mode == "raw":
+        darkness = np.where(values <= 100, values / 100.0, np.nan)
+    else:
+        darkness = values / 255.0 if negate else (255.0 - values) / 255.0
+    cells = np.full(values.shape, UNKNOWN, dtype=np.int8)
+    cells[darkness > keys["occupied_thresh"]] = OCCUPIED
+    cells[darkness < keys["free_thresh"]] = FREE
+    if mode == "scale":
+        cells[~opaque] = UNKNOWN
+    return WorldMap(np.flipud(cells), keys["resolution"], (keys["origin"][0], keys["origin"][1]))
+
+
+def save_map(world: WorldMap, path: Path) -> None:
+    """Write ``path`` (YAML) and a grey PNG of the same stem beside it; ``load_map`` reads back an equal map."""
+    shades = np.full(world.cells.shape, 205, dtype=np.uint8)
+    shades[world.cells == FREE] = 254
+    shades[world.cells == OCCUPIED] = 0
+    image = path.with_suffix(".png")
+    Image.fromarray(np.flipud(shades)).save(image, optimize=True)
+    keys = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": world.resolution,
+        "origin": [*world.origin, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    path.write_text(yaml.safe_dump(keys, sort_keys=False), encoding="utf-8")
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        keys = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot read the map: {error}") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(keys, dict):
+        raise InputError(f"{path}: expected a mapping with the keys {', '.join(_REQUIRED)}")
+    if unknown := sorted(str(key) for key in keys.keys() - {*_REQUIRED, "mode"}):
+        raise InputError(f"{path}: {unknown[0]}: unknown key; known are {', '.join(_REQUIRED)}, mode")
+    for key in _REQUIRED:
+        if key not in keys:
+            raise InputError(f"{path}: {key}: missing")
+    keys.setdefault("mode", "trinary")
+    _check_values(path, keys)
+    return keys
+
+
+def _check_values(path: Path, keys: dict[str, Any]) -> None:
+    def refuse(key: str, expected: str) -> InputError:
+        return InputError(f"{path}: {key}: expected {expected}, got {keys[key]!r}")
+
+    if not isinstance(keys["image"], str):
+        raise refuse("image", "a file name")
+    if not (_is_number(keys["resolution"]) and keys["resolution"] > 0):
+        raise refuse("resolution", "metres per cell > 0")
+    origin = keys["origin"]
+    if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_number, origin))):
+        raise refuse("origin", "[x, y, yaw]")
+    if origin[2] != 0:
+        raise refuse("origin", "yaw 0 (turned maps are not supported)")
+    if keys["negate"] not in (0, 1):
+        raise refuse("negate", "0 or 1")
+    for key in ("occupied_thresh", "free_thresh"):
+        if not (_is_number(keys[key]) and 0 <= keys[key] <= 1):
+            raise refuse(key, "a number in 0..1")
+    if keys["free_thresh"] >= keys["occupied_thresh"]:
+        raise refuse("free_thresh", "less than occupied_thresh")
+    if keys["mode"] not in _MODES:
+        raise refuse("mode", f"one of {', '.join(_MODES)}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _read_image(source: Path, path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Grey values 0..255 and opacity, both (rows, columns), top row first."""
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError as error:
+        raise InputError(f"{source}: image: {path} is not a known image format") from error
+    except OSError as error:
+        raise InputError(f"{source}: image: cannot read {path}: {error}") from error
+    return pixels[..., :3].mean(axis=-1), pixels[..., 3] > 0
