@@ -4,14 +4,14 @@ import math
 from pathlib import Path
 from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar
 
+from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
-from monstertruck_drivers.os4000.config import Os4000Config
-from monstertruck_estimation.odometry import OdometryConfig
-from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruckd.bus.config import ZenohConfig
@@ -100,14 +100,17 @@ class Geometry(Schema):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if self.length < self.wheelbase:
-            raise ValueError(f"impossible geometry: length {self.length} m is less than the wheelbase {self.wheelbase} m")
-        if self.width < self.track:
-            raise ValueError(f"impossible geometry: width {self.width} m is less than the track {self.track} m")
-        if self.wheelbase <= 2 * self.wheel_radius:
-            raise ValueError(
-                f"impossible geometry: wheels of radius {self.wheel_radius} m touch at a wheelbase of {self.wheelbase} m"
-            )
+        impossible = (
+            f"length {self.length} m is less than the wheelbase {self.wheelbase} m"
+            if self.length < self.wheelbase
+            else f"width {self.width} m is less than the track {self.track} m"
+            if self.width < self.track
+            else f"wheels of radius {self.wheel_radius} m touch at a wheelbase of {self.wheelbase} m"
+            if self.wheelbase <= 2 * self.wheel_radius
+            else None
+        )
+        if impossible is not None:
+            raise ValueError(f"impossible geometry: {impossible}")
         return self
 
 

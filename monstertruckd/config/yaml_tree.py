@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 
@@ -99,10 +99,10 @@ def _merge(base: Tree, top: Tree, prefix: Key) -> None:
         base.origins[key] = top.origins[key]
 
 
-def _at(data: dict[str, Any], key: Key) -> dict[str, Any]:
+def _at(data: Any, key: Key) -> dict[str, Any]:
     for part in key:
         data = data[part]
-    return data
+    return cast("dict[str, Any]", data)
 
 
 def _build(node: yaml.Node, path: Path, key: Key, origins: dict[Key, Origin]) -> Any:
@@ -112,7 +112,7 @@ def _build(node: yaml.Node, path: Path, key: Key, origins: dict[Key, Origin]) ->
     if isinstance(node, yaml.SequenceNode):
         return [_build(item, path, (*key, index), origins) for index, item in enumerate(node.value)]
     try:
-        return yaml.SafeLoader("").construct_object(node)  # type: ignore[no-untyped-call]
+        return yaml.SafeLoader("").construct_object(node)
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path}:{node.start_mark.line + 1}: cannot read the value: {error}") from error
 

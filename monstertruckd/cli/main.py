@@ -1,0 +1,61 @@
+"""The ``monstertruckd`` command: mounts the command groups and turns expected errors into exit codes."""
+
+import os
+import sys
+
+import typer
+
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
+from monstertruckd import __version__
+from monstertruckd.cli import demo, devices, kinematics, live, logs, robot
+
+app = typer.Typer(
+    name="monstertruckd",
+    help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    pass
+
+
+app.command("demo")(demo.demo)
+app.command("run")(robot.run)
+app.command("check-config")(robot.check_config)
+app.command("topics")(robot.topics)
+app.command("status")(live.status)
+app.command("echo")(live.echo)
+app.command("replay")(logs.replay)
+app.command("emulate")(devices.emulate)
+app.command("probe")(devices.probe)
+app.add_typer(logs.app, name="log")
+app.add_typer(kinematics.app, name="kinematics")
+
+
+def main() -> None:
+    """Run the command line; expected errors become one line and the reason's exit code."""
+    try:
+        app()
+    except TruckError as error:
+        print(error, file=sys.stderr)
+        reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+        sys.exit(reason.exit_code)
+    except BrokenPipeError:  # e.g. `monstertruckd echo | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""The live screen: what the truck believes, what limits it, how its services are. Pure: messages in, picture out."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.layout import Layout
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
+from monstertruck_schemas.plan import TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude, Battery, LaserScan
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+
+MODE_STYLE = {
+    GateMode.DISARMED: "yellow",
+    GateMode.ARMED: "cyan",
+    GateMode.DRIVING: "bold green",
+    GateMode.STOPPING: "bold yellow",
+    GateMode.ESTOPPED: "bold red",
+}
+STATE_STYLE = {
+    ServiceState.STARTING: "cyan",
+    ServiceState.READY: "green",
+    ServiceState.BACKOFF: "yellow",
+    ServiceState.FAILED: "bold red",
+    ServiceState.STOPPED: "dim",
+}
+EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
+VIEW_METRES = 2.4
+"""Half the width of the scan view."""
+
+
+@dataclass(slots=True)
+class ScreenState:
+    """Newest message of everything the screen shows."""
+
+    robot: str
+    started: int
+    now: int = 0
+    gate: GateState | None = None
+    odometry: Odometry | None = None
+    scan: LaserScan | None = None
+    attitude: Attitude | None = None
+    battery: Battery | None = None
+    tracker: TrackerState | None = None
+    health: HealthTable | None = None
+    loop: LoopHealth | None = None
+    recorder: RecorderHealth | None = None
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=8))
+    trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=2000))
+
+    def take(self, message: object) -> None:
+        """Remember ``message`` if the screen shows its kind."""
+        match message:
+            case GateState():
+                self.gate = message
+            case Odometry():
+                self.odometry = message
+                spot = (message.pose.x, message.pose.y)
+                if not self.trail or math.dist(spot, self.trail[-1]) > 0.03:
+                    self.trail.append(spot)
+            case LaserScan():
+                self.scan = message
+            case Attitude():
+                self.attitude = message
+            case Battery():
+                self.battery = message
+            case TrackerState():
+                self.tracker = message
+            case HealthTable():
+                self.health = message
+            case LoopHealth():
+                self.loop = message
+            case RecorderHealth():
+                self.recorder = message
+            case Event():
+                self.events.append(message)
+            case _:
+                pass
+
+
+def draw(state: ScreenState) -> RenderableType:
+    """The whole screen."""
+    layout = Layout()
+    layout.split_column(Layout(name="top", ratio=1), Layout(_events(state), name="events", size=8))
+    layout["top"].split_row(
+        Layout(_truck(state), name="truck", size=34),
+        Layout(Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim"), name="scan"),
+        Layout(_services(state), name="services", size=40),
+    )
+    return layout
+
+
+def _row(table: Table, name: str, value: str | Text) -> None:
+    table.add_row(Text(name, style="dim"), value)
+
+
+def _truck(state: ScreenState) -> Panel:
+    table = Table.grid(padding=(0, 1))
+    gate, odometry = state.gate, state.odometry
+    if gate is not None:
+        _row(table, "gate", Text(gate.mode.value.upper(), style=MODE_STYLE[gate.mode]))
+        _row(table, "driver", f"{gate.holder or '-'}{f' ({gate.role.value})' if gate.role else ''}")
+        _row(table, "lease left", "-" if gate.lease_left is None else f"{gate.lease_left * 1000:.0f} ms")
+        _row(table, "limit", f"{gate.speed_limit:.2f} m/s")
+        _row(table, "stops within", f"{gate.stopping_distance * 100:.1f} cm")
+        _row(table, "why", Text("\n".join(r.text for r in gate.reasons[:3]) or "-", style="yellow"))
+    if odometry is not None:
+        speed = math.copysign(math.hypot(odometry.twist.vx, odometry.twist.vy), odometry.twist.vx)
+        _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
+        _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s")
+    if state.attitude is not None:
+        _row(table, "tilt", f"{math.degrees(state.attitude.roll):+.1f}° {math.degrees(state.attitude.pitch):+.1f}°")
+    if state.battery is not None:
+        volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.1f} V"
+        _row(table, "battery", f"{volts} {state.battery.level.value}")
+    if state.tracker is not None:
+        done = state.tracker.along / state.tracker.length if state.tracker.length else 0.0
+        bar = "█" * round(done * 14)
+        _row(table, "path", f"{bar:░<14} {done:4.0%}")
+        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
+    if state.loop is not None:
+        _row(
+            table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}"
+        )
+    return Panel(table, title=f"mt/{state.robot}", border_style="dim")
+
+
+def _services(state: ScreenState) -> Panel:
+    table = Table.grid(padding=(0, 1))
+    for row in state.health.services if state.health is not None else ():
+        age = max(0, state.now - row.since) / 1e9
+        table.add_row(
+            row.name,
+            Text(row.state.value, style=STATE_STYLE[row.state]),
+            Text(f"{age:.0f} s" if age < 100 else f"{age / 60:.0f} min", style="dim"),
+            Text(f"↻{row.restarts}" if row.restarts else "", style="yellow"),
+        )
+    parts: list[RenderableType] = [table]
+    if state.recorder is not None and state.recorder.recording:
+        parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB", style="red"))
+    elif state.recorder is not None and state.recorder.reason is not Reason.OK:
+        parts.append(Text(f"NOT RECORDING: {state.recorder.reason.text}", style="bold red"))
+    return Panel(Group(*parts), title="services", border_style="dim")
+
+
+def _events(state: ScreenState) -> Panel:
+    lines = Text()
+    for event in list(state.events)[-6:]:
+        seconds = (event.stamp - state.started) / 1e9
+        lines.append(f"{seconds:8.2f} s  ", style="dim")
+        lines.append(f"{event.source}: ", style="bold")
+        lines.append(event.text or event.reason.text, style=EVENT_STYLE[event.severity])
+        lines.append(f"  [{event.reason.value}]\n", style="dim")
+    return Panel(lines, title="events", border_style="dim")
+
+
+class _Braille:
+    """Scan points and trail as braille dots, forward up, sized by the space there is."""
+
+    def __init__(self, state: ScreenState) -> None:
+        self._state = state
+
+    def __rich_console__(self, _console: object, options: object) -> "list[Text]":
+        width: int = getattr(options, "max_width", 60)
+        height: int = getattr(options, "height", None) or 20
+        scale = min(width * 2, height * 4) / (2 * VIEW_METRES)
+        cells = np.zeros((height, width), np.uint8)
+        _plot(cells, scan_points(self._state.scan), scale)
+        trail_cells = np.zeros_like(cells)
+        _plot(trail_cells, _trail_points(self._state), scale)
+        lines = [Text() for _ in range(height)]
+        for line, row, trail in zip(lines, cells, trail_cells, strict=True):
+            for bits, trail_bits in zip(row.tolist(), trail.tolist(), strict=True):
+                style = "green" if trail_bits and not bits else "cyan"
+                line.append(chr(0x2800 + (bits | trail_bits)), style=style)
+        lines[height // 2].plain = _with_arrow(lines[height // 2].plain, width // 2)
+        return lines
+
+
+def _with_arrow(line: str, at: int) -> str:
+    return f"{line[:at]}▲{line[at + 1 :]}"
+
+
+def scan_points(scan: LaserScan | None, mount_x: float = 0.14) -> np.ndarray:
+    """Valid returns as points in the base frame, shape (n, 2), m."""
+    if scan is None:
+        return np.empty((0, 2))
+    angles = np.linspace(scan.start_angle, scan.end_angle, len(scan.ranges))
+    seen = np.isfinite(scan.ranges)
+    ranges = scan.ranges[seen]
+    return np.column_stack([mount_x + ranges * np.cos(angles[seen]), ranges * np.sin(angles[seen])])
+
+
+def _trail_points(state: ScreenState) -> np.ndarray:
+    if state.odometry is None or not state.trail:
+        return np.empty((0, 2))
+    pose = state.odometry.pose
+    offset = np.array(state.trail) - (pose.x, pose.y)
+    cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
+    return offset @ np.array([[cos, -sin], [sin, cos]])
+
+
+_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
+
+
+def _plot(cells: np.ndarray, points: np.ndarray, scale: float) -> None:
+    """Set the braille dots of ``points`` (x forward = up, y left = left) around the middle of ``cells``."""
+    height, width = cells.shape
+    column = np.round(width - points[:, 1] * scale).astype(int)
+    row = np.round(height * 2 - points[:, 0] * scale).astype(int)
+    inside = (column >= 0) & (column < width * 2) & (row >= 0) & (row < height * 4)
+    row, column = row[inside], column[inside]
+    np.bitwise_or.at(cells, (row // 4, column // 2), _BITS[row % 4, column % 2])

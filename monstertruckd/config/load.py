@@ -1,0 +1,22 @@
+"""Loads a truck's configuration file, simulated or not."""
+
+from pathlib import Path
+
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.validate import load_config
+from monstertruckd.config.yaml_tree import Tree, load_tree
+
+
+def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
+    """The configuration at ``path``; with a section ``sim`` the world's settings are checked too.
+
+    Raises:
+        ConfigError: one line per mistake.
+    """
+    model: type[TruckConfig] = TruckConfig
+    if "sim" in load_tree(path).data:
+        # Only a simulated run may load the world.
+        from monstertruckd.sim.config import SimulatedTruckConfig  # noqa: PLC0415
+
+        model = SimulatedTruckConfig
+    return load_config(path, model)

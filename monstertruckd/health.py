@@ -1,0 +1,82 @@
+"""Health of every service as a topic, and real time against the daemon's own."""
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import ClockOffset
+
+PERIOD = 1.0
+STEP = SECOND // 20
+"""A change of the real-time offset within one period beyond this is a step, not drift (NTP slews < 1 ms/s)."""
+
+
+class HealthBoard:
+    """Collects every service's state, publishes the table on change and once a second.
+
+    The first loss and the recovery of a service are events; repeated failures of one outage are not.
+    """
+
+    name = "health"
+
+    def __init__(self, clock: Clock, out: Publisher[HealthTable], events: EventSink) -> None:
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._rows: dict[str, ServiceHealth] = {}
+        self._down: set[str] = set()
+
+    def report(self, row: ServiceHealth) -> None:
+        """Take in a service's new state (a ``HealthSink``)."""
+        self._rows[row.name] = row
+        if row.state is ServiceState.READY:
+            returned = row.name in self._down
+            self._down.discard(row.name)
+            text = "is back" if returned else "is ready"
+            self._events(Reason.DEVICE_READY, Severity.INFO, row.name, text, restarts=row.restarts)
+        elif row.state in (ServiceState.BACKOFF, ServiceState.FAILED) and row.name not in self._down:
+            self._down.add(row.name)
+            severity = Severity.ERROR if row.state is ServiceState.FAILED else Severity.WARNING
+            self._events(row.reason, severity, row.name, row.detail, restarts=row.restarts)
+        self._publish()
+
+    def rows(self) -> tuple[ServiceHealth, ...]:
+        """All services, in the order in which they first reported."""
+        return tuple(self._rows.values())
+
+    async def run(self, ready: Ready) -> None:
+        """Publish the table once a second."""
+        ready()
+        while True:
+            await self._clock.sleep(PERIOD)
+            self._publish()
+
+    def _publish(self) -> None:
+        now = self._clock.now()
+        self._out.put(HealthTable(stamp=now, received=now, seq=self._out.next_seq(), services=self.rows()))
+
+
+class ClockService:
+    """Publishes real time minus daemon time; a step of real time is an event."""
+
+    name = "clock"
+
+    def __init__(self, clock: Clock, out: Publisher[ClockOffset], events: EventSink) -> None:
+        self._clock = clock
+        self._out = out
+        self._events = events
+
+    async def run(self, ready: Ready) -> None:
+        """Measure once a second."""
+        ready()
+        before: int | None = None
+        while True:
+            offset = self._clock.real_offset()
+            step = offset - before if before is not None and abs(offset - before) > STEP else 0
+            if step:
+                self._events(Reason.CLOCK_STEPPED, Severity.WARNING, self.name, seconds=step / SECOND)
+            now = self._clock.now()
+            self._out.put(ClockOffset(stamp=now, received=now, seq=self._out.next_seq(), offset=offset, stepped=step))
+            before = offset
+            await self._clock.sleep(PERIOD)

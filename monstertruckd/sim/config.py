@@ -1,0 +1,29 @@
+"""Configuration of a run in the simulated world: the daemon's own, and the world behind the emulators."""
+
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from monstertruck_drivers.world.config import WorldConfig
+from monstertruck_schemas.base import Schema
+from monstertruckd.config.truck import TruckConfig
+
+
+class SimConfig(Schema):
+    """The simulated side."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of everything random"""
+    deadman_wired: bool = False
+    """The servo controller's deadman output is wired to the drive controller's quick-stop input"""
+    servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
+    world: WorldConfig = WorldConfig()
+
+
+class SimulatedTruckConfig(TruckConfig):
+    """A truck whose devices are emulated."""
+
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = TruckConfig.FILE_KEYS
+
+    sim: SimConfig

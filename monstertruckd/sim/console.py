@@ -1,0 +1,109 @@
+"""Faults by typed words: from standard input of an emulator process, from tests, from drills."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TextIO
+
+from monstertruck_drivers.base import Emulator
+from monstertruck_drivers.link import EmulatedPort, LineFaults
+from monstertruck_runtime.errors import InputError
+
+HELP = (
+    "known: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
+    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, or a fault of the device"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Emulated:
+    """An emulator and the port it hangs on."""
+
+    emulator: Emulator
+    port: EmulatedPort
+
+    def command(self, words: list[str]) -> None:
+        """Obey one command.
+
+        Raises:
+            InputError: it is not understood; the text lists what is.
+        """
+        match words:
+            case ["plug"]:
+                self.port.plug()
+            case ["unplug"]:
+                self.port.unplug()
+            case ["power-cycle"]:
+                self.emulator.power_cycle()
+            case ["line", name, value]:
+                set_line_fault(self.port.device.faults, name, value)
+            case [fault, *values] if fault != "line":
+                self.emulator.inject(fault, *values)
+            case _:
+                raise InputError(HELP)
+
+
+def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
+    """Set one fault of the cable from text.
+
+    Raises:
+        InputError: unknown fault or bad value.
+    """
+    try:
+        match name:
+            case "stalled" | "deaf":
+                setattr(faults, name, {"on": True, "off": False}[value])
+            case "delay" | "flip_rate" | "drop_rate":
+                setattr(faults, name, float(value))
+            case "chunk":
+                faults.chunk = None if value == "off" else int(value)
+            case "garbage":
+                faults.garbage = bytes.fromhex(value)
+            case _:
+                raise InputError(HELP)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"line {name}: cannot read {value!r}; {HELP}") from error
+
+
+class FaultConsole:
+    """Reads commands line by line; with several devices each line begins with the device's name."""
+
+    def __init__(self, devices: Mapping[str, Emulated], source: TextIO, say: Callable[[str], None]) -> None:
+        self._devices = devices
+        self._source = source
+        self._say = say
+
+    async def run(self) -> None:
+        """Obey lines until cancelled; the end of the input ends the commands, not the devices."""
+        reader = asyncio.StreamReader()
+        loop = asyncio.get_running_loop()
+        try:
+            transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), self._source)
+        except (ValueError, OSError):  # standard input is a file or closed: no commands
+            await asyncio.Event().wait()
+            return
+        try:
+            while line := await reader.readline():
+                self.obey(line.decode(errors="replace"))
+            await asyncio.Event().wait()
+        finally:
+            transport.close()
+
+    def obey(self, line: str) -> None:
+        """Obey one line; answers ``ok`` or what is wrong with it."""
+        words = line.split()
+        if not words:
+            return
+        try:
+            self._find(words).command(words)
+        except InputError as error:
+            self._say(f"error: {error}")
+        else:
+            self._say("ok")
+
+    def _find(self, words: list[str]) -> Emulated:
+        if words[0] in self._devices:
+            return self._devices[words.pop(0)]
+        if len(self._devices) == 1:
+            return next(iter(self._devices.values()))
+        raise InputError(f"name a device first: {', '.join(self._devices)}")

@@ -1,0 +1,47 @@
+"""One emulated device alone on a pty, in the default world."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from monstertruck_drivers.epos.emulator import EposEmulator
+from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
+from monstertruck_drivers.maestro.emulator import MaestroEmulator
+from monstertruck_drivers.os4000.emulator import Os4000Emulator
+from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.world.config import WorldConfig
+from monstertruck_drivers.world.world import World
+from monstertruck_runtime.clock import Clock
+from monstertruckd.catalog import find_kind
+from monstertruckd.sim.console import Emulated
+from monstertruckd.sim.robot import EPOS_BAUD
+
+
+@asynccontextmanager
+async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> AsyncIterator[Emulated]:
+    """Serve ``device`` (kind or role) behind the symlink ``link`` while the context lasts.
+
+    Raises:
+        InputError: unknown device.
+    """
+    world = World(WorldConfig(), seed)
+    port = PtyPort(link)
+    match find_kind(device).role:
+        case "lidar":
+            emulator = HokuyoEmulator(clock, world.lidar, seed=seed)
+        case "compass":
+            emulator = Os4000Emulator(clock, world.compass, seed=seed)
+        case "drive":
+            emulator = EposEmulator(clock, world.motor, seed=seed)
+            port.device.baud = EPOS_BAUD
+        case _:
+            emulator = MaestroEmulator(clock, world.servos, seed=seed)
+    task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")
+    port.plug()
+    try:
+        yield Emulated(emulator, port)
+    finally:
+        port.unplug()
+        task.cancel()
+        await asyncio.wait([task])
