@@ -152,6 +152,13 @@ def require_positive(name: str, value: float) -> None:
         raise KinematicsError(f"{name} is {value}: expected a finite number above 0")
 
 
+def nonzero(x: Real) -> Real:
+    """X with every 0 replaced by 1: a safe divisor where the numerator is 0 as well."""
+    if isinstance(x, np.ndarray):
+        return np.where(x == 0.0, 1.0, x)
+    return x if x != 0.0 else 1.0
+
+
 def any_zero(x: Real) -> bool:
     """Whether x, or any element of it, is exactly 0."""
     if isinstance(x, np.ndarray):

@@ -1,6 +1,25 @@
-"""Rigid motion in the plane: exact integration of a constant body twist."""
+"""Rigid motion in the plane: frames, exact integration of a constant body twist and its Jacobians."""
 
-from monstertruck_kinematics.elementary import Real, cos, sin, sinc
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array, Real, cos, sin, sinc
+
+
+def to_world(heading: Real, vx: Real, vy: Real) -> tuple[Real, Real]:
+    """World components of a body-frame velocity (posture model in the world frame)."""
+    c, s = cos(heading), sin(heading)
+    return c * vx - s * vy, s * vx + c * vy
+
+
+def to_body(heading: Real, x_rate: Real, y_rate: Real) -> tuple[Real, Real]:
+    """Body components of a world-frame velocity (posture model in the robot's frame)."""
+    c, s = cos(heading), sin(heading)
+    return c * x_rate + s * y_rate, c * y_rate - s * x_rate
+
+
+def moved_point(vx: Real, vy: Real, wz: Real, x: float, y: float) -> tuple[Real, Real, Real]:
+    """Twist of the body's point (x, y), m, from the twist of its origin."""
+    return vx - wz * y, vy + wz * x, wz
 
 
 def integrate(pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: float) -> tuple[Real, Real, Real]:
@@ -19,5 +38,33 @@ def integrate(pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: f
     x, y, heading = pose
     half = wz * (0.5 * dt)
     chord = sinc(half) * dt
-    c, s = cos(heading + half), sin(heading + half)
-    return x + chord * (vx * c - vy * s), y + chord * (vx * s + vy * c), heading + 2.0 * half
+    dx, dy = to_world(heading + half, vx, vy)
+    return x + chord * dx, y + chord * dy, heading + 2.0 * half
+
+
+def integration_jacobians(
+    pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: float
+) -> tuple[Array, Array]:
+    """Derivatives (3, 3, ...) of ``integrate`` by the pose and by the twist, to propagate covariances."""
+    heading = np.asarray(pose[2], dtype=np.float64)
+    ahead, aside, turn = np.asarray(vx, np.float64), np.asarray(vy, np.float64), np.asarray(wz, np.float64)
+    half = turn * (0.5 * dt)
+    c, s = np.cos(heading + half), np.sin(heading + half)
+    chord = np.sinc(half / np.pi) * dt
+    dx, dy = c * ahead - s * aside, s * ahead + c * aside
+    # d sinc/dh = (cos h - sinc h)/h, by its series where that cancels.
+    small = np.abs(half) < 1e-3
+    away = np.where(small, 1.0, half)
+    bend = np.where(small, -half / 3.0 * (1.0 - half**2 / 10.0), (np.cos(away) - np.sinc(away / np.pi)) / away)
+    zero, one = np.zeros_like(dx + heading), np.ones_like(dx + heading)
+    by_pose = np.array([[one, zero, -chord * dy + zero], [zero, one, chord * dx + zero], [zero, zero, one]])
+    by_turn_x = 0.5 * dt * (bend * dt * dx - chord * dy)
+    by_turn_y = 0.5 * dt * (bend * dt * dy + chord * dx)
+    by_twist = np.array(
+        [
+            [chord * c + zero, -chord * s + zero, by_turn_x + zero],
+            [chord * s + zero, chord * c + zero, by_turn_y + zero],
+            [zero, zero, one * dt],
+        ]
+    )
+    return by_pose, by_twist

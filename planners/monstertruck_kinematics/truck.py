@@ -9,6 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from monstertruck_kinematics.elementary import (
     Real,
     any_zero,
@@ -18,6 +20,7 @@ from monstertruck_kinematics.elementary import (
     cos,
     hypot,
     larger,
+    nonzero,
     require_finite,
     require_positive,
     require_within,
@@ -172,15 +175,20 @@ class FourWheelSteering:
     def steer_for_twist(self, vx: Real, vy: Real, wz: Real) -> tuple[Real, Real, Real]:
         """Speed and axle angles (speed, front, rear) that give C the velocity (vx, vy, wz).
 
+        Standing still needs no angle: a zero twist gives (0, 0, 0).
+
         Raises:
-            KinematicsError: vx = 0: two steered axles cannot move purely sideways nor turn on the spot.
+            KinematicsError: vx = 0 with vy or wz: two steered axles cannot move purely sideways nor turn on the spot.
         """
+        require_finite("vx", vx)
         require_finite("vy", vy)
         require_finite("wz", wz)
+        ahead = vx
         if any_zero(vx):
-            raise KinematicsError("vx is 0: two steered axles need a forward speed")
-        require_finite("vx", vx)
-        return sign(vx) * hypot(vx, vy), atan((vy + self.l_f * wz) / vx), atan((vy - self.l_r * wz) / vx)
+            if np.any((np.asarray(vx) == 0.0) & (np.abs(vy) + np.abs(wz) > 0.0)):
+                raise KinematicsError("vx is 0 while vy or wz is not: two steered axles need a forward speed")
+            ahead = nonzero(vx)
+        return sign(vx) * hypot(vx, vy), atan((vy + self.l_f * wz) / ahead), atan((vy - self.l_r * wz) / ahead)
 
     def wheel_angles(self, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
         """Angles of the four wheels through the common ICR (eqs. 2.27-2.30), in (-90, 90) deg."""

@@ -1,0 +1,200 @@
+"""Wheels as rows of linear constraints on the body's velocity (vx, vy, wz).
+
+Every wheel stands at (x, y) in the body frame and rolls along ``heading`` (rad from the body's x axis). In polar form
+(l, alpha; plane angle beta) that is heading = alpha + beta - pi/2, and the rows below become the textbook's
+[sin(alpha+beta), -cos(alpha+beta), -l cos beta] (rolling) and [cos(alpha+beta), sin(alpha+beta), l sin beta] (no slip).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array, require_finite, require_positive
+from monstertruck_kinematics.errors import KinematicsError
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """What all wheels share.
+
+    Args:
+        name: unique within a robot; errors use it.
+        x: forward position, m.
+        y: leftward position, m.
+        radius: m.
+        heading: direction of rolling, rad.
+
+    Raises:
+        KinematicsError: a figure is not finite, or the radius not above zero.
+    """
+
+    name: str
+    x: float
+    y: float
+    radius: float
+    heading: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in ("x", "y", "heading"):
+            require_finite(f"wheel {self.name}: {field}", getattr(self, field))
+        require_positive(f"wheel {self.name}: radius", self.radius)
+
+    def row(self, direction: float) -> Array:
+        """Row (3,) whose product with (vx, vy, wz) is the wheel point's speed along ``direction``, m/s."""
+        c, s = math.cos(direction), math.sin(direction)
+        return np.array([c, s, self.x * s - self.y * c])
+
+    @property
+    def rolling_row(self) -> Array:
+        """Row (3,): its product with the body's velocity is ``rolling_gain`` times the wheel's rate."""
+        return self.row(self.heading)
+
+    @property
+    def rolling_gain(self) -> float:
+        """Metres per radian of the wheel's own turning in its rolling row."""
+        return self.radius
+
+    @property
+    def sliding_row(self) -> Array | None:
+        """Row (3,) whose product with the body's velocity must be 0, or None if the wheel may move sideways."""
+        return self.row(self.heading + math.pi / 2.0)
+
+
+@dataclass(frozen=True)
+class FixedWheel(Wheel):
+    """Wheel whose plane is fixed to the body."""
+
+
+@dataclass(frozen=True)
+class SteeredWheel(Wheel):
+    """Centred orientable wheel, at present along ``heading``.
+
+    Args:
+        group: wheels of one group are turned by one motor and stay parallel (a synchro drive's belt); None is alone.
+    """
+
+    group: str | None = None
+
+
+@dataclass(frozen=True)
+class CasterWheel(Wheel):
+    """Off-centred orientable wheel: its point of contact trails the steering axis, so it never constrains the body.
+
+    Args:
+        offset: from the steering axis (x, y) back to the point of contact, m.
+    """
+
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(f"wheel {self.name}: offset", self.offset)
+
+    @property
+    def sliding_row(self) -> Array | None:
+        """None: sideways motion turns the caster instead."""
+        return None
+
+    def steering_rate(self, twist: Sequence[float]) -> float:
+        """Rate at which the caster swivels, rad/s, relative to the body, when the body moves with (vx, vy, wz).
+
+        From its no-slip row: side speed of the axis - offset (wz + rate) = 0, the contact point trailing. (The
+        textbook writes + d: it looks from the axis towards the contact point.)
+        """
+        sideways = float(self.row(self.heading + math.pi / 2.0) @ np.asarray(twist))
+        return sideways / self.offset - twist[2]
+
+
+@dataclass(frozen=True)
+class SwedishWheel(Wheel):
+    """Wheel with free rollers on its rim.
+
+    Args:
+        roller: gamma: rollers let it slide freely across ``heading + roller``; 0 for the 90 deg wheel of an omni
+            robot, +-pi/4 for a mecanum wheel.
+    """
+
+    roller: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_finite(f"wheel {self.name}: roller", self.roller)
+        if abs(math.cos(self.roller)) < 1e-9:
+            raise KinematicsError(f"wheel {self.name}: roller is {self.roller}: at +-pi/2 the wheel drives nothing")
+
+    @property
+    def rolling_row(self) -> Array:
+        """Row along the direction in which the rollers do not give way."""
+        return self.row(self.heading + self.roller)
+
+    @property
+    def rolling_gain(self) -> float:
+        """R cos(gamma)."""
+        return self.radius * math.cos(self.roller)
+
+    @property
+    def sliding_row(self) -> Array | None:
+        """None: the rollers give way."""
+        return None
+
+
+def checked(wheels: Sequence[Wheel]) -> tuple[Wheel, ...]:
+    """The wheels, if they can be one robot's.
+
+    Raises:
+        KinematicsError: no wheels, or two of one name.
+    """
+    if not wheels:
+        raise KinematicsError("wheels is empty: expected at least one wheel")
+    names = [wheel.name for wheel in wheels]
+    for name in names:
+        if names.count(name) > 1:
+            raise KinematicsError(f"wheel {name}: two wheels have this name")
+    return tuple(wheels)
+
+
+def rolling_matrix(wheels: Sequence[Wheel]) -> Array:
+    """(n, 3) matrix from body velocity to the wheels' own rates, rad/s."""
+    return np.array([wheel.rolling_row / wheel.rolling_gain for wheel in checked(wheels)])
+
+
+def sliding_matrix(wheels: Sequence[Wheel]) -> Array:
+    """(k, 3) rows of the k wheels that forbid sideways motion (C*)."""
+    rows = [wheel.sliding_row for wheel in wheels]
+    return np.array([row for row in rows if row is not None]).reshape(-1, 3)
+
+
+def body_velocity(wheels: Sequence[Wheel], rates: Sequence[float], tolerance: float = 1e-6) -> Array:
+    """Body velocity (3,) at which every wheel rolls at its rate and none slips sideways.
+
+    Args:
+        wheels: the robot.
+        rates: of each wheel about its own axle, rad/s.
+        tolerance: m/s by which a wheel may miss.
+
+    Raises:
+        KinematicsError: the wheels contradict each other (the worst is named), or leave the velocity undetermined.
+    """
+    wheels = checked(wheels)
+    if len(rates) != len(wheels):
+        raise KinematicsError(f"rates has {len(rates)} entries: expected one for each of the {len(wheels)} wheels")
+    for wheel, rate in zip(wheels, rates, strict=True):
+        require_finite(f"wheel {wheel.name}: rate", rate)
+    rolling = np.array([wheel.rolling_row for wheel in wheels if not isinstance(wheel, CasterWheel)])
+    speeds = [w.rolling_gain * rate for w, rate in zip(wheels, rates, strict=True) if not isinstance(w, CasterWheel)]
+    names = [w.name for w in wheels if not isinstance(w, CasterWheel)]
+    names += [w.name for w in wheels if w.sliding_row is not None]
+    rows = np.vstack([rolling.reshape(-1, 3), sliding_matrix(wheels)])
+    wanted = np.concatenate([speeds, np.zeros(len(rows) - len(speeds))])
+    twist, _, rank, _ = np.linalg.lstsq(rows, wanted, rcond=1e-9)
+    if rank < 3:
+        raise KinematicsError(f"wheels {', '.join(names)}: they leave the body's velocity undetermined")
+    misses = np.abs(rows @ twist - wanted)
+    worst = int(misses.argmax())
+    if misses[worst] > tolerance:
+        raise KinematicsError(
+            f"wheel {names[worst]} contradicts the others: it misses by {misses[worst]:.3g} m/s, allowed {tolerance:g}"
+        )
+    return np.asarray(twist)
