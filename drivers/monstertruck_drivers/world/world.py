@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from monstertruck_drivers.base import AttitudeSource, MotorPlant, RangeSource, ServoPlant
 from monstertruck_drivers.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_drivers.world.config import SinusoidTilt, TiltConfig, WorldConfig
-from monstertruck_drivers.world.maps import OCCUPIED, load_map
+from monstertruck_drivers.world.maps import FREE, OCCUPIED, load_map
 from monstertruck_drivers.world.obstacles import Box, Obstacle, discs_and_segments, penetration
 from monstertruck_drivers.world.raycast import cast_rays, grid_penetration
 from monstertruck_drivers.world.sensors import SimulatedCompass, SimulatedLidar, SimulatedMotor, SimulatedServos
 from monstertruck_drivers.world.terrain import load_profile, profile_path, rocking
-from monstertruck_drivers.world.truck_plant import TruckPlant, TruthState
+from monstertruck_drivers.world.truck_plant import Pose, TruckPlant, TruthState
 from monstertruck_runtime.errors import InputError
 
 
@@ -39,11 +39,11 @@ class World:
         self._profile = place.profile
         self._tilt: TiltConfig = config.tilt
         self._truck = config.truck
-        self._occupied = np.ascontiguousarray(place.map.cells == OCCUPIED)
         self._obstacles: tuple[Obstacle, ...] = ()
         self._discs, self._segments = discs_and_segments(())
-        if self._contact(*start) > 0:
-            raise InputError(f"start: the truck at {start} touches something on the map {config.map}")
+        if self._overlap(place.map.cells != FREE, start) > 0:
+            raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
+        self._occupied = place.map.cells == OCCUPIED
         self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiled now rather than within somebody's deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
         self.lidar: RangeSource = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
@@ -93,13 +93,15 @@ class World:
         self._discs, self._segments = discs_and_segments(obstacles)
 
     def _contact(self, x: float, y: float, yaw: float) -> float:
-        truck, (x0, y0) = self._truck, self.map.origin
-        depth: float = grid_penetration(
-            self._occupied, self.map.resolution, x - x0, y - y0, yaw, truck.length, truck.width
-        )
+        depth = self._overlap(self._occupied, (x, y, yaw))
         if self._obstacles:
-            footprint = Box(x, y, truck.length, truck.width, yaw)
+            footprint = Box(x, y, self._truck.length, self._truck.width, yaw)
             depth += sum(penetration(footprint, obstacle) for obstacle in self._obstacles)
+        return depth
+
+    def _overlap(self, solid: NDArray[np.bool_], pose: Pose) -> float:
+        (x, y, yaw), (x0, y0), truck = pose, self.map.origin, self._truck
+        depth: float = grid_penetration(solid, self.map.resolution, x - x0, y - y0, yaw, truck.length, truck.width)
         return depth
 
     def _cast(

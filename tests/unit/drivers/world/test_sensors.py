@@ -1,0 +1,219 @@
+"""What lidar and compass report against what is there."""
+
+from math import degrees, pi, radians
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.world.config import CompassConfig, Iron, LidarConfig, SinusoidTilt
+from monstertruck_drivers.world.obstacles import Box, Disc
+from monstertruck_drivers.world.sensors import FAILED, NO_RETURN, TOO_NEAR
+
+ANGLES = (np.arange(769) - 384) * 2 * pi / 1024
+WALLS = [(-2.05, -2.05, 2.05, -2.0), (-2.05, 2.0, 2.05, 2.05), (-2.05, -2, -2, 2), (2.0, -2, 2.05, 2)]
+
+
+def box_ranges(x, y, yaw):
+    """Distances to the walls of the 4 m square room, in closed form."""
+    c, s = np.cos(ANGLES + yaw), np.sin(ANGLES + yaw)
+    c, s = np.where(abs(c) < 1e-12, 1e-12, c), np.where(abs(s) < 1e-12, 1e-12, s)
+    return np.minimum((np.where(c > 0, 2, -2) - x) / c, (np.where(s > 0, 2, -2) - y) / s)
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.5, -0.3, 2.1)])
+def test_scan_at_rest_shows_the_room(field, pose):
+    driver = field(walls=WALLS, start=pose)
+    scan = driver.world.lidar.scan(driver.now)
+    assert scan.shape == (769,)
+    assert scan.dtype == np.int32
+    lidar = (pose[0] + 0.14 * np.cos(pose[2]), pose[1] + 0.14 * np.sin(pose[2]), pose[2])
+    np.testing.assert_allclose(scan[44:726], box_ranges(*lidar)[44:726] * 1000, atol=0.51)
+    assert set(scan[:44]) | set(scan[726:]) == {FAILED}
+
+
+def test_every_beam_leaves_from_where_the_truck_is_then(field):
+    for wait_before_asking in (0.0, 0.15):
+        driver = field(walls=WALLS)
+        driver.steer(0.4, -0.4)
+        driver.drive(0.2)
+        driver.wait(2)
+        began = driver.now
+        trail = []
+        for k in range(769):
+            driver.now = began + k * 97_656
+            if wait_before_asking:
+                trail.append(driver.world.truth(driver.now))
+        if not wait_before_asking:
+            driver.now = began
+            scan = driver.world.lidar.scan(began)
+            continue
+        driver.wait(0.05)
+        late_scan = driver.world.lidar.scan(began)
+    want = np.array(
+        [box_ranges(t.x + 0.14 * np.cos(t.yaw), t.y + 0.14 * np.sin(t.yaw), t.yaw)[k] for k, t in enumerate(trail)]
+    )
+    np.testing.assert_allclose(late_scan[44:726], want[44:726] * 1000, atol=1.5)
+    np.testing.assert_allclose(scan[44:726], want[44:726] * 1000, atol=2.5)  # extrapolated
+    frozen = box_ranges(
+        trail[0].x + 0.14 * np.cos(trail[0].yaw), trail[0].y + 0.14 * np.sin(trail[0].yaw), trail[0].yaw
+    )
+    assert np.abs(frozen - want)[44:726].max() > 0.02  # the distortion is there
+
+
+def test_asking_early_does_not_bind_the_future(field):
+    driver = field()
+    driver.world.lidar.scan(driver.now)
+    assert driver.world.truth(driver.now).time_ns == driver.now
+
+
+def test_noise_follows_the_data_sheet(field):
+    driver = field(walls=WALLS, noise=True)
+    clean = box_ranges(0.14, 0.0, 0.0)
+    errors = []
+    for _ in range(60):
+        driver.wait(0.1)
+        scan = driver.world.lidar.scan(driver.now).astype(float)
+        scan[scan < 20] = np.nan
+        errors.append(scan / 1000 - clean)
+    errors = np.array(errors)[:, 44:726]
+    bound = np.maximum(0.01, 0.01 * clean[44:726])
+    scaled = errors / bound
+    assert np.nanstd(scaled) == pytest.approx(0.5, rel=0.03)
+    assert abs(np.nanmean(scaled)) < 0.02
+    assert np.isnan(errors).mean() == pytest.approx(0.002, abs=0.001)
+
+
+def test_noise_belongs_to_the_instant_not_to_the_asking(field):
+    scans = []
+    for extra in (False, True):
+        driver = field(walls=WALLS, noise=True, seed=4)
+        driver.wait(1)
+        if extra:
+            driver.world.lidar.scan(driver.now - 200_000_000)
+            driver.world.compass.compass(driver.now)
+        scans.append(driver.world.lidar.scan(driver.now))
+    np.testing.assert_array_equal(*scans)
+    other = field(walls=WALLS, noise=True, seed=5)
+    other.wait(1)
+    assert (other.world.lidar.scan(other.now) != scans[0]).any()
+
+
+def test_error_codes(field):
+    driver = field(lidar=LidarConfig(first_step=43))
+    driver.world.add(driver.now, Disc(0.14 + 0.115, 0.0, 0.1))
+    scan = driver.world.lidar.scan(driver.now)
+    assert scan[384] == TOO_NEAR
+    assert scan[384 + 300] == NO_RETURN
+    assert scan[42] == FAILED
+    assert scan[43] == NO_RETURN
+
+
+def test_obstacles_come_and_go(field):
+    driver = field(walls=WALLS)
+    box = Box(1.2, 0.0, 0.2, 0.2)
+    before = driver.world.lidar.scan(driver.now)
+    driver.world.add(driver.now, box)
+    seen = driver.world.lidar.scan(driver.now)
+    driver.world.remove(driver.now, box)
+    assert seen[384] == pytest.approx(960, abs=1)
+    assert before[384] == 1860
+    np.testing.assert_array_equal(driver.world.lidar.scan(driver.now), before)
+
+
+def test_nose_down_sees_the_ground_nose_up_passes_over_walls(field):
+    driver = field(walls=WALLS)
+    driver.world.set_tilt(driver.now, SinusoidTilt(kind="sinusoid", pitch_deg=14, frequency=0.25))
+    driver.wait(1)  # quarter period: nose down
+    down = driver.world.lidar.scan(driver.now)
+    assert down[384] == pytest.approx(250 / np.sin(radians(14)), rel=0.01)
+    driver.wait(2)
+    up = driver.world.lidar.scan(driver.now)
+    assert up[384] == NO_RETURN
+    assert up[384 + 256] == pytest.approx(2000, abs=5)  # level sideways
+
+
+@pytest.mark.parametrize(("yaw", "heading"), [(0.0, 90.0), (pi / 2, 0.0), (pi, 270.0), (-pi / 2, 180.0), (0.3, 72.811)])
+def test_heading_is_clockwise_from_north(field, yaw, heading):
+    reading = field(start=(0.0, 0.0, yaw)).world.compass.compass(7_000_000_000)
+    assert (reading.heading_deg - heading + 180) % 360 - 180 == pytest.approx(0, abs=1e-3)
+    assert reading.acceleration == (0, 0, 1)
+
+
+def test_north_offset(field):
+    driver = field(compass=CompassConfig(north_yaw=pi / 2 + radians(10)))
+    assert driver.world.compass.compass(driver.now).heading_deg == pytest.approx(100)
+
+
+def test_heading_survives_tilt_and_vectors_agree(field):
+    driver = field(
+        start=(0.0, 0.0, 1.0),
+        tilt=SinusoidTilt(kind="sinusoid", pitch_deg=15, roll_deg=10),
+        compass=CompassConfig(horizontal_field=250, vertical_field=-390),
+    )
+    down = np.array([0.0, 0.0, -1.0])
+    signs = set()
+    for _ in range(40):
+        truth = driver.wait(0.07)
+        reading = driver.world.compass.compass(driver.now)
+        assert reading.heading_deg == pytest.approx(90 - degrees(1.0), abs=1e-6)
+        assert reading.pitch_deg == pytest.approx(-degrees(truth.pitch))
+        assert reading.roll_deg == pytest.approx(degrees(truth.roll))
+        up, field_vector = np.array(reading.acceleration), np.array(reading.field)
+        assert np.linalg.norm(up) == pytest.approx(1)
+        assert np.linalg.norm(field_vector) == pytest.approx(np.hypot(250, 390))
+        assert field_vector @ up == pytest.approx(-390)
+        assert np.sign(up[0]) == np.sign(reading.pitch_deg)  # as in the maker's sample sentence
+        assert np.sign(up[1]) == np.sign(reading.roll_deg)
+        signs.add((np.sign(up[0]), np.sign(up[1])))
+    assert len(signs) == 4
+    assert down @ up < 0
+
+
+def test_compass_error_is_smooth_fixed_and_below_half_a_degree(field):
+    errors = []
+    for yaw in np.linspace(-3, 3, 25):
+        driver = field(start=(0.0, 0.0, float(yaw)), noise=True, compass=CompassConfig(noise_deg=0.0))
+        heading = driver.world.compass.compass(driver.now).heading_deg
+        errors.append((heading - (90 - degrees(yaw)) + 180) % 360 - 180)
+    errors = np.array(errors)
+    assert 0.2 < np.abs(errors).max() <= 0.41
+    assert np.abs(np.diff(errors)).max() < 0.2
+
+
+def test_compass_noise(field):
+    driver = field(noise=True)
+    headings, pitches = [], []
+    for _ in range(300):
+        driver.wait(0.05)
+        reading = driver.world.compass.compass(driver.now)
+        headings.append(reading.heading_deg)
+        pitches.append(reading.pitch_deg)
+    assert np.std(headings) == pytest.approx(0.1, rel=0.2)
+    assert np.std(pitches) == pytest.approx(0.1, rel=0.2)
+    assert 0.01 < abs(np.mean(pitches)) < 0.25
+
+
+def test_motor_current_and_iron_disturb_the_heading(field):
+    driver = field(start=(0.0, 0.0, pi / 2), walls=[(-2, 0.5, 2, 0.6)], compass=CompassConfig(motor_field=20.0))
+    driver.drive(0.2)
+    driver.wait(4)  # against the wall: 0.5 A
+    truth = driver.world.truth(driver.now)
+    north = pi / 2 - truth.yaw
+    want = degrees(np.arctan2(250 * np.sin(north) + 20 * truth.motor_current, 250 * np.cos(north)))
+    assert want > 1.5
+    assert driver.world.compass.compass(driver.now).heading_deg == pytest.approx(want, rel=1e-6)
+    iron = field(start=(0.0, 0.0, pi / 2), compass=CompassConfig(iron=Iron(hard_y=25.0, soft_x=0.5)))
+    reading = iron.world.compass.compass(iron.now)
+    assert reading.field == pytest.approx((125, 25, -390))
+    assert reading.heading_deg == pytest.approx(degrees(np.arctan2(25, 125)))
+
+
+def test_readings_have_the_controllers_sign(field):
+    driver = field()
+    driver.world.motor.command(driver.now, 3000.0, 1e5)
+    truth = driver.wait(1)
+    reading = driver.world.motor.reading(driver.now)
+    assert truth.v < 0  # inverted: the controller's positive sense is backwards
+    assert reading.turns > 0
+    assert reading.rpm == pytest.approx(3000, rel=1e-3)
+    assert reading.current_ma > 0
