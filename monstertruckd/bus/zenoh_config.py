@@ -19,7 +19,7 @@ class TlsConfig(Schema):
     """The robot's own certificate; must name every address a client dials."""
     key: Path
     """Its private key."""
-    pilots: tuple[str, ...] = ()
+    pilots: tuple[str, ...] = Field(min_length=1)
     """Common names that may see, ask and drive."""
     observers: tuple[str, ...] = ()
     """Common names that may only see."""
@@ -40,8 +40,8 @@ class ZenohConfig(Schema):
     max_sessions: int = Field(default=64, ge=1)
 
 
-def session_config(robot: str, config: ZenohConfig) -> str:
-    """Zenoh's own JSON configuration of the robot's session.
+def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> str:
+    """Zenoh's own JSON configuration of the robot's session, or of a client that looks whom it would meet.
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; it is deep enough for the largest message.
@@ -53,9 +53,9 @@ def session_config(robot: str, config: ZenohConfig) -> str:
         },
     }
     session: dict[str, Any] = {
-        "mode": config.mode,
-        "listen": {"endpoints": config.listen, "exit_on_failure": True},
-        "connect": {"endpoints": config.connect, "timeout_ms": 500, "exit_on_failure": False},
+        "mode": "client" if probe else config.mode,
+        "listen": {"endpoints": () if probe else config.listen, "exit_on_failure": True},
+        "connect": {"endpoints": config.connect, "timeout_ms": 500, "exit_on_failure": probe},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "adminspace": {"enabled": False},

@@ -104,9 +104,9 @@ class ZenohBridge:
             try:
                 async with asyncio.TaskGroup() as calls:
                     try:
-                        await _in_thread(partial(self._declare_inputs, self._session, hop, calls))
-                        ready()
-                        await failed
+                        with await _in_thread(partial(self._declare_inputs, self._session, hop, calls)):
+                            ready()
+                            await failed
                     finally:
                         hop.close()
             finally:
@@ -125,11 +125,19 @@ class ZenohBridge:
                 raise BusyError(msg) from error
             msg = f"zenoh cannot open {where}: {text}"
             raise ConfigError(msg) from error
-        if any(reply.ok for reply in session.liveliness().get(alive_key(self._robot), timeout=1.0)):
+        if self._config.connect and self._runs_elsewhere():
             session.close()  # type: ignore[no-untyped-call]
-            msg = f"another daemon already runs robot {self._robot!r} (reached through {where})"
+            msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(self._config.connect)}"
             raise BusyError(msg)
         self._session = session
+
+    def _runs_elsewhere(self) -> bool:
+        """Ask the fleet's routers as a client: its link is complete when it is open, a router's is not."""
+        try:
+            with zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config, probe=True))) as probe:
+                return any(reply.ok for reply in probe.liveliness().get(alive_key(self._robot), timeout=1.0))
+        except zenoh.ZError:  # none of them is up
+            return False
 
     def _declare_publishers(self, session: zenoh.Session) -> dict[str, Callable[[bytes], None]]:
         """Put functions by topic name."""
@@ -141,7 +149,8 @@ class ZenohBridge:
 
     def _declare_inputs(
         self, session: zenoh.Session, hop: ThreadHop[Callable[[], None]], calls: asyncio.TaskGroup
-    ) -> None:
+    ) -> zenoh.LivelinessToken:
+        """Subscribers and queryables; last the token that says so, which lives as long as its object."""
         remote = zenoh.Locality.REMOTE
         active: set[asyncio.Task[None]] = set()
         for topic in TOPICS:
@@ -155,7 +164,7 @@ class ZenohBridge:
             lambda query: hop.put(partial(self._serve, query, calls, active)),
             allowed_origin=remote,
         )
-        session.liveliness().declare_token(alive_key(self._robot))
+        return session.liveliness().declare_token(alive_key(self._robot))
 
     def _send(
         self, publishers: dict[str, Callable[[bytes], None]], topic: Topic[Any], _message: Message, data: bytes

@@ -303,7 +303,7 @@ class TruckClient:
             )
         )
 
-    async def _collect(self, ask: Callable[[handlers.Callback[zenoh.Reply]], object]) -> list[zenoh.Reply]:
+    async def _collect(self, ask: Callable[["handlers.Callback[zenoh.Reply]"], object]) -> list[zenoh.Reply]:
         """All replies of a query, gathered without blocking the loop."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[None] = loop.create_future()

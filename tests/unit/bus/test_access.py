@@ -1,7 +1,14 @@
 """Access rules follow from the topic table."""
 
+import json
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd.bus.access import access_rules, in_groups, out_groups
+from monstertruckd.bus.zenoh_config import TlsConfig, ZenohConfig, session_config
 
 
 def test_every_group_goes_one_way():
@@ -37,6 +44,13 @@ def test_pilots_and_observers_are_told_apart_by_certificate():
     assert [subject["cert_common_names"] for subject in rules["subjects"]] == [["pilot"], ["observer"]]
 
 
-def test_no_names_means_nobody_under_tls():
-    rules = access_rules("rover", [], [])
-    assert [subject["cert_common_names"] for subject in rules["subjects"]] == [[]]
+def test_tls_without_a_pilot_is_refused():
+    with pytest.raises(ValidationError, match="pilots"):
+        TlsConfig.model_validate_json('{"ca": "ca.pem", "certificate": "t.pem", "key": "t.key", "pilots": []}')
+
+
+def test_tls_means_access_control():
+    tls = TlsConfig(ca=Path("ca.pem"), certificate=Path("t.pem"), key=Path("t.key"), pilots=("ann",))
+    config = json.loads(session_config("rover", ZenohConfig(tls=tls)))
+    assert config["access_control"] == access_rules("rover", ["ann"], [])
+    assert config["transport"]["link"]["tls"]["enable_mtls"] is True

@@ -1,0 +1,79 @@
+"""Mutual TLS end to end: a pilot drives, an observer looks, strangers get nothing."""
+
+import asyncio
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.client import ClientTls, TruckClient
+from monstertruck_runtime.errors import NotFoundError, TruckError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
+from monstertruckd.bus.zenoh_config import TlsConfig
+from tests.bus_kit import free_endpoint, gate_state, running_robot
+
+pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
+
+
+def certificates(folder: Path) -> None:
+    """One authority; a server certificate for the truck, client certificates for the others."""
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+    key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    openssl("req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-days", "1", "-subj", "/CN=Test CA")
+    for name, usage, names in (
+        ("truck", "serverAuth,clientAuth", "DNS:localhost,IP:127.0.0.1"),
+        ("ann", "clientAuth", "DNS:ann"),
+        ("bob", "clientAuth", "DNS:bob"),
+        ("eve", "clientAuth", "DNS:eve"),
+    ):
+        openssl("req", *key, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        (folder / f"{name}.ext").write_text(
+            "basicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\n"
+            f"extendedKeyUsage={usage}\nsubjectAltName={names}\n"
+        )
+        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
+                "-days", "1", "-extfile", f"{name}.ext", "-out", f"{name}.pem")  # fmt: skip
+
+
+async def test_who_may_do_what(tmp_path: Path):
+    await asyncio.to_thread(certificates, tmp_path)
+    server = TlsConfig(
+        ca=tmp_path / "ca.pem",
+        certificate=tmp_path / "truck.pem",
+        key=tmp_path / "truck.key",
+        pilots=("ann",),
+        observers=("bob",),
+    )
+    endpoint = free_endpoint("tls")
+
+    def client(name: str) -> TruckClient:
+        files = ClientTls(ca=server.ca, certificate=tmp_path / f"{name}.pem", key=tmp_path / f"{name}.key")
+        return TruckClient(endpoint=endpoint, tls=files, timeout=1.0, source=name)
+
+    async with running_robot(endpoint, tls=server) as robot:
+        robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        requests = robot.bus.subscribe(REQ_DRIVE, fifo(10))
+        async with client("ann") as ann, client("bob") as bob, client("eve") as eve:
+            assert await ann.get_retained(GATE) == gate_state(1)
+            assert (await ann.call("topics"))["topics"]
+            assert await bob.get_retained(GATE) == gate_state(1)
+            assert [await each.alive() for each in (ann, bob, eve)] == [True, True, False]
+            with pytest.raises(TruckError):
+                await bob.call("topics")
+            with pytest.raises(NotFoundError):
+                await eve.get_retained(GATE)
+            await bob.drive(9.0, 0.0)
+            await ann.drive(0.5, 0.0)
+            async with asyncio.timeout(3):
+                request = await requests.next()
+            await asyncio.sleep(0.05)
+        with pytest.raises(NotFoundError):
+            async with TruckClient(endpoint=endpoint.replace("tls/", "tcp/"), timeout=0.3):
+                pass
+    assert request.source == "ann"
+    assert requests.latest is request

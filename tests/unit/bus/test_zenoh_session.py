@@ -1,0 +1,329 @@
+"""The bridge against real Zenoh sessions: state out, requests in, calls, refusals, clean ends."""
+
+import asyncio
+import json
+import re
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import BusyError, ConfigError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.topics import GATE, POSE, REQ_DRIVE, TOPICS, Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
+from monstertruckd.bus.zenoh_session import MAX_REQUEST, ZenohBridge
+from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
+
+
+def raw_session(endpoint: str) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def drive_request(seq: int) -> DriveRequest:
+    return DriveRequest(
+        stamp=1, received=1, seq=seq, source="a", role=Role.STATION, lease=0.5, nonce="n", speed=1.0, front=0.0
+    )
+
+
+async def eventually(condition, seconds: float = 3.0) -> None:
+    async with asyncio.timeout(seconds):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def test_state_leaves_with_the_recorders_bytes_and_its_encoding():
+    async with running_robot() as robot:
+        recorded: list[bytes] = []
+        robot.bus.tap(lambda _t, _m, data: recorded.append(data), [POSE])
+        got: list[tuple[bytes, str]] = []
+        with raw_session(robot.endpoint) as station:
+            station.declare_subscriber(
+                "mt/truck/state/pose", lambda s: got.append((s.payload.to_bytes(), str(s.encoding)))
+            )
+            await asyncio.sleep(0.1)
+            publisher = robot.bus.publisher(POSE, Writer.ESTIMATION)
+            for seq in range(200):
+                publisher.put(odometry(seq))
+            await eventually(lambda: len(got) == 200)
+    assert [data for data, _ in got] == recorded
+    assert {encoding for _, encoding in got} == {wire.encoding(POSE)}
+    assert wire.decode(POSE, got[7][0]) == odometry(7)
+
+
+async def test_retained_topics_reach_late_joiners_and_plain_get():
+    async with running_robot() as robot:
+        publisher = robot.bus.publisher(GATE, Writer.GATE)
+        publisher.put(gate_state(0))
+        publisher.put(gate_state(1))
+        async with TruckClient(endpoint=robot.endpoint) as client:
+            box = client.subscribe(GATE, fifo(9))
+            async with asyncio.timeout(2):
+                assert (await box.next()).seq == 1
+            publisher.put(gate_state(2))
+            async with asyncio.timeout(2):
+                assert (await box.next()).seq == 2
+        with raw_session(robot.endpoint) as station:
+            (reply,) = await asyncio.to_thread(lambda: list(station.get("mt/truck/state/gate", timeout=1.0)))
+            assert reply.ok is not None
+            assert wire.decode(GATE, reply.ok.payload.to_bytes()) == gate_state(2)
+
+
+async def test_what_was_retained_before_the_bridge_ran_is_out_as_well():
+    endpoint = free_endpoint()
+    clock = WallClock()
+    bus, rpc = Bus(clock), Rpc(clock)
+    bus.publisher(GATE, Writer.GATE).put(gate_state(5))
+    bridge = ZenohBridge("truck", bus, ZenohConfig(listen=(endpoint,)), clock, rpc)
+    for _ in range(2):  # and again after a restart of the bridge
+        ready = asyncio.Event()
+        task = asyncio.create_task(bridge.run(ready.set))
+        await ready.wait()
+        async with TruckClient(endpoint=endpoint) as client:
+            state = await client.get_retained(GATE)
+            assert state == gate_state(5)
+        task.cancel()
+        await asyncio.wait([task])
+
+
+async def test_requests_come_in_typed_and_stamped_by_the_robot():
+    async with running_robot() as robot:
+        box = robot.bus.subscribe(REQ_DRIVE, fifo(1000))
+        with raw_session(robot.endpoint) as station:
+            for seq in range(60):
+                station.put("mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(seq)))
+            async with asyncio.timeout(3):
+                got = [await box.next() for _ in range(60)]
+    assert [request.seq for request in got] == list(range(60))
+    assert all(request.received > 1 and request.stamp == 1 for request in got)
+
+
+@pytest.mark.parametrize(
+    ("payload", "text"),
+    [
+        (b"\xff\x00garbage", "req/drive"),
+        (b"{}", "req/drive: stamp"),
+        (b"x" * (MAX_REQUEST + 1), f"request of {MAX_REQUEST + 1} bytes"),
+        (wire.encode(REQ_DRIVE, drive_request(0)).replace(b'"station"', b'"king"'), "req/drive: role"),
+    ],
+    ids=["garbage", "empty", "huge", "role"],
+)
+async def test_bad_requests_become_one_event_a_second(payload: bytes, text: str):
+    async with running_robot() as robot:
+        box = robot.bus.subscribe(REQ_DRIVE, fifo(10))
+        with raw_session(robot.endpoint) as station:
+            for _ in range(20):
+                station.put("mt/truck/req/drive", payload)
+            station.put("mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+            async with asyncio.timeout(3):
+                await box.next()
+            async with asyncio.timeout(3):
+                event = await robot.events.next()
+    assert event.reason is Reason.BAD_INPUT
+    assert event.source == "zenoh"
+    assert text in event.text
+    assert event.seq == 0
+    assert robot.events.latest is event
+
+
+async def test_state_put_by_others_never_enters_the_bus():
+    async with running_robot() as robot:
+        box = robot.bus.subscribe(POSE, fifo(10))
+        with raw_session(robot.endpoint) as station:
+            station.put("mt/truck/state/pose", wire.encode(POSE, odometry(1)))
+            station.put("mt/truck/req/unknown", b"x")
+            station.put("mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+            async with asyncio.timeout(3):
+                await robot.bus.subscribe(REQ_DRIVE, fifo(1)).next()
+    assert box.latest is None
+    assert robot.events.latest is None
+
+
+async def test_schemas_are_served_in_their_own_encoding():
+    async with running_robot() as robot:
+        with raw_session(robot.endpoint) as station:
+            replies = await asyncio.to_thread(lambda: list(station.get("mt/truck/rpc/schema/**", timeout=2.0)))
+    served = {str(reply.ok.key_expr): reply.ok for reply in replies if reply.ok}
+    assert set(served) == {f"mt/truck/rpc/schema/{topic.name}" for topic in TOPICS}
+    pose = served["mt/truck/rpc/schema/state/pose"]
+    assert pose.payload.to_bytes() == wire.schema(POSE).data
+    assert str(pose.encoding) == "application/protobuf;google.protobuf.FileDescriptorSet"
+    assert json.loads(served["mt/truck/rpc/schema/state/gate"].payload.to_bytes())["type"] == "object"
+
+
+async def test_a_slow_call_does_not_hold_up_others_and_too_many_are_refused():
+    async with running_robot() as robot:
+        release = asyncio.Event()
+
+        async def wait(_):
+            await release.wait()
+            return {}
+
+        robot.rpc.register("wait", wait)
+
+        def ask(name: str) -> str:
+            (reply,) = list(station.get(f"mt/truck/rpc/{name}", timeout=2.0))
+            return "ok" if reply.ok else json.loads(reply.err.payload.to_bytes())["reason"]
+
+        with raw_session(robot.endpoint) as station:
+            waiting = [station.get("mt/truck/rpc/wait", timeout=2.0) for _ in range(16)]
+            refused = await asyncio.to_thread(ask, "topics")
+            release.set()
+            assert await asyncio.to_thread(lambda: [bool(next(iter(w)).ok) for w in waiting]) == [True] * 16
+            accepted = await asyncio.to_thread(ask, "topics")
+    assert (refused, accepted) == ("busy", "ok")
+
+
+async def test_an_endpoint_in_use_is_refused_by_name():
+    async with running_robot() as robot:
+        with pytest.raises(BusyError, match=f"{robot.endpoint} is in use"):
+            async with running_robot(robot.endpoint):
+                pass
+    async with running_robot(robot.endpoint):  # free again
+        pass
+
+
+async def test_one_robot_name_is_run_once_on_a_network():
+    async with running_robot() as robot:
+        with pytest.raises(BusyError, match="already runs robot 'truck'"):
+            async with running_robot(connect=(robot.endpoint,), mode="peer"):
+                pass
+        async with running_robot(connect=(robot.endpoint,), robot="rover"):
+            pass
+
+
+async def test_an_endpoint_that_cannot_be_opened_is_a_config_error():
+    with pytest.raises(ConfigError, match=r"zenoh cannot open tcp/203\.0\.113\.1:7447") as caught:
+        async with running_robot("tcp/203.0.113.1:7447"):
+            pass
+    assert "cargo" not in str(caught.value)
+
+
+async def test_opening_first_fails_early_and_run_goes_on_with_it():
+    endpoint = free_endpoint()
+    clock = WallClock()
+    first = ZenohBridge("truck", Bus(clock), ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+    second = ZenohBridge("truck", Bus(clock), ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+    await first.open()
+    await first.open()
+    with pytest.raises(BusyError):
+        await second.open()
+    ready = asyncio.Event()
+    task = asyncio.create_task(first.run(ready.set))
+    await ready.wait()
+    task.cancel()
+    await asyncio.wait([task])
+    await first.close()
+    await second.open()
+    await second.close()
+
+
+@pytest.mark.parametrize("turns", [0, 1, 3, 10])
+async def test_cancelling_at_any_moment_frees_the_endpoint(turns: int):
+    endpoint = free_endpoint()
+    clock = WallClock()
+    bridge = ZenohBridge("truck", Bus(clock), ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+    task = asyncio.create_task(bridge.run(lambda: None))
+    for _ in range(turns):
+        await asyncio.sleep(0.0005)
+    task.cancel()
+    await asyncio.wait([task])
+    assert task.cancelled()
+    host, _, port = endpoint.removeprefix("tcp/").partition(":")
+    with socket.socket() as probe:
+        probe.bind((host, int(port)))
+
+
+async def test_no_thread_of_zenoh_outlives_the_bridge():
+    before = set(threading.enumerate())
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
+        assert await client.call("topics")
+    await eventually(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith("asyncio")])
+
+
+async def test_a_bug_behind_the_bridge_ends_the_service(monkeypatch: pytest.MonkeyPatch):
+    clock = WallClock()
+    bus = Bus(clock)
+    endpoint = free_endpoint()
+    bridge = ZenohBridge("truck", bus, ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+    monkeypatch.setattr(bus, "inject", lambda *_: 1 / 0)
+    ready = asyncio.Event()
+    task = asyncio.create_task(bridge.run(ready.set))
+    await ready.wait()
+    with raw_session(endpoint) as station:
+        station.put("mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+        await asyncio.wait([task], timeout=3)
+    with pytest.raises(ExceptionGroup) as caught:
+        await task
+    assert caught.group_contains(ZeroDivisionError)
+
+
+async def test_access_control_stops_forgers_but_no_one_else():
+    async with running_robot(access_control=True) as robot:
+        publisher = robot.bus.publisher(GATE, Writer.GATE)
+        publisher.put(gate_state(1))
+        requests = robot.bus.subscribe(REQ_DRIVE, fifo(1))
+        async with TruckClient(endpoint=robot.endpoint) as client, asyncio.timeout(5):
+            gate = client.subscribe(GATE, fifo(9))
+            pose = client.subscribe(POSE, fifo(9))
+            assert (await gate.next()).seq == 1
+            assert await client.get_retained(GATE) == gate_state(1)
+            assert await client.alive()
+            assert (await client.call("topics"))["topics"]
+            await client.drive(0.5, 0.0)
+            await requests.next()
+            with raw_session(robot.endpoint) as forger:
+                forger.put("mt/truck/state/pose", wire.encode(POSE, odometry(666)))
+                forger.put("mt/truck/state/gate", wire.encode(GATE, gate_state(666)))
+                await asyncio.sleep(0.1)
+            publisher.put(gate_state(2))
+            robot.bus.publisher(POSE, Writer.ESTIMATION).put(odometry(2))
+            assert (await gate.next()).seq == 2
+            assert (await pose.next()).seq == 2
+
+
+def test_discovery_is_off_and_the_default_is_this_machine_only():
+    config = json.loads(session_config("truck", ZenohConfig()))
+    assert config["listen"]["endpoints"] == ["tcp/127.0.0.1:7447"]
+    assert config["scouting"]["multicast"]["enabled"] is False
+    assert config["scouting"]["gossip"]["enabled"] is False
+    assert config["scouting"]["delay"] == 0
+    assert "access_control" not in config
+
+
+async def test_the_ten_lines_of_the_docs_print_the_pose(tmp_path: Path):
+    text = (Path(__file__).parents[3] / "docs" / "zenoh.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "import sys, zenoh" in block]
+    assert len(code.strip().splitlines()) <= 10
+    assert "monstertruck" not in code
+    script = tmp_path / "pose.py"
+    script.write_text(code)
+    async with running_robot() as robot:
+        publisher = robot.bus.publisher(POSE, Writer.ESTIMATION)
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, str(script), robot.endpoint, stdout=subprocess.PIPE
+        )
+        assert process.stdout is not None
+        line = asyncio.create_task(process.stdout.readline())
+        async with asyncio.timeout(10):
+            while not line.done():
+                publisher.put(odometry(publisher.next_seq(), x=1.25))
+                await asyncio.sleep(0.02)
+        process.kill()
+        await process.communicate()
+    assert line.result() == b"x 1.250 m, y 2.000 m in map\n"
