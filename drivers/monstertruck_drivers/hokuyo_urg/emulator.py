@@ -1,0 +1,426 @@
+"""The device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
+
+Three tasks run for ever: one hears request lines, one answers them a little later, and one is the rotor,
+which turns on a 100 ms grid of the sensor's own clock whether or not anybody listens. A stream, once asked
+for, goes on until QT, RS, its count or the supply ends it; a host that dies changes nothing.
+
+Where the specification is silent the emulator answers TM0 during a scan with 0A, MD during a stream with 0B,
+and everything but TM and RS in time-adjust mode with 0E.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.base import RangeSource
+from monstertruck_drivers.hokuyo_urg.identity import build_fields
+from monstertruck_drivers.hokuyo_urg.orders import (
+    LEAST_MM,
+    Order,
+    counter_line,
+    parse_order,
+    parse_scip1_order,
+    scan_lines,
+)
+from monstertruck_drivers.hokuyo_urg.protocol import COUNTER_MASK, TAG_LIMIT, build_reply
+from monstertruck_drivers.link import DeviceEnd
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+STEPS: Final = 1024
+PERIOD: Final = SECOND // 10
+"""Nanoseconds of one revolution, of the sensor's clock."""
+FRONT_STEP: Final = 384
+GREATEST_MM: Final = 5600
+PROCESSING: Final = 1_500_000
+"""Nanoseconds from the last step to the first byte."""
+ANSWER_DELAY: Final = 0.0005
+"""Seconds from a request to its answer."""
+CATCH_UP: Final = 5
+"""Revolutions sent late after the host's machine slept; older ones are lost."""
+
+StartState = Literal["scip1", "scip2", "streaming", "time_adjust"]
+FAULTS: Final = (
+    "status 21..98 | deaf [on|off] | fragile [on|off] | cut | laser [on|off] | seri [on|off] | timer MILLISECONDS"
+)
+
+
+class HokuyoEmulator:
+    """Emulated scanner.
+
+    Args:
+        clock: the world's time.
+        source: what it sees; asked at the end of each revolution that is sent.
+        seed: of the USB jitter.
+        state: what the host finds: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
+            in time-adjust mode by a dead host.
+        serial: ``SERI`` of VV.
+        firmware: ``FIRM`` of VV; a major number below 3 knows SCIP 1.1 only.
+        timer_start: counter at construction, ms.
+        drift_ppm: how much faster than the world the sensor's clock runs.
+        jitter: greatest delay of a scan by USB batching, s.
+        min_step: first step that measures (``AMIN``).
+        max_step: last step that measures (``AMAX``).
+        name: for logs.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        source: RangeSource,
+        *,
+        seed: int = 0,
+        state: StartState = "scip1",
+        serial: str = "H0706400",
+        firmware: str = "3.1.04(02/Aug./2007)",
+        timer_start: int = 0,
+        drift_ppm: float = 0.0,
+        jitter: float = 0.0,
+        min_step: int = 44,
+        max_step: int = 725,
+        name: str = "lidar",
+    ) -> None:
+        self.name = name
+        self.received: deque[str] = deque(maxlen=1000)
+        """Newest request lines, for tests."""
+        self._clock = clock
+        self._source = source
+        self._rng = np.random.default_rng(seed)
+        self._state: StartState = state
+        self._identity = {"SERI": serial, "FIRM": firmware}
+        self._rate = 1.0 + drift_ppm * 1e-6
+        self._jitter = jitter
+        self._steps = (min_step, max_step)
+        self._born = clock.now()
+        self._fragile = self._cut = self._laser_broken = self._seri_quirk = False
+        self._order: Order | None = None
+        self._statuses: deque[int] = deque()
+        self._pending: list[str] = []
+        self._requests: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
+        self._power_up()
+        self._scip2 = state != "scip1"
+        self._adjusting = state == "time_adjust"
+        self._timer_zero = self._time() - timer_start * 1_000_000
+        if state == "streaming":
+            self._laser = True
+            self._order = Order("MD", *self._steps, prefix=f"MD{min_step:04d}{max_step:04d}010")
+
+    # Emulator protocol
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve for ever."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._listen(end), name=f"{self.name} hears")
+            tasks.create_task(self._serve(end), name=f"{self.name} answers")
+            tasks.create_task(self._turn(end), name=f"{self.name} turns")
+
+    def power_cycle(self) -> None:
+        """Off and on: back in SCIP 1.1 unless configured to start in 2.0, counter at zero, hearing again."""
+        self._power_up()
+        self._scip2 = self._state == "scip2"
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream until 98, 50-97 end
+        it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the next scan in
+        the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an empty
+        line into VV. ``timer`` sets the counter.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        known: dict[str, Callable[..., None]] = {
+            "status": self._inject_status,
+            "timer": self._inject_timer,
+            "deaf": lambda word="on": setattr(self, "_deaf", _switch(word)),
+            "fragile": lambda word="on": setattr(self, "_fragile", _switch(word)),
+            "cut": lambda: setattr(self, "_cut", True),
+            "laser": lambda word="on": setattr(self, "_laser_broken", _switch(word)),
+            "seri": lambda word="on": setattr(self, "_seri_quirk", _switch(word)),
+        }
+        try:
+            known[fault](*values)
+        except (KeyError, TypeError, ValueError) as error:
+            asked = " ".join((fault, *values))
+            raise InputError(f"{self.name}: cannot inject {asked!r}; known: {FAULTS}") from error
+
+    def _inject_status(self, code: str) -> None:
+        if not 21 <= int(code) <= 98:
+            raise ValueError(code)
+        self._statuses.append(int(code))
+
+    def _inject_timer(self, milliseconds: str) -> None:
+        self._timer_zero = self._time() - int(milliseconds) * 1_000_000
+
+    # Supply and time
+
+    def _power_up(self) -> None:
+        self._scip2 = self._adjusting = self._laser = self._verifying = self._deaf = False
+        self._baud = 19200
+        self._next_baud: int | None = None
+        self._order = None
+        self._skipped = 0
+        self._ordered = 0
+        self._input = b""
+        self._statuses.clear()
+        self._pending.clear()
+        while not self._requests.empty():
+            self._requests.get_nowait()
+        self._timer_zero = self._time()
+
+    def _time(self) -> int:
+        """Sensor's own time, ns since construction."""
+        return round((self._clock.now() - self._born) * self._rate)
+
+    def _world_time(self, time: int) -> int:
+        """The world's time at a time of the sensor's clock, ns."""
+        return self._born + round(time / self._rate)
+
+    def _counter(self, time: int) -> int:
+        return (time - self._timer_zero) // 1_000_000 & COUNTER_MASK
+
+    # Rotor
+
+    async def _turn(self, end: DeviceEnd) -> None:
+        begin: int | None = None
+        while (begin := await self._next_revolution(begin)) is not None:
+            await self._clock.sleep_until(self._sent_at(begin))
+            order = self._order
+            if order is None or begin < self._ordered:
+                continue
+            if self._statuses:
+                self._send_status(end, order, self._statuses.popleft())
+            elif not self._verifying:
+                self._send_scan(end, order, begin)
+
+    async def _next_revolution(self, previous: int | None) -> int | None:
+        """Sensor's time at step 0 of the revolution after ``previous``; None = it never turns again."""
+        if previous is None:
+            return -(-self._time() // PERIOD) * PERIOD
+        late = (self._time() - previous) // PERIOD
+        return previous + PERIOD * (1 if late <= CATCH_UP else late)
+
+    def _latest_revolution(self) -> int:
+        """Sensor's time at step 0 of the last revolution that is complete."""
+        return (self._time() - self._sweep()) // PERIOD * PERIOD
+
+    def _measure(self, begin: int) -> NDArray[np.int32]:
+        """Shape (769,), mm or codes."""
+        return self._source.scan(self._world_time(begin))
+
+    def _sweep(self) -> int:
+        return self._steps[1] * PERIOD // STEPS + PROCESSING
+
+    def _sent_at(self, begin: int) -> int:
+        """The world's time at which the scan begun at ``begin`` reaches the host."""
+        late = self._rng.uniform(0.0, self._jitter) if self._jitter > 0 else 0.0
+        return self._world_time(begin + self._sweep()) + round(late * SECOND)
+
+    def _send_scan(self, end: DeviceEnd, order: Order, begin: int) -> None:
+        self._skipped += 1
+        if self._skipped <= order.skip:
+            return
+        self._skipped = 0
+        if order.left is not None:
+            order = replace(order, left=order.left - 1)
+            self._order = order
+        block = build_reply(order.echo, "99", self._data(order, begin))
+        if self._cut:
+            self._cut, block = False, block[: len(block) // 2]
+        end.write(block)
+        if order.left == 0:
+            self._order, self._laser = None, False
+
+    def _send_status(self, end: DeviceEnd, order: Order, code: int) -> None:
+        end.write(build_reply(order.echo, f"{code:02d}"))
+        self._verifying = 21 <= code <= 49
+        if 50 <= code <= 97:
+            self._order, self._laser = None, False
+
+    def _data(self, order: Order, begin: int) -> list[bytes]:
+        return scan_lines(order, self._counter(begin), self._measure(begin))
+
+    # Requests
+
+    async def _listen(self, end: DeviceEnd) -> None:
+        while True:
+            self._input += await end.read()
+            *lines, self._input = self._input.replace(b"\r", b"\n").split(b"\n")
+            for raw in lines:
+                line = raw.decode("latin-1")
+                if line and not self._deaf:
+                    self.received.append(line)
+                    self._requests.put_nowait((line, line in self._pending))
+                    self._pending.append(line)
+
+    async def _serve(self, end: DeviceEnd) -> None:
+        while True:
+            line, repeated = await self._requests.get()
+            await self._clock.sleep(ANSWER_DELAY)
+            if line in self._pending:
+                self._pending.remove(line)
+            answer = self._answer_scip2(line, repeated) if self._scip2 else self._answer_scip1(line)
+            end.write(answer)
+            if self._next_baud is not None:
+                self._baud, self._next_baud = self._next_baud, None
+                end.baud = None if end.baud is None else self._baud  # USB has none
+
+    def _answer_scip1(self, line: str) -> bytes:
+        if line == "SCIP2.0" and not self._identity["FIRM"].startswith(("1.", "2.")):
+            self._scip2 = True
+            return build_reply(line, "0")
+        if line in ("L0", "L1"):
+            self._laser = line == "L1" and not self._laser_broken
+            return build_reply(line, "0" if self._laser == (line == "L1") else "E")
+        if line == "V":
+            return build_reply(line, "0", [f"{key}:{value};".encode() for key, value in self._version().items()])
+        order = parse_scip1_order(line)
+        if order is not None and self._laser:
+            return build_reply(line, "0", self._data(order, self._latest_revolution()))
+        return build_reply(line, "E")
+
+    def _answer_scip2(self, line: str, repeated: bool) -> bytes:
+        text, _, tag = line.partition(";")
+        if len(tag) > TAG_LIMIT:
+            return build_reply(line, "0G")
+        if repeated:
+            return build_reply(line, "0B")
+        if self._adjusting and text[:2] not in ("TM", "RS"):
+            return build_reply(line, "0E")
+        handlers: dict[str, Callable[[str, str], tuple[str, list[bytes]]]] = {
+            "VV": self._vv,
+            "PP": self._pp,
+            "II": self._ii,
+            "BM": self._bm,
+            "QT": self._qt,
+            "RS": self._rs,
+            "TM": self._tm,
+            "SS": self._ss,
+            "CR": lambda *_: ("04", []),
+            "GD": self._single,
+            "GS": self._single,
+            "MD": self._multi,
+            "MS": self._multi,
+        }
+        handler = handlers.get(text[:2])
+        if handler is None or (len(text) > 2 and text[:2] in ("VV", "PP", "II", "BM", "QT", "RS")):
+            self._deaf = self._fragile
+            return b"" if self._deaf else build_reply(line, "0E")
+        status, lines = handler(text, tag)
+        reply = build_reply(line, status, lines)
+        return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self._seri_quirk else reply
+
+    def _version(self) -> dict[str, str]:
+        return {
+            "VEND": "Hokuyo Automatic Co.,Ltd.",
+            "PROD": "SOKUIKI Sensor URG-04LX",
+            "FIRM": self._identity["FIRM"],
+            "PROT": "SCIP 2.0" if self._scip2 else "SCIP 1.1",
+            "SERI": self._identity["SERI"],
+        }
+
+    def _vv(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
+        lines = build_fields(self._version())
+        if self._seri_quirk:
+            lines[-1] = lines[-1][:-1] + bytes(((lines[-1][-1] - 0x30 + 1) % 64 + 0x30,))
+        return "00", lines
+
+    def _pp(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
+        first, last = self._steps
+        fields: dict[str, str | int] = {
+            "MODL": "URG-04LX(Hokuyo Automatic Co.,Ltd.)",
+            "DMIN": LEAST_MM,
+            "DMAX": GREATEST_MM,
+            "ARES": STEPS,
+            "AMIN": first,
+            "AMAX": last,
+            "AFRT": FRONT_STEP,
+            "SCAN": 600,
+        }
+        return "00", build_fields(fields)
+
+    def _ii(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
+        fields: dict[str, str | int] = {
+            "MODL": "URG-04LX(Hokuyo Automatic Co.,Ltd.)",
+            "LASR": "ON" if self._laser else "OFF",
+            "SCSP": "Initial(600[rpm])<-Default setting by user",
+            "MESM": "CLASSIC" if self._laser else "IDLE",
+            "SBPS": f"{self._baud}[bps]",
+            "TIME": f"{self._counter(self._time()):06X}",
+            "STAT": "Laser malfunction." if self._laser_broken else "Sensor works well.",
+        }
+        return "00", build_fields(fields)
+
+    def _bm(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
+        if self._laser_broken:
+            return "01", []
+        status = "02" if self._laser else "00"
+        self._laser = True
+        return status, []
+
+    def _qt(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
+        self._order, self._laser, self._verifying = None, False, False
+        self._statuses.clear()
+        return "00", []
+
+    def _rs(self, text: str, tag: str) -> tuple[str, list[bytes]]:
+        self._adjusting, self._timer_zero, self._next_baud = False, self._time(), 19200
+        return self._qt(text, tag)
+
+    def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
+        if text == "TM1":
+            if not self._adjusting:
+                return "04", []
+            return "00", [counter_line(self._counter(self._time()))]
+        if text not in ("TM0", "TM2"):
+            return "01", []
+        enter = text == "TM0"
+        if enter == self._adjusting:
+            return "02" if enter else "03", []
+        if enter and self._order is not None:
+            return "0A", []
+        self._adjusting = enter
+        self._laser = False
+        return "00", []
+
+    def _ss(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
+        digits = text[2:]
+        if len(digits) != 6:
+            return "0C", []
+        if not digits.isdigit():
+            return "01", []
+        if int(digits) not in (19200, 57600, 115200):
+            return "02", []
+        if int(digits) == self._baud:
+            return "03", []
+        self._next_baud = int(digits)
+        return "00", []
+
+    def _single(self, text: str, tag: str) -> tuple[str, list[bytes]]:
+        order = parse_order(text, tag)
+        if isinstance(order, str):
+            return order, []
+        if not self._laser:
+            return "10", []
+        return "00", self._data(order, self._latest_revolution())
+
+    def _multi(self, text: str, tag: str) -> tuple[str, list[bytes]]:
+        order = parse_order(text, tag)
+        if isinstance(order, str):
+            return order, []
+        if self._order is not None:
+            return "0B", []
+        if self._laser_broken:
+            self._statuses.append(50)
+        self._order, self._laser, self._skipped, self._ordered = order, True, 0, self._time()
+        return "00", []
+
+
+def _switch(word: str) -> bool:
+    return {"on": True, "off": False}[word]

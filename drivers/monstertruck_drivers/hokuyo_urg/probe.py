@@ -1,0 +1,71 @@
+"""Ask a port what scanner is on it and take one scan."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.hokuyo_urg.identity import Parameters
+from monstertruck_drivers.hokuyo_urg.protocol import (
+    ScanBlock,
+    decode_scan,
+    scan_command,
+    scip1_scan_command,
+    split_ranges,
+)
+from monstertruck_drivers.hokuyo_urg.session import Dialect, ScipSession, Sensor
+from monstertruck_drivers.link import Port
+from monstertruck_runtime.clock import Clock
+
+FIRST_SCAN = 1.6
+"""Seconds allowed for the first scan."""
+
+
+async def probe(port: Port, clock: Clock) -> dict[str, object]:
+    """Handshake, identity, state and a summary of the first scan, ready for JSON; the laser is off afterwards.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    async with await port.open() as link:
+        session = ScipSession(link, clock, HokuyoConfig())
+        sensor = await session.handshake()
+        try:
+            block = await _one_scan(session, sensor)
+        finally:
+            if not link.is_lost:
+                await session.stop()
+    return {
+        "device": "hokuyo_urg",
+        "port": port.name,
+        "dialect": sensor.dialect.value,
+        "identity": asdict(sensor.identity),
+        "parameters": asdict(sensor.parameters),
+        "state": None if sensor.state is None else asdict(sensor.state),
+        "scan": _summary(block, sensor.parameters),
+    }
+
+
+async def _one_scan(session: ScipSession, sensor: Sensor) -> ScanBlock:
+    shape = (sensor.parameters.first_step, sensor.parameters.last_step)
+    if sensor.dialect is Dialect.SCIP1:
+        await session.demand("L1")
+        return decode_scan(await session.demand(scip1_scan_command(*shape)), *shape)
+    command = scan_command("MD", *shape, count=1)
+    await session.demand(command)
+    reply = await session.next_reply(FIRST_SCAN)
+    return decode_scan(reply, *shape)
+
+
+def _summary(block: ScanBlock, parameters: Parameters) -> dict[str, object]:
+    ranges, codes = split_ranges(block.values, parameters.least_mm)
+    valid = ranges[np.isfinite(ranges)]
+    kinds, counts = np.unique(codes[~np.isfinite(ranges)], return_counts=True)
+    return {
+        "counter_ms": block.counter,
+        "beams": len(ranges),
+        "valid": len(valid),
+        "nearest_m": float(valid.min()) if len(valid) else None,
+        "farthest_m": float(valid.max()) if len(valid) else None,
+        "error_codes": {str(kind): int(count) for kind, count in zip(kinds, counts, strict=True)},
+    }

@@ -1,0 +1,392 @@
+"""SCIP 1.1 and 2.0 as pure functions: sums, 6-bit encoding, requests, replies, ranges. No I/O.
+
+A reply is an echo line, a status line, any number of lines and an empty line; in SCIP 2.0 every line
+after the echo ends with a checksum character. Source: SCIP 2.0 specification, checked against a capture of
+firmware 3.1.04. The text fields of VV, PP and II are in ``identity.py``.
+"""
+
+import re
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.errors import ProtocolError
+from monstertruck_schemas.sensor import VALID_BEAM
+
+ScanFormat = Literal["MD", "MS"]
+"""Three characters a range (up to 262143 mm) or two (up to 4095 mm)."""
+
+RANGE_WIDTH: Final[dict[str, int]] = {"MD": 3, "GD": 3, "MS": 2, "GS": 2, "G": 2}
+"""Characters of one range by command."""
+COUNTER_BITS: Final = 24
+COUNTER_MASK: Final = (1 << COUNTER_BITS) - 1
+"""The millisecond counter wraps after 4 h 39 min 37.2 s."""
+LINE_PAYLOAD: Final = 64
+"""Most payload characters of a data line."""
+TAG_LIMIT: Final = 16
+"""Most characters of the echoed string after ``;``."""
+MAX_REPLY: Final = 8192
+"""Bytes kept while waiting for the end of a reply; the longest real one (769 ranges) has under 2500."""
+
+
+# Sums and numbers
+
+
+def line_sum(text: bytes) -> int:
+    """Checksum character of a line, from its bytes without checksum and LF."""
+    return (sum(text) & 0x3F) + 0x30
+
+
+def sum_matches(line: bytes) -> bool:
+    """Whether ``line`` (with its checksum character) is intact; a ``;`` before the sum may count or not."""
+    text, check = line[:-1], line[-1:]
+    if not check:
+        return False
+    return check[0] == line_sum(text) or (text.endswith(b";") and check[0] == line_sum(text[:-1]))
+
+
+def encode(value: int, width: int) -> bytes:
+    """``value`` as ``width`` characters of six bits each, most significant first.
+
+    Raises:
+        ValueError: it does not fit.
+    """
+    if not 0 <= value < 1 << 6 * width:
+        raise ValueError(f"{value} does not fit into {width} characters")
+    return bytes((value >> shift & 0x3F) + 0x30 for shift in range(6 * (width - 1), -1, -6))
+
+
+def decode(text: bytes) -> int:
+    """Inverse of :func:`encode`.
+
+    Raises:
+        ProtocolError: a character outside ``0`` to ``o``.
+    """
+    value = 0
+    for byte in text:
+        if not 0x30 <= byte <= 0x6F:
+            raise ProtocolError(f"SCIP: byte 0x{byte:02X} in an encoded number")
+        value = value << 6 | (byte - 0x30)
+    return value
+
+
+def encode_array(values: NDArray[np.integer], width: int) -> bytes:
+    """Shape (n,) to ``n * width`` characters; bits that do not fit are cut."""
+    shifts = np.arange(6 * (width - 1), -1, -6)
+    return ((values[:, None] >> shifts & 0x3F) + 0x30).astype(np.uint8).tobytes()
+
+
+def decode_array(payload: bytes, width: int) -> NDArray[np.int32]:
+    """Inverse of :func:`encode_array`.
+
+    Raises:
+        ProtocolError: a character outside ``0`` to ``o``, or a number cut short.
+    """
+    if len(payload) % width:
+        raise ProtocolError(f"SCIP: {len(payload)} characters are no whole number of {width}-character ranges")
+    digits = np.frombuffer(payload, np.uint8) - np.uint8(0x30)  # too small a byte wraps to a great one
+    if digits.size and digits.max() > 0x3F:
+        raise ProtocolError("SCIP: byte outside the encoding in a data line")
+    columns = digits.reshape(-1, width).astype(np.int32)
+    values = columns[:, 0]
+    for column in range(1, width):
+        values = values << 6 | columns[:, column]
+    return values
+
+
+def wrap_lines(payload: bytes, *, sums: bool = True) -> list[bytes]:
+    """Cut ``payload`` into data lines, without their LF, with checksum characters if ``sums``."""
+    lines = [payload[at : at + LINE_PAYLOAD] for at in range(0, len(payload), LINE_PAYLOAD)]
+    return [line + bytes((line_sum(line),)) for line in lines] if sums else lines
+
+
+def unwrap_lines(lines: list[bytes], *, sums: bool = True) -> bytes:
+    """Join data lines again, checking their sums.
+
+    Raises:
+        ProtocolError: a line with a wrong sum or more than 64 payload characters.
+    """
+    if not sums:
+        return b"".join(lines)
+    payload = []
+    for line in lines:
+        text = line[:-1]
+        if not text or (sum(text) & 0x3F) + 0x30 != line[-1] or len(text) > LINE_PAYLOAD:
+            raise ProtocolError("SCIP: bad checksum in a data line")
+        payload.append(text)
+    return b"".join(payload)
+
+
+# Requests
+
+
+def request(command: str, tag: str = "") -> bytes:
+    """Wire form of a command, with an optional string that the sensor echoes.
+
+    Raises:
+        ValueError: characters the sensor would refuse, or too long a tag.
+    """
+    if len(tag) > TAG_LIMIT:
+        raise ValueError(f"tag {tag!r} is longer than {TAG_LIMIT} characters")
+    text = f"{command};{tag}" if tag else command
+    if not text.isascii() or not text.isprintable() or ";" in command or not command:
+        raise ValueError(f"{text!r} is no SCIP request")
+    return text.encode("ascii") + b"\n"
+
+
+def scan_command(scan_format: ScanFormat, start: int, end: int, cluster: int = 1, skip: int = 0, count: int = 0) -> str:
+    """``MD``/``MS``: steps ``start`` to ``end``, ``skip`` revolutions left out between two; count 0 = endless.
+
+    Raises:
+        ValueError: a parameter outside its digits.
+    """
+    _digits(start=(start, 9999), end=(end, 9999), cluster=(cluster, 99), skip=(skip, 9), count=(count, 99))
+    return f"{scan_format}{start:04d}{end:04d}{cluster:02d}{skip:d}{count:02d}"
+
+
+def single_command(command: Literal["GD", "GS"], start: int, end: int, cluster: int = 1) -> str:
+    """``GD``/``GS``: the latest revolution, once; the laser must be on (``BM``).
+
+    Raises:
+        ValueError: a parameter outside its digits.
+    """
+    _digits(start=(start, 9999), end=(end, 9999), cluster=(cluster, 99))
+    return f"{command}{start:04d}{end:04d}{cluster:02d}"
+
+
+def scip1_scan_command(start: int, end: int, cluster: int = 1) -> str:
+    """``G`` of SCIP 1.1: the latest revolution, once.
+
+    Raises:
+        ValueError: a parameter outside its digits.
+    """
+    _digits(start=(start, 999), end=(end, 999), cluster=(cluster, 99))
+    return f"G{start:03d}{end:03d}{cluster:02d}"
+
+
+def baud_command(baud: int) -> str:
+    """``SS``: change the rate of the RS232 port.
+
+    Raises:
+        ValueError: not a rate of the standard.
+    """
+    if baud not in (19200, 57600, 115200):
+        raise ValueError(f"SCIP knows 19200, 57600 and 115200 baud, not {baud}")
+    return f"SS{baud:06d}"
+
+
+def _digits(**limits: tuple[int, int]) -> None:
+    for name, (value, greatest) in limits.items():
+        if not 0 <= value <= greatest:
+            raise ValueError(f"{name} {value} is not within 0..{greatest}")
+
+
+# Replies
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """One complete reply or scan block."""
+
+    echo: str
+    """First line, an exact copy of the request (scan blocks: with the remaining count)."""
+    status: str
+    """Two characters in SCIP 2.0, one in SCIP 1.1."""
+    lines: list[bytes]
+    """Lines after the status, without LF, with their checksum characters, unchecked."""
+
+    @property
+    def scip1(self) -> bool:
+        """True if a sensor in SCIP 1.1 answered."""
+        return len(self.status) == 1
+
+    def answers_scan(self, command: str) -> bool:
+        """Whether this belongs to the stream that ``command`` (MD/MS) started, whatever count remains."""
+        return len(self.echo) == len(command) and self.echo[:13] == command[:13] and self.echo[13:].isdigit()
+
+
+def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> bytes:
+    """Wire form of a reply; ``lines`` carry their own checksum characters."""
+    head = status.encode("ascii")
+    if len(status) > 1:
+        head += bytes((line_sum(head),))
+    return b"\n".join([echo.encode("latin-1"), head, *(lines or []), b"", b""])
+
+
+_ECHO = rb"(?:VV|PP|II|BM|QT|RS|TM[012]|SS\d{6}|SCIP2\.0|G[DS]\d{10}|M[DS]\d{13}|V|L[01]|G\d{8})"
+# Not tied to the start of a line: it may be glued to one that was cut.
+_HEADER = re.compile(_ECHO + rb"(?:;[^\n]{0,16})?\n(?:[0-9A-Z]{2}[0-o]|[0-9A-Z])\n")
+_FIRST_LINES = re.compile(rb"([\x20-\x7e]{1,64})\n(?:([0-9A-Z]{2})([0-o])|([0-9A-Z]))\n")
+_TEXT_LINE = re.compile(rb"[A-Z]{4}:")
+
+
+class ScipParser:
+    """Incremental reader of replies that finds its way again after lost, flipped or foreign bytes."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._searched = 0
+        self._last = Reply("", "", [])
+        self.replies = 0
+        """Replies recognised so far."""
+        self.rejected = 0
+        """Runs of bytes without a readable header so far."""
+
+    def feed(self, data: bytes) -> list[Reply]:
+        """Take received bytes in pieces of any size; returns the replies completed by them."""
+        self._buffer += data
+        found: list[Reply] = []
+        while (at := self._buffer.find(b"\n\n", self._searched)) >= 0:
+            group = bytes(self._buffer[: at + 1])
+            del self._buffer[: at + 2]
+            self._searched = 0
+            found += self._read(group.lstrip(b"\n"))
+        if len(self._buffer) > MAX_REPLY:
+            del self._buffer[: -MAX_REPLY // 2]
+            self.rejected += 1
+        self._searched = max(0, len(self._buffer) - 1)
+        self.replies += len(found)
+        return found
+
+    def reset(self) -> None:
+        """Forget a reply that is half received."""
+        self._buffer.clear()
+        self._searched = 0
+
+    def _read(self, group: bytes) -> list[Reply]:
+        """Replies in the text up to an empty line: one, or more where an end was lost."""
+        if not group:
+            return []
+        starts = [match.start() for match in _HEADER.finditer(group)]
+        if starts[:1] != [0]:
+            starts.insert(0, 0)
+        parts = [group[a:b] for a, b in zip(starts, [*starts[1:], len(group)], strict=True)]
+        return [reply for part in parts if (reply := self._part(part)) is not None]
+
+    def _part(self, part: bytes) -> Reply | None:
+        match = _FIRST_LINES.match(part)
+        if match is not None and (match[2] is None or line_sum(match[2]) == match[3][0]):
+            status = (match[2] or match[4]).decode("ascii")
+            self._last = Reply(match[1].decode("ascii"), status, part[match.end() :].split(b"\n")[:-1])
+            return self._last
+        if self._last.echo[:2] in ("VV", "PP", "II") and _TEXT_LINE.match(part):
+            # Some units put an empty line into the middle of VV: the rest continues it.
+            return Reply(self._last.echo, self._last.status, part.split(b"\n")[:-1])
+        self.rejected += 1
+        return None
+
+
+# Statuses
+
+
+class Outcome(Enum):
+    """What a status asks of the host."""
+
+    OK = auto()
+    ALREADY = auto()
+    """Nothing to do: the laser was on, the mode was entered or left before."""
+    DATA = auto()
+    """A scan follows."""
+    VERIFYING = auto()
+    """21-49: stopped to verify a suspected fault; wait for RESUMED."""
+    RESUMED = auto()
+    LASER_OFF = auto()
+    BUSY = auto()
+    """0B: drain and retry once."""
+    UPDATE_MODE = auto()
+    """0I: firmware update mode; leave it with RS."""
+    FAULT = auto()
+    """50-97, 0A, or a laser that failed to light."""
+    BAD_REQUEST = auto()
+    """Our own mistake: retrying cannot help."""
+
+
+def classify(command: str, status: str) -> Outcome:
+    """Judge ``status`` of the reply to ``command`` (its first characters suffice)."""
+    if len(status) == 1:
+        return Outcome.OK if status == "0" else Outcome.BAD_REQUEST
+    shared = {"00": Outcome.OK, "0A": Outcome.FAULT, "0B": Outcome.BUSY, "0I": Outcome.UPDATE_MODE}
+    if status in shared:
+        return shared[status]
+    if command.startswith("BM"):
+        return {"01": Outcome.FAULT, "02": Outcome.ALREADY}.get(status, Outcome.BAD_REQUEST)
+    if command.startswith("TM"):
+        return Outcome.ALREADY if status in ("02", "03") else Outcome.BAD_REQUEST
+    if command.startswith("SS"):
+        return Outcome.ALREADY if status == "03" else Outcome.BAD_REQUEST
+    if status.isdigit() and command[:2] in ("MD", "MS", "GD", "GS"):
+        code = int(status)
+        if code == 99:
+            return Outcome.DATA
+        if code == 98:
+            return Outcome.RESUMED
+        if code >= 50:
+            return Outcome.FAULT
+        if code >= 21:
+            return Outcome.VERIFYING
+        if code == 10:
+            return Outcome.LASER_OFF
+    return Outcome.BAD_REQUEST
+
+
+# Scans
+
+
+@dataclass(frozen=True, slots=True)
+class ScanBlock:
+    """Decoded data of one revolution."""
+
+    counter: int | None
+    """Millisecond counter at step 0, 24 bits; None in SCIP 1.1."""
+    values: NDArray[np.int32]
+    """Shape (n,): mm, or an error code where below the sensor's least range."""
+
+
+def decode_counter(line: bytes) -> int:
+    """Millisecond counter from a time line with its checksum.
+
+    Raises:
+        ProtocolError: wrong sum or length.
+    """
+    if len(line) != 5 or line_sum(line[:4]) != line[4]:
+        raise ProtocolError("SCIP: bad time line")
+    return decode(line[:4])
+
+
+def decode_scan(reply: Reply, start: int, end: int, cluster: int = 1) -> ScanBlock:
+    """Decode the block of a scan of steps ``start`` to ``end``.
+
+    A partial last cluster may be there or not: the specification leaves it open.
+
+    Raises:
+        ProtocolError: wrong sums, or another number of ranges than was asked for.
+    """
+    name = reply.echo[:1] if reply.scip1 else reply.echo[:2]
+    if name not in RANGE_WIDTH or (not reply.scip1 and len(reply.lines) < 2):
+        raise ProtocolError(f"SCIP: {reply.echo!r} carries no scan")
+    counter = None if reply.scip1 else decode_counter(reply.lines[0])
+    payload = unwrap_lines(reply.lines if reply.scip1 else reply.lines[1:], sums=not reply.scip1)
+    values = decode_array(payload, RANGE_WIDTH[name])
+    steps, width = end - start + 1, max(cluster, 1)
+    if len(values) not in (steps // width, -(-steps // width)):
+        raise ProtocolError(f"SCIP: {len(values)} ranges came, {-(-steps // width)} were asked for")
+    return ScanBlock(counter, values)
+
+
+def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Separate ranges from error codes.
+
+    Args:
+        values: shape (n,), mm or codes.
+        least: mm; what is below is an error code (``DMIN``).
+
+    Returns:
+        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,).
+    """
+    valid = values >= least
+    ranges = np.where(valid, values / 1000.0, np.inf)
+    codes = np.where(valid, VALID_BEAM, np.minimum(values, VALID_BEAM - 1)).astype(np.uint8)
+    return ranges, codes

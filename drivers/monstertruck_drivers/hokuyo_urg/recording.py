@@ -1,0 +1,172 @@
+"""A recorded drive served by the emulated scanner, every scan at its recorded time, once."""
+
+import asyncio
+import gzip
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator, StartState
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+
+COLUMNS: Final = 707
+TIME_COLUMN: Final = 0
+FIRST_RANGE_COLUMN: Final = 24
+FIRST_STEP: Final = 43
+LAST_STEP: Final = 725
+STEPS: Final = 769
+GREATEST: Final = (1 << 18) - 1
+"""Most that three characters hold, mm."""
+LEAD: Final = 10_000_000
+"""Nanoseconds from the request for scans to step 0 of the first recorded one."""
+
+
+class RecordedRanges:
+    """Scans of a recorded drive; a ``RangeSource`` once :meth:`start` told when it begins.
+
+    Args:
+        times: shape (n,), ns since the first scan, increasing: step 0 of each revolution.
+        ranges: shape (n, 683), mm or error codes, steps 43..725.
+    """
+
+    def __init__(self, times: NDArray[np.int64], ranges: NDArray[np.int32]) -> None:
+        self.times = times
+        self.ranges = ranges
+        self._begin = 0
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the text format of the BreezySLAM examples, gzipped or not.
+
+        One scan a line of 707 blank-separated numbers: column 0 time in microseconds, 24..706 ranges in mm.
+
+        Raises:
+            InputError: the file does not exist or a line is not of this form.
+        """
+        opener = gzip.open if path.suffix == ".gz" else open
+        times: list[int] = []
+        rows: list[NDArray[np.int32]] = []
+        try:
+            with opener(path, "rt", encoding="ascii") as lines:
+                for number, line in enumerate(lines, start=1):
+                    time, row = _parse(line, f"{path}:{number}")
+                    if times and time <= times[-1]:
+                        raise InputError(f"{path}:{number}: time {time} does not increase")
+                    times.append(time)
+                    rows.append(row)
+        except (OSError, EOFError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: expected a recording of {COLUMNS} numbers a line: {error}") from error
+        if not rows:
+            raise InputError(f"{path}: holds no scans")
+        return cls((np.array(times, np.int64) - times[0]) * 1000, np.array(rows, np.int32))
+
+    def start(self, time_ns: int) -> None:
+        """Let step 0 of the first scan be at ``time_ns``."""
+        self._begin = time_ns
+
+    def scan(self, time_ns: int) -> NDArray[np.int32]:
+        """The recorded revolution that began nearest to ``time_ns``; shape (769,), zero where not recorded."""
+        at = int(np.searchsorted(self.times, time_ns - self._begin))
+        near = [i for i in (at - 1, at) if 0 <= i < len(self.times)]
+        best = min(near, key=lambda i: abs(int(self.times[i]) - (time_ns - self._begin)))
+        values = np.zeros(STEPS, np.int32)
+        values[FIRST_STEP : LAST_STEP + 1] = self.ranges[best]
+        return values
+
+
+def _parse(line: str, where: str) -> tuple[int, NDArray[np.int32]]:
+    words = line.split()
+    if len(words) != COLUMNS:
+        raise InputError(f"{where}: expected {COLUMNS} numbers, found {len(words)}")
+    try:
+        time, row = int(words[TIME_COLUMN]), np.array(words[FIRST_RANGE_COLUMN:], np.int64)
+    except ValueError as error:
+        raise InputError(f"{where}: expected whole numbers: {error}") from error
+    if row.min() < 0 or row.max() > GREATEST:
+        raise InputError(f"{where}: expected ranges within 0..{GREATEST} mm")
+    return time, row.astype(np.int32)
+
+
+class RecordedHokuyoEmulator(HokuyoEmulator):
+    """Scanner that turns when the recorded one did; reports steps 43..725 as the recorded one.
+
+    The first request for a stream starts the recording, which then runs through once, whoever listens.
+
+    Args:
+        clock: the world's time.
+        recording: what it sees and when.
+        seed: of the USB jitter.
+        state: what the host finds; ``streaming`` starts the recording at once.
+        timer_start: counter at construction, ms.
+        drift_ppm: how much faster than the world the sensor's clock runs.
+        jitter: greatest delay of a scan by USB batching, s.
+        name: for logs.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        recording: RecordedRanges,
+        *,
+        seed: int = 0,
+        state: StartState = "scip1",
+        timer_start: int = 0,
+        drift_ppm: float = 0.0,
+        jitter: float = 0.0,
+        name: str = "lidar",
+    ) -> None:
+        self.finished = asyncio.Event()
+        """Set once the last recorded scan was sent."""
+        self.began: int | None = None
+        """The world's time, ns, at step 0 of the first recorded scan."""
+        self._recording = recording
+        self._wanted = asyncio.Event()
+        self._first = 0
+        self._index = -1
+        super().__init__(
+            clock,
+            recording,
+            seed=seed,
+            state=state,
+            timer_start=timer_start,
+            drift_ppm=drift_ppm,
+            jitter=jitter,
+            min_step=FIRST_STEP,
+            max_step=LAST_STEP,
+            name=name,
+        )
+        if state == "streaming":
+            self._wanted.set()
+
+    async def _next_revolution(self, previous: int | None) -> int | None:
+        if previous is None:
+            await self._wanted.wait()
+            self._first = self._time() + LEAD
+            self._recording.start(self._first)
+            self.began = self._world_time(self._first)
+        self._index += 1
+        if self._index == len(self._recording):
+            self.finished.set()
+            return None
+        return self._first + int(self._recording.times[self._index])
+
+    def _measure(self, begin: int) -> NDArray[np.int32]:
+        # In the sensor's time, which may drift from the world's.
+        return self._recording.scan(begin)
+
+    def _latest_revolution(self) -> int:
+        age = self._time() - self._sweep() - self._first
+        complete = int(np.searchsorted(self._recording.times, age, side="right")) - 1
+        return self._first + int(self._recording.times[max(complete, 0)])
+
+    def _multi(self, text: str, tag: str) -> tuple[str, list[bytes]]:
+        answer = super()._multi(text, tag)
+        if answer[0] == "00":
+            self._wanted.set()
+        return answer
