@@ -4,9 +4,9 @@ These are the *true* values of the plant. What the daemon believes stands in its
 is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Pose2D, Schema
 
@@ -99,6 +99,17 @@ class TruckConfig(Schema):
     rear_servo: ServoConfig = ServoConfig(channel=0)
     motor: MotorConfig = MotorConfig()
 
+    @model_validator(mode="after")
+    def _check_geometry(self) -> Self:
+        if self.length < self.wheelbase or self.width < self.track:
+            raise ValueError(
+                f"footprint {self.length} m x {self.width} m: expected at least wheelbase x track, "
+                f"{self.wheelbase} m x {self.track} m"
+            )
+        if self.front_servo.channel == self.rear_servo.channel:
+            raise ValueError(f"front_servo and rear_servo share channel {self.front_servo.channel}")
+        return self
+
 
 class BatteryConfig(Schema):
     """6S LiPo pack and its measurement."""
@@ -144,6 +155,14 @@ class LidarConfig(Schema):
     wall_height: Positive = 0.6
     """Of everything in the map: beams tilted upwards pass over it, m."""
 
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.first_step > self.last_step:
+            raise ValueError(f"first_step {self.first_step} > last_step {self.last_step}")
+        if self.min_range >= self.max_range:
+            raise ValueError(f"min_range {self.min_range} m >= max_range {self.max_range} m")
+        return self
+
 
 class Iron(Schema):
     """Magnetic error of the truck's own metal: measured = soft * true + hard, per device axis x, y, z."""
@@ -180,7 +199,7 @@ class CompassConfig(Schema):
     iron: Iron = Iron()
 
 
-class FlatTilt(Schema):
+class GroundTilt(Schema):
     """The ground is level, or follows the profile that lies beside the map."""
 
     kind: Literal["ground"] = "ground"
@@ -198,7 +217,7 @@ class SinusoidTilt(Schema):
     """Hz."""
 
 
-TiltConfig = Annotated[FlatTilt | SinusoidTilt, Field(discriminator="kind")]
+TiltConfig = Annotated[GroundTilt | SinusoidTilt, Field(discriminator="kind")]
 
 
 class WorldConfig(Schema):
@@ -213,4 +232,4 @@ class WorldConfig(Schema):
     battery: BatteryConfig = BatteryConfig()
     lidar: LidarConfig = LidarConfig()
     compass: CompassConfig = CompassConfig()
-    tilt: TiltConfig = FlatTilt()
+    tilt: TiltConfig = GroundTilt()

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.ndimage import distance_transform_edt, label
 
 from monstertruck_drivers.world.built_in import BUILT_IN, lap
-from monstertruck_drivers.world.config import WorldConfig
+from monstertruck_drivers.world.config import LidarConfig, ServoConfig, TruckConfig, WorldConfig
 from monstertruck_drivers.world.make_worlds import make_worlds
 from monstertruck_drivers.world.maps import FREE, OCCUPIED, load_map
+from monstertruck_drivers.world.obstacles import Box, Disc, penetration
 from monstertruck_drivers.world.terrain import Profile, load_profile
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.errors import InputError
@@ -113,16 +115,27 @@ def test_bad_worlds_are_refused(config, match):
         World(config, seed=0)
 
 
-def test_removing_what_is_not_there():
-    from monstertruck_drivers.world.obstacles import Disc
+@pytest.mark.parametrize(
+    ("model", "values", "match"),
+    [
+        (TruckConfig, {"length": 0.3}, "wheelbase"),
+        (TruckConfig, {"rear_servo": ServoConfig(channel=1)}, "share channel 1"),
+        (LidarConfig, {"first_step": 700, "last_step": 44}, "first_step 700"),
+        (LidarConfig, {"min_range": 6.0}, "min_range"),
+        (WorldConfig, {"gravity": 1.6}, "gravity"),
+    ],
+)
+def test_impossible_configurations_are_refused(model, values, match):
+    with pytest.raises(ValidationError, match=match):
+        model(**values)
 
+
+def test_removing_what_is_not_there():
     with pytest.raises(InputError, match="not in the world"):
         World(WorldConfig(), seed=0).remove(0, Disc(0, 0, 1))
 
 
 def test_obstacle_penetration_against_distance():
-    from monstertruck_drivers.world.obstacles import Box, Disc, penetration
-
     body = Box(0, 0, 0.47, 0.34, yaw=0.4)
     for bearing in np.linspace(0, 2 * pi, 17):
         edge = 1.0
