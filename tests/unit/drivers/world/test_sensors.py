@@ -217,3 +217,16 @@ def test_readings_have_the_controllers_sign(field):
     assert reading.turns > 0
     assert reading.rpm == pytest.approx(3000, rel=1e-3)
     assert reading.current_ma > 0
+
+
+def test_current_and_analog_noise(field):
+    driver = field(noise=True)
+    driver.drive(0.0)
+    currents, volts = [], []
+    for _ in range(300):
+        driver.wait(0.05)
+        currents.append(driver.world.motor.reading(driver.now).current_ma)
+        volts.append(driver.world.servos.analog_volts(5, driver.now))
+    assert np.std(currents) == pytest.approx(10, rel=0.2)
+    assert np.std(volts) == pytest.approx(0.003, rel=0.2)
+    assert driver.world.motor.reading(driver.now).current_ma == currents[-1]  # the same instant, the same draw
