@@ -1,0 +1,129 @@
+"""Configuration of the Maestro: servo calibration, battery scale and thresholds, deadman."""
+
+import math
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.maestro.protocol import ADC_MAX, CHANNELS
+from monstertruck_schemas.base import Schema
+
+Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
+Volts = Annotated[float, Field(ge=0)]
+Seconds = Annotated[float, Field(ge=0)]
+Microseconds = Annotated[float, Field(gt=0, le=4000)]
+
+
+class ServoConfig(Schema):
+    """One steering servo: ``pulse_us = centre_us + direction * scale_us_per_deg * servo angle in degrees``."""
+
+    channel: Channel
+    centre_us: Microseconds = 1439.2
+    """Pulse that steers straight ahead."""
+    scale_us_per_deg: Annotated[float, Field(gt=0)] = 10.48
+    direction: Literal[-1, 1] = -1
+    """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
+    min_us: Microseconds = 1088.0
+    max_us: Microseconds = 1840.0
+    max_angle_deg: Annotated[float, Field(gt=0, le=90)] = 45.0
+    speed: Annotated[int, Field(ge=0, le=0x3FFF)] = 100
+    """Limit of the pulse's change, 0.25 us per 10 ms; 0 = none."""
+    acceleration: Annotated[int, Field(ge=0, le=255)] = 0
+    """0.25 us per 10 ms per 80 ms; 0 = none."""
+
+    @model_validator(mode="after")
+    def _centre_within_limits(self) -> Self:
+        if not self.min_us < self.centre_us < self.max_us:
+            raise ValueError(f"min_us {self.min_us} < centre_us {self.centre_us} < max_us {self.max_us} does not hold")
+        return self
+
+    def quarters(self, angle: float) -> int:
+        """Target in quarter microseconds for a servo angle (rad, left positive), held within all limits."""
+        limit = self.max_angle_deg
+        degrees = min(max(math.degrees(angle), -limit), limit)
+        pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
+        return round(4 * min(max(pulse, self.min_us), self.max_us))
+
+    def angle(self, quarters: int) -> float:
+        """Servo angle (rad, left positive) of a pulse in quarter microseconds."""
+        return math.radians((quarters / 4 - self.centre_us) * self.direction / self.scale_us_per_deg)
+
+
+class BatteryConfig(Schema):
+    """Pack voltage through a divider on an analog input, and when it counts as low or critical."""
+
+    channel: Channel = 5
+    cells: Annotated[int, Field(ge=1, le=14)] = 6
+    volts_per_count: Annotated[float, Field(gt=0)] = 5.0 * 10 / ADC_MAX
+    """The reference is the USB 5 V rail (5 % tolerance) behind a 1:10 divider: calibrate with a multimeter."""
+    gain: Annotated[float, Field(gt=0)] = 1.0
+    offset: float = 0.0
+    """Volts added after the gain."""
+    smoothing: Seconds = 5.0
+    """Time constant of the published voltage."""
+    low: Volts = 22.0
+    low_after: Seconds = 10.0
+    clear: Volts = 22.4
+    """Low and critical end above this."""
+    clear_after: Seconds = 30.0
+    critical: Volts = 21.0
+    critical_after: Seconds = 10.0
+    collapsed: Volts = 19.8
+    """Critical too, after a shorter time."""
+    collapsed_after: Seconds = 2.0
+    plausible_min: Volts = 15.0
+    """Outside the plausible range the sensor is at fault, not the battery."""
+    plausible_max: Volts = 26.0
+
+    @model_validator(mode="after")
+    def _thresholds_in_order(self) -> Self:
+        order = ("plausible_min", "collapsed", "critical", "low", "clear", "plausible_max")
+        for lower, upper in pairwise(order):
+            if not getattr(self, lower) < getattr(self, upper):
+                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+        # A broken divider reads 0 or full scale.
+        for raw in (0, ADC_MAX):
+            if self.plausible_min <= self.volts(raw) <= self.plausible_max:
+                raise ValueError(f"reading {raw} means {self.volts(raw):.1f} V, which may not count as plausible")
+        return self
+
+    def volts(self, raw: int) -> float:
+        """Pack voltage of a 10-bit reading."""
+        return raw * self.volts_per_count * self.gain + self.offset
+
+
+class MaestroConfig(Schema):
+    """Pololu Micro Maestro 6."""
+
+    kind: Literal["maestro"] = "maestro"
+    front: ServoConfig = ServoConfig(channel=1)
+    rear: ServoConfig = ServoConfig(channel=0)
+    battery: BatteryConfig | None = BatteryConfig()
+    poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
+    """Times a second both pulses and the error word are read."""
+    battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
+    """Times a second the battery is read; never more often than ``poll_rate``."""
+    answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
+    """Seconds in which all answers of one poll must have come."""
+    command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
+    """Seconds after which a steering command is stale: the servos hold, the deadman is released."""
+    deadman_channel: Channel | None = None
+    """Digital output held high while commands are fresh; wire it to the motor controller's quick-stop input."""
+    deadman_feed: Literal["fresh", "always"] = "fresh"
+    """When the Maestro's own serial time-out is fed: see ``MaestroDriver``."""
+    device_number: Annotated[int, Field(ge=0, le=127)] | None = None
+    """Use the Pololu protocol with this number; None = compact protocol."""
+    use_crc: bool = False
+    """Must equal the unit's own setting."""
+
+    @model_validator(mode="after")
+    def _channels_differ(self) -> Self:
+        used = {"front": self.front.channel, "rear": self.rear.channel}
+        if self.battery is not None:
+            used["battery"] = self.battery.channel
+        if self.deadman_channel is not None:
+            used["deadman_channel"] = self.deadman_channel
+        if len(set(used.values())) < len(used):
+            raise ValueError(f"every channel may have one use only, got {used}")
+        return self

@@ -1,0 +1,245 @@
+"""Steering driver: servo targets out; pulses, errors and battery voltage in."""
+
+import contextlib
+from typing import Final
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.maestro.battery import BatteryJudge
+from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.protocol import Encoder, error_names
+from monstertruck_drivers.maestro.session import Session
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.cmd import SteeringCommand
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Battery, BatteryLevel, SteeringFeedback
+
+MISSES: Final = 3
+"""Polls in a row without a usable answer that end the session."""
+LINE_HIGH: Final = 8000
+LINE_LOW: Final = 4000
+"""Targets of a digital output, quarter microseconds: on either side of the device's threshold."""
+
+LEVEL_EVENTS: Final = {
+    BatteryLevel.NORMAL: (Reason.OK, Severity.INFO),
+    BatteryLevel.LOW: (Reason.BATTERY_LOW, Severity.WARNING),
+    BatteryLevel.CRITICAL: (Reason.BATTERY_CRITICAL, Severity.ERROR),
+    BatteryLevel.SENSOR_FAULT: (Reason.DEVICE_FAULT, Severity.ERROR),
+}
+
+
+class MaestroDriver:
+    """Sends every steering command at once, and polls pulses, errors and battery in between.
+
+    **Deadman.** The Maestro's serial time-out (set once in the unit, about 0.5 s) sends its channels home when
+    no valid command comes, whichever it is: polling feeds it as well as targets do. Commands are stale
+    ``command_timeout`` after their stamp. Then the servos hold, the deadman line (if configured) is released by
+    an explicit target, and with ``deadman_feed: fresh`` the driver falls silent until the next command, so that
+    the time-out trips too although the driver still lives; feedback and battery pause meanwhile. With ``always``
+    polling goes on, and the time-out guards only against a hung or dead process. Before the first command of a
+    session there is nothing to guard: the line is low and polling runs. Channels that go home are the unit's own
+    setting: deadman line "Off", steering "Ignore".
+
+    Args:
+        config: calibration and rates.
+        port: the Maestro's Command Port.
+        clock: time; the commands' stamps are of the same clock.
+        commands: steering commands of the gate.
+        out: feedback, angles as servo angles in rad, left positive.
+        battery: pack voltage; None when the battery is measured elsewhere.
+        events: where errors of the device are reported.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: MaestroConfig,
+        port: Port,
+        clock: Clock,
+        commands: Subscription[SteeringCommand],
+        out: Publisher[SteeringFeedback],
+        battery: Publisher[Battery] | None,
+        events: EventSink,
+        name: str = "steering",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._commands = commands
+        self._out = out
+        self._events = events
+        self._battery = None
+        if battery is not None and config.battery is not None:
+            self._battery = BatteryReader(config.battery, battery, events, name)
+        self._angles = [0.0, 0.0]
+        self._start_session()
+
+    def _start_session(self) -> None:
+        self._command: SteeringCommand | None = None
+        self._fresh = False
+        self._failing = False
+        self._misses = 0
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: no answers (three polls in a row); at the start: wrong mode or wrong port.
+            ProtocolError: answers out of form, three polls in a row.
+            WrongDeviceError: another device answers on this port.
+            PortBusyError: another process holds the port.
+        """
+        config = self._config
+        self._start_session()
+        async with await self._port.open() as link:
+            encoder = Encoder(config.device_number, config.use_crc)
+            session = Session(link, self._clock, encoder, config.answer_timeout)
+            # Errors pending since power-up say nothing about this session.
+            await session.identify(config.front.channel, config.rear.channel)
+            self._restore(session)
+            ready()
+            try:
+                await self._serve(session)
+            finally:
+                with contextlib.suppress(DeviceLostError):
+                    session.send(*self._line(session, high=False))
+
+    async def _serve(self, session: Session) -> None:
+        period = round(SECOND / self._config.poll_rate)
+        every = max(1, round(self._config.poll_rate / self._config.battery_rate))
+        due = self._clock.now()
+        cycle = 0
+        while True:
+            await self._follow(session, due)
+            session.require_link()
+            self._watch(session)
+            if self._fresh or self._command is None or self._config.deadman_feed == "always":
+                await self._poll(session, self._battery if cycle % every == 0 else None)
+            cycle += 1
+            due = max(due + period, self._clock.now())
+
+    async def _follow(self, session: Session, until: int) -> None:
+        """Pass commands on as they come."""
+        with contextlib.suppress(TimeoutError):
+            async with self._clock.deadline((until - self._clock.now()) / SECOND):
+                while True:
+                    command = await self._commands.next()
+                    if self._is_fresh(command):
+                        self._command = command
+                        self._fresh = True
+                        session.send(*self._targets(session, command), *self._line(session, high=True))
+
+    def _is_fresh(self, command: SteeringCommand) -> bool:
+        return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
+
+    def _watch(self, session: Session) -> None:
+        """Release the deadman when commands stop."""
+        if self._fresh and self._command is not None and not self._is_fresh(self._command):
+            self._fresh = False
+            session.send(*self._line(session, high=False))
+            text = f"no steering command for {self._config.command_timeout} s: servos hold"
+            self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
+
+    def _targets(self, session: Session, command: SteeringCommand) -> list[bytes]:
+        pairs = ((self._config.front, command.front_servo), (self._config.rear, command.rear_servo))
+        return [session.encode.set_target(servo.channel, servo.quarters(angle)) for servo, angle in pairs]
+
+    def _line(self, session: Session, *, high: bool) -> list[bytes]:
+        channel = self._config.deadman_channel
+        return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else LINE_LOW)]
+
+    def _restore(self, session: Session) -> None:
+        """Send everything a Maestro forgets at power-up or loses by an error."""
+        packets: list[bytes] = []
+        for servo in (self._config.front, self._config.rear):
+            packets.append(session.encode.set_speed(servo.channel, servo.speed))
+            packets.append(session.encode.set_acceleration(servo.channel, servo.acceleration))
+        if self._command is not None:
+            packets += self._targets(session, self._command)
+        session.send(*packets, *self._line(session, high=self._fresh))
+
+    async def _poll(self, session: Session, battery: "BatteryReader | None") -> None:
+        config = self._config
+        channels = [config.front.channel, config.rear.channel] + ([battery.channel] if battery else [])
+        asked = self._clock.now()
+        try:
+            *positions, errors = await session.ask(
+                *(session.encode.get_position(channel) for channel in channels), session.encode.get_errors()
+            )
+            session.check(positions, errors)
+        except (DeviceTimeoutError, ProtocolError):
+            self._misses += 1
+            if self._misses >= MISSES:
+                raise
+            # The lost answer may have held the only report of an error.
+            self._restore(session)
+            return
+        self._misses = 0
+        received = self._clock.now()
+        stamp = (asked + received) // 2
+        self._report(session, stamp, received, positions, errors)
+        if battery is not None:
+            battery.take(stamp, received, positions[2])
+
+    def _report(self, session: Session, stamp: int, received: int, positions: list[int], errors: int) -> None:
+        servos: tuple[ServoConfig, ServoConfig] = (self._config.front, self._config.rear)
+        for axle, (servo, position) in enumerate(zip(servos, positions[:2], strict=True)):
+            if position > 0:  # 0: no pulses, the servo stays where it is
+                self._angles[axle] = servo.angle(position)
+        pulsing = all(positions[:2])
+        lost = errors != 0 or (self._command is not None and not pulsing)
+        if lost:
+            if not self._failing:
+                what = ", ".join(error_names(errors)) or "pulses off"
+                text = f"the servo controller reports {what}: settings and targets sent again"
+                self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text, error_word=errors)
+            self._restore(session)
+        self._failing = lost
+        self._out.put(
+            SteeringFeedback(
+                stamp=stamp,
+                received=received,
+                seq=self._out.next_seq(),
+                front=self._angles[0],
+                rear=self._angles[1],
+                error_word=errors,
+                trusted=errors == 0 and pulsing,
+            )
+        )
+
+
+class BatteryReader:
+    """Publishes and judges what the battery's analog input reads; outlives sessions."""
+
+    def __init__(self, config: BatteryConfig, out: Publisher[Battery], events: EventSink, source: str) -> None:
+        self.channel = config.channel
+        self._config = config
+        self._out = out
+        self._events = events
+        self._source = source
+        self._judge = BatteryJudge(config)
+        self._level = BatteryLevel.NORMAL
+
+    def take(self, stamp: int, received: int, raw: int) -> None:
+        """Take one 10-bit reading."""
+        volts = self._config.volts(raw)
+        voltage, level = self._judge.update(stamp, volts)
+        if level is not self._level and level in LEVEL_EVENTS:
+            reason, severity = LEVEL_EVENTS[level]
+            self._events(reason, severity, self._source, f"battery {level.value} at {volts:.1f} V", raw_voltage=volts)
+            self._level = level
+        self._out.put(
+            Battery(
+                stamp=stamp,
+                received=received,
+                seq=self._out.next_seq(),
+                voltage=voltage,
+                raw_voltage=volts,
+                cells=self._config.cells,
+                level=level,
+            )
+        )

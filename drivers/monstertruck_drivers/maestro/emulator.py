@@ -1,0 +1,361 @@
+"""The device side of a Micro Maestro, byte for byte."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from monstertruck_drivers.base import ServoPlant
+from monstertruck_drivers.link import DeviceEnd, EmulatedPort
+from monstertruck_drivers.maestro.protocol import (
+    ADC_MAX,
+    CHANNELS,
+    OUTPUT_THRESHOLD,
+    Code,
+    Command,
+    Decoder,
+    Error,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+TICK: Final = 10_000_000
+"""Nanoseconds between two steps of a ramp."""
+AT_JUNK: Final = b"AT\r\nAT+CGMI\r\nATI\r\n"
+"""What modem managers send into a serial port they do not know."""
+
+CHANNEL_COMMANDS: Final = (Code.SET_TARGET, Code.SET_SPEED, Code.SET_ACCELERATION, Code.GET_POSITION)
+"""Commands that name a channel first."""
+
+Mode = Literal["dual_port", "uart"]
+Home = float | Literal["off", "ignore"]
+"""What a channel does at an error: pulse in microseconds, no pulses, or nothing."""
+
+
+@dataclass(slots=True)
+class Ramp:
+    """Pulse of one channel on its way to its target; all in quarter microseconds, velocity per 10 ms."""
+
+    target: int = 0
+    position: float = 0.0
+    velocity: float = 0.0
+    speed: int = 0
+    acceleration: int = 0
+
+    def aim(self, target: int) -> None:
+        """Change the target. From or to 0 (no pulses) there is nothing to ramp."""
+        if target == 0 or self.target == 0:
+            self.position, self.velocity = float(target), 0.0
+        self.target = target
+
+    def step(self) -> None:
+        """10 ms pass."""
+        left = self.target - self.position
+        top = float(self.speed or np.inf)
+        if not self.acceleration:
+            self.position += float(np.clip(left, -top, top))
+            return
+        gain = self.acceleration / 8  # its unit is per 80 ms
+        braking = (2 * gain * abs(left)) ** 0.5
+        wanted = float(np.copysign(min(top, braking), left))
+        self.velocity += float(np.clip(wanted - self.velocity, -gain, gain))
+        if abs(left) <= max(gain, abs(self.velocity)) and abs(self.velocity) <= 2 * gain:
+            self.position, self.velocity = float(self.target), 0.0
+        else:
+            self.position += self.velocity
+
+
+class MaestroEmulator:
+    """A Micro Maestro 6 powered by USB.
+
+    Settings given here live in the unit's non-volatile memory; targets, speeds and accelerations do not.
+    Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (answers
+    are withheld), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
+
+    Args:
+        clock: time.
+        servos: physics; without it the analog inputs read ``analog_v`` and the pulses move nothing.
+        seed: of the analog noise.
+        mode: serial mode; in ``uart`` (as from the factory) bytes over USB are ignored.
+        crc: whether commands must carry a CRC-7 byte.
+        device_number: for the Pololu protocol.
+        serial_timeout_s: silence after which all channels go home; 0 = never.
+        home: per channel; default: outputs "off", others "ignore".
+        inputs: channels that are analog inputs.
+        outputs: channels that are digital outputs.
+        limits_us: least and greatest pulse; targets are clamped.
+        noise_lsb: standard deviation of the analog noise.
+        rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, to which inputs are referred.
+        usb: the port it hangs on; lets a brown-out make it vanish and come back.
+        on_output: told (channel, high) when a digital output changes, whatever the cause.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        servos: ServoPlant | None = None,
+        *,
+        seed: int = 0,
+        mode: Mode = "dual_port",
+        crc: bool = False,
+        device_number: int = 12,
+        serial_timeout_s: float = 0.0,
+        home: Mapping[int, Home] | None = None,
+        inputs: frozenset[int] = frozenset({5}),
+        outputs: frozenset[int] = frozenset({2, 3, 4}),
+        limits_us: tuple[float, float] = (992.0, 2000.0),
+        noise_lsb: float = 0.7,
+        rail_drift_v: float = 0.0,
+        usb: EmulatedPort | None = None,
+        on_output: Callable[[int, bool], None] | None = None,
+        name: str = "maestro",
+    ) -> None:
+        self.name = name
+        self.usb = usb
+        self.on_output = on_output
+        self.received: deque[int] = deque(maxlen=1 << 16)
+        """Bytes the host sent to the Command Port, for tests."""
+        self.wire: deque[int] = deque(maxlen=1 << 16)
+        """Bytes bridged from the TTL Port to the TX pin."""
+        self.analog_v = dict.fromkeys(range(CHANNELS), 2.4)
+        """Volts at the inputs while there is no plant."""
+        self.rail_v = 5.0
+        self._clock = clock
+        self._servos = servos
+        self._rng = np.random.default_rng(seed)
+        self._mode = mode
+        self._timeout = round(serial_timeout_s * SECOND)
+        self._home: dict[int, Home] = {
+            channel: "off" if channel in outputs else "ignore" for channel in range(CHANNELS)
+        }
+        self._home.update(home or {})
+        self._inputs = inputs
+        self._outputs = outputs
+        self._limits = (round(limits_us[0] * 4), round(limits_us[1] * 4))
+        self._noise = noise_lsb
+        self._drift = rail_drift_v
+        self._decoder = Decoder(device_number, crc)
+        self._mute = False
+        self._powered = True
+        self._fed_again = asyncio.Event()
+        self._levels = dict.fromkeys(outputs, False)
+        self._boot()
+        if servos is not None:
+            servos.attach(self)
+
+    def _boot(self) -> None:
+        now = self._clock.now()
+        self._decoder = Decoder(self._decoder.device, self._decoder.crc)
+        self._ramps = [Ramp() for _ in range(CHANNELS)]
+        self._ticked = now // TICK
+        # A serial signal error is usually pending after power-up.
+        self._errors = Error.SERIAL_SIGNAL
+        self._fed = now
+        self._timed_out = False
+        for channel, home in self._home.items():
+            if isinstance(home, int | float):
+                self._aim(channel, round(4 * home))
+        self._tell_outputs()
+
+    # What the world calls
+
+    def pulse_us(self, channel: int, time_ns: int) -> float | None:
+        """Pulse at ``time_ns``; None = none."""
+        self._tick(time_ns)
+        position = self._ramps[channel].position
+        return position / 4 if position > 0 else None
+
+    def output(self, channel: int) -> bool:
+        """Level of a digital output."""
+        return channel in self._outputs and self._ramps[channel].target >= OUTPUT_THRESHOLD
+
+    def power_cycle(self) -> None:
+        """Supply off and on: targets, speeds, errors are lost, settings stay."""
+        self._advance()
+        self._boot()
+        self._fed_again.set()
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve the Command Port."""
+        end.on_plug = self._plugged
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._watch())
+            while True:
+                self._take(end, await end.read())
+
+    async def run_ttl(self, end: DeviceEnd) -> None:
+        """Serve the TTL Port: a plain bridge to the TX pin, on which nothing listens."""
+        while True:
+            self.wire.extend(await end.read())
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "brown_out", ():
+                    self._brown_out(0.5)
+                case "brown_out", (seconds,):
+                    self._brown_out(float(seconds))
+                case "at_junk", ():
+                    self._execute(AT_JUNK)  # it answers nothing to it
+                case "mode", (("dual_port" | "uart") as mode,):
+                    self._mode = mode
+                case "mute", (("on" | "off") as state,):
+                    self._mute = state == "on"
+                case "error", (bit,):
+                    self._fail(Error(1 << int(bit)))
+                case "rail", (volts,):
+                    self.rail_v = float(volts)
+                case "noise", (lsb,):
+                    self._noise = float(lsb)
+                case "battery", (volts,):
+                    self.analog_v.update(dict.fromkeys(self._inputs, float(volts) / 10))
+                case _:
+                    raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: brown_out [SECONDS], "
+                "at_junk, mode dual_port|uart, mute on|off, error BIT, rail VOLTS, noise LSB, battery VOLTS"
+            ) from error
+
+    # Serving
+
+    def _take(self, end: DeviceEnd, data: bytes) -> None:
+        answer = self._execute(data)
+        if answer and not self._mute:
+            end.write(answer)
+
+    def _execute(self, data: bytes) -> bytes:
+        self.received.extend(data)
+        if self._mode == "uart":
+            return b""
+        self._advance()
+        answers = b""
+        for item in self._decoder.feed(data):
+            if isinstance(item, Error):
+                self._fail(item)
+                continue
+            self._fed = self._clock.now()
+            self._timed_out = False
+            self._fed_again.set()
+            answers += self._obey(item)
+        self._tell_outputs()
+        return answers
+
+    def _obey(self, command: Command) -> bytes:
+        code, data = command.code, command.data
+        if code in CHANNEL_COMMANDS and data[0] >= CHANNELS:
+            self._fail(Error.PROTOCOL)
+            return b""
+        answer = b""
+        match code:
+            case Code.SET_TARGET:
+                self._aim(data[0], command.value)
+            case Code.MINI_SSC if data[0] < CHANNELS:
+                # Factory neutral 1500 us and range 476.25 us to either side of 127.
+                self._aim(data[0], 6000 + (data[1] - 127) * 15)
+            case Code.SET_SPEED:
+                self._ramps[data[0]].speed = command.value
+            case Code.SET_ACCELERATION:
+                self._ramps[data[0]].acceleration = min(command.value, 255)
+            case Code.GO_HOME:
+                self._go_home()
+            case Code.GET_POSITION:
+                answer = self._position(data[0]).to_bytes(2, "little")
+            case Code.GET_ERRORS:
+                answer = int(self._errors).to_bytes(2, "little")
+                self._errors = Error(0)
+            case Code.GET_MOVING_STATE:
+                answer = b"\x00"  # the Micro's firmware fault: says so even while moving
+            case Code.GET_SCRIPT_STATUS:
+                answer = b"\x01"  # no script is stored
+            case _:
+                pass  # script commands: nothing to run
+        return answer
+
+    def _aim(self, channel: int, quarters: int) -> None:
+        if channel in self._inputs or not self._powered:
+            return
+        low, high = self._limits
+        self._ramps[channel].aim(min(max(quarters, low), high) if quarters else 0)
+
+    def _position(self, channel: int) -> int:
+        if channel not in self._inputs:
+            return round(self._ramps[channel].position)
+        now = self._clock.now()
+        volts = self.analog_v[channel] if self._servos is None else self._servos.analog_volts(channel, now)
+        rail = self.rail_v + self._drift * float(np.sin(2 * np.pi * now / (60 * SECOND)))
+        counts = volts / rail * ADC_MAX + self._noise * float(self._rng.standard_normal())
+        return int(np.clip(round(counts), 0, ADC_MAX))
+
+    def _fail(self, error: Error) -> None:
+        self._advance()
+        self._errors |= error
+        self._go_home()
+        self._tell_outputs()
+
+    def _go_home(self) -> None:
+        for channel, home in self._home.items():
+            if home != "ignore":
+                self._aim(channel, 0 if home == "off" else round(4 * home))
+
+    def _tell_outputs(self) -> None:
+        for channel in self._outputs:
+            level = self.output(channel)
+            if level != self._levels[channel]:
+                self._levels[channel] = level
+                if self.on_output is not None:
+                    self.on_output(channel, level)
+
+    # Time
+
+    def _advance(self) -> None:
+        """Let the servos follow the old targets up to now, then the ramps."""
+        now = self._clock.now()
+        if self._servos is not None:
+            self._servos.advance(now)
+        self._tick(now)
+
+    def _tick(self, time_ns: int) -> None:
+        ticks = time_ns // TICK - self._ticked
+        if ticks <= 0:
+            return
+        self._ticked += ticks
+        for ramp in self._ramps:
+            for _ in range(ticks):
+                if ramp.position == ramp.target and ramp.velocity == 0:
+                    break
+                ramp.step()
+
+    async def _watch(self) -> None:
+        """The serial time-out: fires when nothing valid came, although nothing is sent."""
+        while self._timeout:
+            self._fed_again.clear()
+            if self._timed_out:
+                await self._fed_again.wait()
+            await self._clock.sleep_until(self._fed + self._timeout)
+            if not self._timed_out and self._clock.now() - self._fed >= self._timeout:
+                self._timed_out = True
+                self._fail(Error.SERIAL_TIMEOUT)
+
+    # Supply
+
+    def _plugged(self, plugged: bool) -> None:
+        """USB is the logic's supply."""
+        self._powered = plugged
+        self.power_cycle()
+
+    def _brown_out(self, seconds: float) -> None:
+        """A stalled servo pulled the rail down: gone from USB, back with nothing in mind."""
+        if self.usb is None:
+            self.power_cycle()
+        else:
+            self.usb.unplug()
+            asyncio.get_running_loop().call_later(seconds, self.usb.plug)

@@ -1,0 +1,114 @@
+"""Question and answer with a Maestro over one open link; shared by driver and probe."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Encoder, words
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+ATTEMPTS: Final = 3
+"""Tries to identify: another program may be talking into a freshly plugged port."""
+QUIET: Final = 0.02
+"""Seconds of silence that end an answer; a Maestro says nothing unasked."""
+
+
+class Session:
+    """One conversation. Answers carry no mark of their own: only their number and form can be checked.
+
+    Args:
+        link: open link to the Command Port.
+        clock: time.
+        encoder: protocol form.
+        timeout: seconds in which the answers to one question must come.
+    """
+
+    def __init__(self, link: Link, clock: Clock, encoder: Encoder, timeout: float) -> None:
+        self.encode = encoder
+        self._link = link
+        self._clock = clock
+        self._timeout = timeout
+
+    def send(self, *commands: bytes) -> None:
+        """Commands without an answer.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        self._link.write(b"".join(commands))
+
+    async def ask(self, *requests: bytes) -> list[int]:
+        """Send requests in one go and collect a 16-bit word for each.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: not all answers came in time.
+        """
+        self._link.discard()
+        self._link.write(b"".join(requests))
+        try:
+            async with self._clock.deadline(self._timeout):
+                return words(await self._link.exactly(2 * len(requests)))
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: no answer within {self._timeout} s") from None
+
+    async def identify(self, *channels: int) -> int:
+        """Make sure that a Maestro answers, reading its errors and the positions of ``channels``.
+
+        Returns:
+            The error word that was pending; it is cleared now.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: bytes came that no Maestro sends.
+        """
+        heard = False
+        for _ in range(ATTEMPTS):
+            heard |= await self._speaks()
+            try:
+                *positions, errors = await self.ask(
+                    *(self.encode.get_position(channel) for channel in channels), self.encode.get_errors()
+                )
+                self.check(positions, errors)
+            except DeviceTimeoutError:
+                continue
+            except ProtocolError:
+                heard = True
+                continue
+            if not await self._speaks():
+                return errors
+            heard = True
+        name = self._link.name
+        if heard:
+            raise WrongDeviceError(f"{name}: no Maestro: it speaks unasked or answers out of form")
+        raise DeviceTimeoutError(
+            f"{name}: silence; expected a Maestro's Command Port (USB interface 00) in serial mode 'USB Dual Port' "
+            "(factory mode is UART: set it once with the maker's tool), with matching CRC setting and device number"
+        )
+
+    async def _speaks(self) -> bool:
+        """Whether bytes come that nobody asked for; they are dropped."""
+        try:
+            async with self._clock.deadline(QUIET):
+                return bool(await self._link.read())
+        except TimeoutError:
+            return False
+
+    def check(self, positions: list[int], errors: int) -> None:
+        """Refuse words that cannot be what was asked for.
+
+        Raises:
+            ProtocolError: out of form, as when a byte was lost.
+        """
+        if errors > ERROR_MASK or any(position > POSITION_MAX for position in positions):
+            raise ProtocolError(f"{self._link.name}: answers out of form: errors {errors:#x}, positions {positions}")
+
+    def require_link(self) -> None:
+        """Notice an unplugged device without sending anything.
+
+        Raises:
+            DeviceLostError: the link is down.
+        """
+        if self._link.is_lost:
+            raise DeviceLostError(f"{self._link.name}: unplugged")

@@ -1,0 +1,1 @@
+"""OceanServer OS4000 compass: heading, tilt, magnetic field and acceleration."""

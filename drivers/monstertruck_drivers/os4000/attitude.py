@@ -1,0 +1,66 @@
+"""From a sentence in the device's units and signs to an attitude in SI units and REP 103 signs."""
+
+import math
+from typing import Final
+
+from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.os4000.protocol import Sentence
+from monstertruck_schemas.sensor import Attitude, Vector3
+
+GRAVITY: Final = 9.80665
+"""m/s^2 in 1 g."""
+MILLIGAUSS: Final = 0.1
+"""Microtesla in 1 mG."""
+
+
+def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: int, seq: int) -> Attitude:
+    """Convert one sentence.
+
+    The device counts pitch nose up and roll right side down; REP 103 counts pitch nose DOWN (about y, left) and
+    roll right side down (about x, forward), so that only pitch changes its sign. Its acceleration is +1 g along z
+    (up) at rest, with x forward and y left (a maker's sample of pitch 2.5 and roll -14 degrees shows it).
+
+    Raises:
+        ValueError: heading, pitch or roll is absent or out of range; the text says which.
+    """
+    heading, pitch, roll = sentence.heading, sentence.pitch, sentence.roll
+    if heading is None or not 0 <= heading < 360:
+        raise ValueError(f"heading {heading} is not within [0, 360)")
+    if pitch is None or abs(pitch) > 90:
+        raise ValueError(f"pitch {pitch} is not within [-90, 90]")
+    if roll is None or abs(roll) > 180:
+        raise ValueError(f"roll {roll} is not within [-180, 180]")
+    return Attitude(
+        stamp=stamp,
+        received=received,
+        seq=seq,
+        frame=config.frame,
+        heading=math.radians(heading),
+        roll=math.radians(roll),
+        pitch=-math.radians(pitch),
+        temperature=sentence.temperature,
+        magnetic_field=_scaled(sentence.field, MILLIGAUSS),
+        acceleration=_scaled(sentence.acceleration, GRAVITY),
+        heading_disturbed=_is_disturbed(sentence, config),
+        tilt_valid=_is_tilt(sentence, config),
+    )
+
+
+def _scaled(vector: tuple[float, float, float] | None, factor: float) -> Vector3 | None:
+    return None if vector is None else Vector3(x=vector[0] * factor, y=vector[1] * factor, z=vector[2] * factor)
+
+
+def _length(vector: tuple[float, float, float] | None, length: float | None) -> float | None:
+    return math.hypot(*vector) if vector is not None else length
+
+
+def _is_disturbed(sentence: Sentence, config: Os4000Config) -> bool:
+    length = _length(sentence.field, sentence.field_length)
+    if length is None or config.field_strength is None:
+        return False
+    return abs(length * MILLIGAUSS / config.field_strength - 1) > config.field_tolerance
+
+
+def _is_tilt(sentence: Sentence, config: Os4000Config) -> bool:
+    length = _length(sentence.acceleration, sentence.acceleration_length)
+    return length is None or abs(length - 1) <= config.gravity_tolerance

@@ -1,0 +1,50 @@
+"""Configuration of the OS4000 compass."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.os4000.protocol import RATE_MAX, Fields
+from monstertruck_schemas.base import FrameId, Schema
+
+Positive = Annotated[float, Field(gt=0)]
+
+NEEDED = Fields.HEADING | Fields.PITCH | Fields.ROLL
+"""Without these there is no attitude."""
+
+
+class Os4000Config(Schema):
+    """OceanServer OS4000 compass.
+
+    Rate, fields and format are written to the unit only where it behaves otherwise. Declination must be zero in
+    the unit: what it sends counts from magnetic north.
+    """
+
+    kind: Literal["os4000"] = "os4000"
+    rate: Annotated[int, Field(ge=1, le=RATE_MAX)] = 20
+    """Sentences a second; all fields at 19200 baud allow 24."""
+    fields: Annotated[int, Field(ge=0, le=511)] = 335
+    """Field mask; 335 = heading, pitch, roll, temperature, magnetic field, acceleration."""
+    delay: Annotated[float, Field(ge=0, le=1)] = 0.04
+    """Age of a measurement when its last byte arrives: 80 bytes at 19200 baud."""
+    silence: Positive = 0.5
+    """Seconds without a correct sentence that end the session; never less than five periods."""
+    field_strength: Positive | None = None
+    """Length of the magnetic field vector where the unit was calibrated, microtesla; None = not checked."""
+    field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    """Share by which the field may differ before the heading counts as disturbed."""
+    gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """Share of 1 g by which the acceleration may differ before roll and pitch stop being tilt."""
+    frame: FrameId = "base"
+    """Frame whose axes the unit is mounted along."""
+
+    @model_validator(mode="after")
+    def _fields_make_an_attitude(self) -> Self:
+        if self.fields & NEEDED != NEEDED:
+            raise ValueError(f"fields {self.fields} lacks heading (1), pitch (2) or roll (4)")
+        return self
+
+    @property
+    def patience(self) -> float:
+        """Seconds without a correct sentence that end the session."""
+        return max(self.silence, 5 / self.rate)

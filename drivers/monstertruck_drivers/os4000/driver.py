@@ -1,0 +1,136 @@
+"""Compass driver: what the unit streams becomes attitudes."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.os4000.attitude import to_attitude
+from monstertruck_drivers.os4000.config import NEEDED, Os4000Config
+from monstertruck_drivers.os4000.protocol import Fields, Key, Sentence
+from monstertruck_drivers.os4000.session import LISTEN, Session, observed_fields, observed_rate
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude
+
+RATE_TOLERANCE: Final = 0.25
+"""Share by which the observed rate may differ from the configured one."""
+
+
+class Os4000Driver:
+    """Listens; writes a setting only where the unit behaves otherwise than configured.
+
+    Baud rates are not hunted for: a port opens at its configured rate, and a unit at another one shows as bytes
+    without a sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
+
+    Args:
+        config: rate, fields and checks.
+        port: the compass's port.
+        clock: time.
+        out: attitudes, REP 103 signs.
+        events: settings written, sentences refused.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: Os4000Config,
+        port: Port,
+        clock: Clock,
+        out: Publisher[Attitude],
+        events: EventSink,
+        name: str = "compass",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._refusing = False
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            ProtocolError: bytes without a correct sentence, or sentences without heading, pitch and roll.
+            WrongDeviceError: nothing that comes at the start is an OS4000's sentence.
+            PortBusyError: another process holds the port.
+        """
+        async with await self._port.open() as link:
+            session = Session(link, self._clock)
+            await self._set_up(session)
+            ready()
+            await self._serve(session)
+
+    async def _set_up(self, session: Session) -> None:
+        heard = await session.start(self._config.rate)
+        wrong = self._differences(heard)
+        if not wrong:
+            return
+        for key, (number, text) in wrong.items():
+            self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, f"{text}: setting it")
+            await session.set(key, number)
+        heard = await session.listen(LISTEN)
+        missing = NEEDED & ~observed_fields(heard)
+        if missing:
+            raise ProtocolError(f"{self._port.name}: the compass does not send {_names(missing)}, although told to")
+        for _, text in self._differences(heard).values():
+            self._events(Reason.DEVICE_MISMATCH, Severity.WARNING, self.name, f"{text} even after setting it")
+
+    def _differences(self, heard: list[tuple[int, Sentence]]) -> dict[Key, tuple[int, str]]:
+        """Settings that differ: key to configured value and a text."""
+        config = self._config
+        wrong: dict[Key, tuple[int, str]] = {}
+        fields = observed_fields(heard)
+        if fields != config.fields:
+            text = f"the unit sends {_names(fields)}, configured is {_names(Fields(config.fields))}"
+            wrong[Key.FIELDS] = config.fields, text
+        rate = observed_rate(heard)
+        if rate is None or abs(rate / config.rate - 1) > RATE_TOLERANCE:
+            seen = "too seldom" if rate is None else f"{rate:.1f} times a second"
+            wrong[Key.RATE] = config.rate, f"the unit sends {seen}, configured is {config.rate}"
+        return wrong
+
+    async def _serve(self, session: Session) -> None:
+        patience = round(self._config.patience * SECOND)
+        limit, heard = self._clock.now() + patience, session.bytes_heard
+        while True:
+            try:
+                async with self._clock.deadline((limit - self._clock.now()) / SECOND):
+                    sentences = await session.receive()
+            except TimeoutError:
+                if session.bytes_heard == heard:
+                    raise DeviceTimeoutError(f"{self._port.name}: silent for {self._config.patience} s") from None
+                raise ProtocolError(
+                    f"{self._port.name}: {session.bytes_heard - heard} bytes, but no usable sentence "
+                    f"for {self._config.patience} s"
+                ) from None
+            if self._publish(sentences):
+                limit, heard = self._clock.now() + patience, session.bytes_heard
+
+    def _publish(self, sentences: list[Sentence]) -> bool:
+        """Publish what is usable; sentences that came in one burst are spaced by the period."""
+        received = self._clock.now()
+        newest = received - round(self._config.delay * SECOND)
+        usable = False
+        for age, sentence in reversed(list(enumerate(reversed(sentences)))):
+            stamp = newest - age * SECOND // self._config.rate
+            try:
+                attitude = to_attitude(sentence, self._config, stamp, received, self._out.next_seq())
+            except ValueError as error:
+                if not self._refusing:
+                    self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, f"sentence refused: {error}")
+                self._refusing = True
+                continue
+            self._refusing = False
+            self._out.put(attitude)
+            usable = True
+        return usable
+
+
+def _names(fields: Fields) -> str:
+    return "+".join((bit.name or "").lower() for bit in Fields if bit in fields) or "nothing"

@@ -1,0 +1,354 @@
+"""The device side of an OS4000, byte for byte."""
+
+import asyncio
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from monstertruck_drivers.base import AttitudeSource, CompassReading
+from monstertruck_drivers.link import DeviceEnd
+from monstertruck_drivers.os4000.protocol import (
+    BAUDS,
+    ESC,
+    FORMAT_TAGGED,
+    RATE_MAX,
+    RATE_MIN,
+    Fields,
+    Key,
+    Sentence,
+    build,
+    frame,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+LOOK: Final = 50_000_000
+"""Nanoseconds after which a waiting stream looks whether it may go on."""
+BOOT: Final = 200_000_000
+"""Nanoseconds from power-up to the first sentence."""
+VERSION: Final = b"OS4000-T Ver 2.1\r\n"
+
+Switch = Literal["on", "off"]
+
+
+@dataclass(slots=True)
+class Settings:
+    """Non-volatile memory."""
+
+    rate: int
+    fields: int
+    format: int = FORMAT_TAGGED
+    baud: int = BAUDS.index(19200)
+    mounting: int = 1
+    temperature_offset: int = 0
+
+    def store(self, key: Key, number: int) -> bool:
+        """Write one setting; False = value refused."""
+        match key:
+            case Key.RATE if RATE_MIN <= number <= RATE_MAX:
+                self.rate = number
+            case Key.FIELDS if 0 < number < 512:
+                self.fields = number
+            case Key.FORMAT if number in (1, 2, 4, 8):
+                self.format = number
+            case Key.BAUD if 0 <= number < len(BAUDS):
+                self.baud = number
+            case Key.MOUNTING if 1 <= number <= 6:
+                self.mounting = number
+            case Key.TEMPERATURE_OFFSET:
+                self.temperature_offset = number
+            case _:
+                return False
+        return True
+
+
+VALUE_KEYS: Final = (Key.RATE, Key.FIELDS, Key.FORMAT, Key.BAUD, Key.MOUNTING, Key.TEMPERATURE_OFFSET)
+CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
+
+
+class Turntable:
+    """An attitude for the bench: level, turning once a minute."""
+
+    def compass(self, time_ns: int) -> CompassReading:
+        """Reading at ``time_ns``."""
+        heading = time_ns / SECOND * 6 % 360
+        north = math.radians(heading)
+        return CompassReading(
+            heading_deg=heading,
+            pitch_deg=0.0,
+            roll_deg=0.0,
+            temperature_c=20.0,
+            field=(250 * math.cos(north), 250 * math.sin(north), -390.0),
+            acceleration=(0.0, 0.0, 1.0),
+        )
+
+
+class Os4000Emulator:
+    """An OS4000-T that streams from power-up on.
+
+    Faults (``inject``): ``frozen on|off`` (the same sentence again and again), ``silent on|off``, ``bad_checksum N``,
+    ``empty_field TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text),
+    ``pending`` (as if a command was left unfinished), ``rate N`` and ``format N`` (stored settings changed by
+    somebody), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the rate), ``host_baud N``
+    (the host's rate; at another one than the unit's both sides see noise).
+
+    Args:
+        clock: time.
+        source: physics; without it a turntable.
+        seed: of the sensors' fine noise and of garbled bytes.
+        rate: stored rate.
+        fields: stored field mask.
+        terminators: bytes the firmware takes as end of value.
+        settle: seconds the stream pauses after a setting.
+        pace: bytes take their time on the line at the unit's baud rate.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        source: AttitudeSource | None = None,
+        *,
+        seed: int = 0,
+        rate: int = 20,
+        fields: int = 335,
+        terminators: bytes = b" \r",
+        settle: float = 0.8,
+        pace: bool = True,
+        name: str = "os4000",
+    ) -> None:
+        self.name = name
+        self.settings = Settings(rate, fields)
+        self.received: deque[int] = deque(maxlen=1 << 16)
+        """Bytes the host sent, for tests."""
+        self.host_baud: int | None = None
+        """Rate the host uses; None = the same as the unit."""
+        self._clock = clock
+        self._source = source or Turntable()
+        self._rng = np.random.default_rng(seed)
+        self._terminators = terminators
+        self._settle = round(settle * SECOND)
+        self._pace = pace
+        self._frozen = False
+        self._silent = False
+        self._bad_checksums = 0
+        self._spoiled: tuple[str, str] | None = None
+        self._disturbance = 0.0
+        self._drift = 0.0
+        self._stray = b""
+        self._last = b""
+        self._end: DeviceEnd | None = None
+        self._boot()
+
+    def _boot(self) -> None:
+        self._baud = BAUDS[self.settings.baud]
+        self._escaped = False
+        self._command: Key | None = None
+        self._digits = b""
+        self._torn = True
+        self._resume_at = self._clock.now() + BOOT
+        self._line_free = self._clock.now()
+        if self._end is not None and self._pace:
+            self._end.baud = self._baud
+
+    def power_cycle(self) -> None:
+        """Supply off and on: an open command is forgotten, a stored baud rate becomes active."""
+        self._boot()
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Stream and obey."""
+        self._end = end
+        end.on_plug = self._plugged
+        self._boot()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._stream(end))
+            while True:
+                for byte in await end.read():
+                    self.received.append(byte)
+                    if self.host_baud in (None, self._baud):
+                        self._take(end, byte)
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            self._inject(fault, values)
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: "
+                "frozen on|off, silent on|off, bad_checksum N, empty_field TAG|none, nan_field TAG|none, "
+                "half_sentence, prompt, pending, rate N, format N, disturbance DEGREES, drift SHARE, host_baud N"
+            ) from error
+
+    def _inject(self, fault: str, values: tuple[str, ...]) -> None:
+        match fault, values:
+            case "frozen", (("on" | "off") as state,):
+                self._frozen = state == "on"
+            case "silent", (("on" | "off") as state,):
+                self._silent = state == "on"
+            case "bad_checksum", (count,):
+                self._bad_checksums = int(count)
+            case (("empty_field" | "nan_field"), (tag,)):
+                self._spoiled = None if tag == "none" else (tag, "" if fault == "empty_field" else "NaN")
+            case "half_sentence", ():
+                self._torn = True
+            case "prompt", ():
+                self._stray = _prompt(Key.MOUNTING)
+            case "pending", ():
+                self._command, self._digits = Key.RATE, b""
+            case _, (number,):
+                self._set(fault, number)
+            case _:
+                raise ValueError("unknown")
+
+    def _set(self, fault: str, number: str) -> None:
+        match fault:
+            case "rate" | "format":
+                if not self.settings.store(Key.RATE if fault == "rate" else Key.FORMAT, int(number)):
+                    raise ValueError("out of range")
+            case "disturbance":
+                self._disturbance = float(number)
+            case "drift":
+                self._drift = float(number)
+            case "host_baud":
+                self.host_baud = int(number)
+            case _:
+                raise ValueError("unknown")
+
+    def _plugged(self, plugged: bool) -> None:
+        """The port is its supply."""
+        if plugged:
+            self.power_cycle()
+
+    # Commands
+
+    def _take(self, end: DeviceEnd, byte: int) -> None:
+        if self._escaped:
+            self._escaped = False
+            self._open(end, byte)
+        elif self._command is not None:
+            self._value(end, byte)
+        elif byte == ESC:
+            self._escaped = True
+
+    def _open(self, end: DeviceEnd, byte: int) -> None:
+        if byte in VALUE_KEYS or byte in CALIBRATION_KEYS:
+            self._command, self._digits = Key(byte), b""
+            end.write(_prompt(self._command))
+        elif byte == Key.VERSION:
+            end.write(VERSION)
+        elif byte == Key.CONFIGURATION:
+            stored = self.settings
+            end.write(
+                b"Rate %d Fields %d Format %d Baud %d Mounting %d\r\n"
+                % (stored.rate, stored.fields, stored.format, BAUDS[stored.baud], stored.mounting)
+            )
+
+    def _value(self, end: DeviceEnd, byte: int) -> None:
+        assert self._command is not None
+        if byte == ESC:
+            self._command = None
+        elif byte in self._terminators:
+            command, self._command = self._command, None
+            if command in VALUE_KEYS and not self._store(command):
+                end.write(b"Invalid\r\n")
+            self._resume_at = self._clock.now() + self._settle
+        elif byte in b"-0123456789" and len(self._digits) < 8:
+            self._digits += bytes((byte,))
+
+    def _store(self, command: Key) -> bool:
+        try:
+            return self.settings.store(command, int(self._digits))
+        except ValueError:
+            return False
+
+    # Stream
+
+    async def _stream(self, end: DeviceEnd) -> None:
+        last = self._clock.now()
+        while True:
+            now = self._clock.now()
+            period = self._period()
+            if period is not None and now >= last + period:
+                self._emit(end, now)
+                last = max(last + period, now - period)
+                continue
+            await self._clock.sleep_until(now + LOOK if period is None else min(now + LOOK, last + period))
+
+    def _period(self) -> int | None:
+        rate = self.settings.rate
+        if rate == 0:
+            return None
+        seconds = 1 / rate if rate > 0 else float(-rate)
+        return round(seconds / (1 + self._drift) * SECOND)
+
+    def _emit(self, end: DeviceEnd, now: int) -> None:
+        busy = self._escaped or self._command is not None or now < self._resume_at or now < self._line_free
+        if busy or self._silent:
+            return
+        line = self._last if self._frozen and self._last else self._sentence(now)
+        self._last = line
+        line = self._spoil(line)
+        if self._pace:
+            self._line_free = now + len(line) * 10 * SECOND // self._baud
+        if self.host_baud not in (None, self._baud):
+            line = self._rng.integers(0x80, 0x100, len(line), np.uint8).tobytes()
+        end.write(line)
+
+    def _spoil(self, line: bytes) -> bytes:
+        if self._torn:
+            self._torn = False
+            return line[len(line) // 2 :]
+        if self._bad_checksums:
+            self._bad_checksums -= 1
+            return line.replace(b"P", b"p", 1)
+        stray, self._stray = self._stray, b""
+        return stray + line
+
+    def _sentence(self, now: int) -> bytes:
+        reading = self._source.compass(now)
+        heading = round((reading.heading_deg + self._disturbance) * 10) % 3600 / 10
+        pitch, roll = round(reading.pitch_deg, 1) + 0.0, round(reading.roll_deg, 1) + 0.0
+        form = self.settings.format
+        if form == 2:
+            return frame(f"OHPR,{heading:.1f},{pitch:.1f},{roll:.1f}")
+        if form == 4:
+            return frame(f"HCHDT,{heading:.1f},T")
+        if form == 8:
+            return b"%.1f,%.1f,%.1f\r\n" % (heading, pitch, roll)
+        x, y, z = np.add(reading.field, 0.3 * self._rng.standard_normal(3)).tolist()
+        ax, ay, az = np.add(reading.acceleration, 0.001 * self._rng.standard_normal(3)).tolist()
+        sentence = Sentence(
+            heading=heading,
+            pitch=pitch,
+            roll=roll,
+            temperature=reading.temperature_c + self.settings.temperature_offset,
+            field_length=math.hypot(x, y, z),
+            field=(x, y, z),
+            acceleration_length=math.hypot(ax, ay, az),
+            acceleration=(ax, ay, az),
+        )
+        line = build(sentence, mask=Fields(self.settings.fields))
+        return _replace_field(line, *self._spoiled) if self._spoiled is not None else line
+
+
+def _prompt(command: Key) -> bytes:
+    return b"CMD %c\r\nValue and Enter or Esc\r\n" % command
+
+
+def _replace_field(line: bytes, tag: str, text: str) -> bytes:
+    """Put ``text`` in the place of a field's number, with a correct sum."""
+    body = line[1 : line.index(b"*")].decode("ascii")
+    start = body.find(tag)
+    if start < 0:
+        return line
+    start += len(tag)
+    stop = start
+    while stop < len(body) and body[stop] in "+-.0123456789":
+        stop += 1
+    return frame(body[:start] + text + body[stop:])

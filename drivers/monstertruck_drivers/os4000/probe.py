@@ -1,0 +1,46 @@
+"""Who is on the port, and what does it read."""
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.os4000.protocol import Fields, Key
+from monstertruck_drivers.os4000.session import Session, observed_fields, observed_rate
+from monstertruck_runtime.clock import Clock
+
+PROBE_RATE = 20
+"""Set only when the unit was told to be silent."""
+
+
+async def probe(port: Port, clock: Clock) -> dict[str, object]:
+    """Listen, and ask for the firmware version. Only a silent unit is set to another rate.
+
+    Returns:
+        JSON-able: ``device``, ``port``, ``version`` (lines the unit prints), ``rate`` in Hz, ``fields`` (names),
+        ``sample`` in the device's units and signs.
+
+    Raises:
+        DeviceLostError: not plugged in.
+        DeviceTimeoutError: silence.
+        WrongDeviceError: another device, or another baud rate than the port's.
+        PortBusyError: another process holds the port.
+    """
+    async with await port.open() as link:
+        session = Session(link, clock)
+        heard = await session.start(PROBE_RATE)
+        version = await session.ask(Key.VERSION)
+    _, sample = heard[-1]
+    rate = observed_rate(heard)
+    fields = observed_fields(heard)
+    return {
+        "device": "OceanServer OS4000",
+        "port": port.name,
+        "version": version,
+        "rate": None if rate is None else round(rate, 1),
+        "fields": [(bit.name or "").lower() for bit in Fields if bit in fields],
+        "sample": {
+            "heading_deg": sample.heading,
+            "pitch_deg": sample.pitch,
+            "roll_deg": sample.roll,
+            "temperature_c": sample.temperature,
+            "field_mg": sample.field,
+            "acceleration_g": sample.acceleration,
+        },
+    }

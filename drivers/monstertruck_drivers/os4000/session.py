@@ -1,0 +1,135 @@
+"""Listening to an OS4000 and setting it up over one open link; shared by driver and probe."""
+
+from itertools import pairwise
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.os4000 import protocol
+from monstertruck_drivers.os4000.protocol import FORMAT_TAGGED, Fields, Key, Parser, Sentence, is_other_format
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
+
+LISTEN: Final = 1.2
+"""Seconds to hear a streaming unit; also longer than it pauses after a setting."""
+PROMPT: Final = 0.3
+"""Seconds to wait for the prompt of a command."""
+SAMPLES: Final = 6
+"""Sentences that tell rate and fields."""
+
+
+class Session:
+    """One conversation.
+
+    Args:
+        link: open link, at the unit's baud rate.
+        clock: time.
+    """
+
+    def __init__(self, link: Link, clock: Clock) -> None:
+        self.parser = Parser()
+        self.bytes_heard = 0
+        self._link = link
+        self._clock = clock
+
+    async def receive(self) -> list[Sentence]:
+        """Sentences that became complete with the next bytes.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        data = await self._link.read()
+        self.bytes_heard += len(data)
+        return self.parser.feed(data)
+
+    async def listen(self, seconds: float, count: int = SAMPLES) -> list[tuple[int, Sentence]]:
+        """Collect sentences with their arrival times until ``count`` came or ``seconds`` passed."""
+        heard: list[tuple[int, Sentence]] = []
+        try:
+            async with self._clock.deadline(seconds):
+                while len(heard) < count:
+                    heard += [(self._clock.now(), sentence) for sentence in await self.receive()]
+        except TimeoutError:
+            pass
+        return heard
+
+    async def start(self, rate: int) -> list[tuple[int, Sentence]]:
+        """Bring the unit to talk, whatever state it was left in.
+
+        It may stream; wait inside an unfinished command; have its output switched off (that is stored); or print
+        another format. Only a silent unit, or one that prints a known other format, is written to. Baud rates
+        other than the port's are not tried: a port cannot change its rate.
+
+        Args:
+            rate: sentences a second to set when the output is off.
+
+        Returns:
+            At least one sentence, with arrival times.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence to the end.
+            WrongDeviceError: bytes come, but no sentence of an OS4000.
+        """
+        remedies = [
+            b"\r",  # ends a command that waits for its value
+            bytes((protocol.ESC,)),
+            protocol.key(Key.RATE) + protocol.value(rate),
+        ]
+        heard = await self.listen(LISTEN)
+        if not heard and any(is_other_format(line) for line in self.parser.text):
+            await self.set(Key.FORMAT, FORMAT_TAGGED)
+            heard = await self.listen(LISTEN)
+        silent = self.bytes_heard == 0
+        while not heard and remedies and silent:
+            self._link.write(remedies.pop(0))
+            heard = await self.listen(LISTEN)
+        if heard:
+            return heard
+        name = self._link.name
+        if self.bytes_heard:
+            raise WrongDeviceError(
+                f"{name}: {self.bytes_heard} bytes, but no OS4000 sentence: another device, or another baud rate "
+                f"than the unit's ({', '.join(map(str, protocol.BAUDS))}; 19200 from the factory)"
+            )
+        raise DeviceTimeoutError(
+            f"{name}: silence; expected an OS4000 that streams, at its baud rate (19200 from the factory)"
+        )
+
+    async def set(self, command: Key, number: int) -> None:
+        """Write one setting; afterwards sentences come again.
+
+        Which end of value a firmware takes is not certain: space first, then CR, and ESC to leave in any case.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        self._link.write(protocol.key(command))
+        await self.listen(PROMPT, count=1000)
+        for end in (protocol.value(number), b"\r", bytes((protocol.ESC,))):
+            self._link.write(end)
+            if await self.listen(LISTEN, count=1):
+                return
+
+    async def ask(self, command: Key, seconds: float = 0.5) -> list[str]:
+        """Text that an immediate command prints."""
+        self.parser.text = []
+        self._link.write(protocol.key(command))
+        await self.listen(seconds, count=1000)
+        return [line.decode("ascii", "replace") for line in self.parser.text]
+
+
+def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
+    """All fields seen: a field may be empty in one sentence."""
+    mask = Fields(0)
+    for _, sentence in heard:
+        mask |= sentence.fields
+    return mask
+
+
+def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
+    """Sentences a second, by the median interval: a lost sentence or a burst does not count; None = too few."""
+    times = [time for time, _ in heard]
+    intervals = sorted(after - before for before, after in pairwise(times))
+    if len(intervals) < 2 or intervals[len(intervals) // 2] == 0:
+        return None
+    return SECOND / intervals[len(intervals) // 2]
