@@ -33,6 +33,7 @@ class Reason(StrEnum):
     BUSY = "busy", 7, "in use by another process or caller"
     DISK_FULL = "disk_full", 8, "no space left to record"
     LOG_DAMAGED = "log_damaged", 9, "log is truncated or damaged"
+    RECORDING_FAILED = "recording_failed", 10, "log cannot be written"
 
     # Devices
     DEVICE_LOST = "device_lost", 20, "device unplugged or its port vanished"

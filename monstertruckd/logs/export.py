@@ -1,0 +1,150 @@
+"""Export of logs for spreadsheets (CSV) and numpy (NPZ): one file per topic, one column per field."""
+
+import csv
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from enum import Enum
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
+from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.logs.reader import LogReader
+
+_TIME = "log_time"
+
+
+def export_csv(path: str | Path, directory: str | Path) -> dict[str, Path]:
+    """Write ``<group>_<name>.csv`` for every topic that has messages.
+
+    Nested records get dotted columns; arrays and lists stand in one cell as JSON; absent values are empty.
+
+    Returns:
+        The files by topic.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, a message in it is invalid, or the folder cannot be written.
+    """
+    directory = _folder(directory)
+    files: dict[str, Path] = {}
+    with ExitStack() as stack:
+        writers: dict[str, Any] = {}
+        for topic, row in _rows(path):
+            if topic not in writers:
+                files[topic] = directory / f"{_stem(topic)}.csv"
+                writers[topic] = csv.writer(stack.enter_context(files[topic].open("w", newline="")))
+                writers[topic].writerow(row)
+            writers[topic].writerow(_cell(value) for value in row.values())
+    return files
+
+
+def export_npz(path: str | Path, directory: str | Path) -> dict[str, Path]:
+    """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
+
+    Absent numbers are NaN. Arrays of equal length are stacked to shape (messages, length); others are laid end
+    to end, with their lengths in ``<column>.lengths``. Text, lists and mappings are strings (lists as JSON).
+
+    Returns:
+        The files by topic.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, a message in it is invalid, or the folder cannot be written.
+    """
+    directory = _folder(directory)
+    tables: dict[str, dict[str, list[Any]]] = {}
+    for topic, row in _rows(path):
+        table = tables.setdefault(topic, {name: [] for name in row})
+        for name, value in row.items():
+            table[name].append(value)
+    files = {}
+    for topic, table in tables.items():
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, values in table.items():
+            arrays |= _column(name, values)
+        files[topic] = directory / f"{_stem(topic)}.npz"
+        np.savez_compressed(files[topic], allow_pickle=False, **arrays)
+    return files
+
+
+def _folder(directory: str | Path) -> Path:
+    directory = Path(directory)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{directory}: cannot be made: {error.strerror}"
+        raise InputError(msg) from None
+    return directory
+
+
+def _stem(topic: str) -> str:
+    return topic.replace("/", "_")
+
+
+def _rows(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(topic, column to value) of every message of a known topic."""
+    for number, message in enumerate(LogReader(Path(path)), start=1):
+        if message.topic not in BY_NAME:
+            continue
+        try:
+            decoded = message.decode()
+        except NotFoundError:
+            continue
+        except TruckError as error:
+            text = f"{path}: message {number}: {error}"
+            raise InputError(text) from None
+        yield message.topic, {_TIME: message.log_time, **_flat(decoded, type(decoded), "")}
+
+
+def _flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+    """Columns of a record; the same for every message of a model, present or not."""
+    row: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        value = None if record is None else getattr(record, name)
+        nested = _record_type(field.annotation)
+        row |= {prefix + name: value} if nested is None else _flat(value, nested, f"{prefix}{name}.")
+    return row
+
+
+def _record_type(annotation: Any) -> type[BaseModel] | None:
+    for option in (annotation, *get_args(annotation)):
+        if isinstance(option, type) and issubclass(option, BaseModel) and _is_plain(annotation):
+            return option
+    return None
+
+
+def _is_plain(annotation: Any) -> bool:
+    """A record or an optional record, not a list of records."""
+    return all(option is type(None) or isinstance(option, type) for option in (get_args(annotation) or (annotation,)))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.value if isinstance(value, Enum) else value
+
+
+def _cell(value: Any) -> Any:
+    value = [_plain(item) for item in value] if isinstance(value, tuple) else _plain(value)
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+def _column(name: str, values: list[Any]) -> dict[str, NDArray[Any]]:
+    if all(isinstance(value, np.ndarray) for value in values):
+        lengths = [len(value) for value in values]
+        if len(set(lengths)) == 1:
+            return {name: np.stack(values)}
+        return {name: np.concatenate(values), f"{name}.lengths": np.array(lengths)}
+    if all(value is None or isinstance(value, int | float) for value in values):
+        if any(value is None for value in values):
+            return {name: np.array([np.nan if value is None else value for value in values], np.float64)}
+        return {name: np.array(values)}
+    return {name: np.array(["" if value is None else str(_cell(value)) for value in values])}

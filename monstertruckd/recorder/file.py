@@ -1,0 +1,198 @@
+"""One log file being written, and the folder of all of them."""
+
+import fcntl
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from mcap.writer import CompressionType, Writer
+
+from monstertruck_runtime import wire
+from monstertruck_schemas.topics import Topic
+from monstertruckd import __version__
+from monstertruckd.recorder.config import Compression
+
+_NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
+_COMPRESSION: Final = {
+    Compression.NONE: CompressionType.NONE,
+    Compression.LZ4: CompressionType.LZ4,
+    Compression.ZSTD: CompressionType.ZSTD,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A message on its way to the log."""
+
+    topic: Topic[Any]
+    log_time: int
+    """When the daemon published or received it, ns of daemon time."""
+    stamp: int
+    sequence: int
+    """Counts the topic's messages; a gap is a message dropped on the way to the log."""
+    payload: bytes
+
+
+class LogFile:
+    """An open MCAP file, locked against everybody who would repair or remove it.
+
+    Args:
+        path: file to make.
+        compression: of the chunks.
+        chunk_size: bytes after which a chunk is closed.
+        attachments: written first, each as ``<name>.json``.
+        metadata: text about the run.
+        start: first log time, ns.
+
+    Raises:
+        OSError: the file exists, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        compression: Compression,
+        chunk_size: int,
+        attachments: Mapping[str, Any],
+        metadata: Mapping[str, str],
+        start: int,
+    ) -> None:
+        self.path = path
+        self.start = start
+        self.open_since: int | None = None
+        """Log time of the oldest message that is not in the file yet."""
+        self._output = _Output(path)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        try:
+            self._writer = Writer(
+                self._output,  # type: ignore[arg-type]  # write, tell and flush are all it needs
+                chunk_size=chunk_size,
+                compression=_COMPRESSION[compression],
+            )
+            self._writer.start(library=f"monstertruckd {__version__}")
+            self._writer.add_metadata("run", dict(metadata))
+            for name, value in attachments.items():
+                data = json.dumps(value, indent=1, sort_keys=True).encode()
+                self._writer.add_attachment(start, start, f"{name}.json", "application/json", data)
+        except BaseException:
+            self._output.close()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._output.tell()
+
+    def add(self, entry: Entry) -> None:
+        """Put a message into the open chunk."""
+        channel = self._channels.get(entry.topic.name) or self._register(entry.topic)
+        before = self.size
+        self._writer.add_message(
+            channel, entry.log_time, entry.payload, max(0, entry.stamp), entry.sequence & 0xFFFFFFFF
+        )
+        if self.size != before:
+            self.open_since = None
+        elif self.open_since is None:
+            self.open_since = entry.log_time
+
+    def flush(self) -> None:
+        """Close the open chunk and hand it to the kernel: it survives the process."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self.open_since = None
+
+    def sync(self) -> None:
+        """Wait until the disk has it: it survives a power cut."""
+        self._output.sync()
+
+    def finish(self) -> None:
+        """Write the index and close."""
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self.sync()
+        finally:
+            self._output.close()
+
+    def abandon(self) -> None:
+        """Close as it is; the file is repaired at the next start."""
+        self._output.close()
+
+    def _register(self, topic: Topic[Any]) -> int:
+        schema = wire.schema(topic)
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        channel = self._writer.register_channel(
+            topic.name, schema.message_encoding, self._schemas[schema.name], {"encoding": wire.encoding(topic)}
+        )
+        self._channels[topic.name] = channel
+        return channel
+
+
+class _Output:
+    """Unbuffered file: what was written is with the kernel, and an error leaves nothing behind to flush."""
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        fcntl.flock(self._fd, fcntl.LOCK_EX)
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            written = os.write(self._fd, rest)
+            self._size += written
+            rest = rest[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def sync(self) -> None:
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+class LogFolder:
+    """Numbered log files of one folder: ``run-<run>-<part>.mcap``, in order of age."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        directory.mkdir(parents=True, exist_ok=True)
+        self._run = (
+            max(
+                (int(name[1]) for name in (_NAME.fullmatch(path.name) for path in directory.iterdir()) if name),
+                default=0,
+            )
+            + 1
+        )
+        self._part = 0
+
+    def next_path(self) -> Path:
+        """Name of the next file of this run."""
+        path = self.directory / f"run-{self._run:06d}-{self._part:03d}.mcap"
+        self._part += 1
+        return path
+
+    def next_run(self) -> None:
+        """Take another run number: somebody else uses this one."""
+        self._run += 1
+        self._part = 0
+
+    def finished(self, current: Path) -> dict[Path, int]:
+        """Size of every log but ``current``, oldest first."""
+        found = {}
+        for path in sorted(self.directory.iterdir()):
+            if _NAME.fullmatch(path.name) and path != current:
+                found[path] = path.stat().st_size
+        return found

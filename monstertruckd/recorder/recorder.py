@@ -1,0 +1,180 @@
+"""The recorder: takes encoded messages on the event loop, writes them in a thread of its own."""
+
+import asyncio
+import errno
+import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import Clock
+from monstertruck_schemas.health import RecorderHealth
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import TOPICS, Topic
+from monstertruckd.logs.recover import recover_directory
+from monstertruckd.recorder.config import RecorderConfig
+from monstertruckd.recorder.digest import LogDigest
+from monstertruckd.recorder.file import Entry
+from monstertruckd.recorder.writer import LogWriter
+
+log = logging.getLogger(__name__)
+
+_FULL: Final = {errno.ENOSPC, errno.EDQUOT}
+
+FailureSink = Callable[[Reason, str], None]
+
+
+class Recorder:
+    """Records while its ``async with`` body runs; leaving it finishes the log.
+
+    A disk that is full or refuses ends the recording: ``on_failure`` is called once, later messages count as
+    drops, and nothing is raised, because driving goes on. Unfinished logs in the folder are repaired meanwhile.
+
+    Args:
+        config: where and how.
+        clock: daemon time of the messages.
+        on_failure: called on the event loop with the reason and one line of text.
+        attachments: JSON-able values attached to every file as ``<name>.json`` (config, calibration, versions).
+        metadata: text about the run, in every file.
+        digest: takes every recorded message.
+        deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
+            by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
+    """
+
+    name = "recorder"
+
+    def __init__(
+        self,
+        config: RecorderConfig,
+        clock: Clock,
+        on_failure: FailureSink,
+        *,
+        attachments: Mapping[str, Any] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        digest: LogDigest | None = None,
+        deterministic: bool = False,
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._on_failure = on_failure
+        self._attachments = dict(attachments or {})
+        self._metadata = dict(metadata or {})
+        self._digest = digest
+        self._deterministic = deterministic
+        self._queue: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
+        self._room = threading.Semaphore(config.queue_size)
+        self._sequences = {topic.name: 0 for topic in TOPICS}
+        self._recording = False
+        self._ended = False
+        self._reason = Reason.OK
+        self._path: Path | None = None
+        self._messages = self._bytes = self._drops = 0
+
+    @property
+    def path(self) -> Path | None:
+        """File being written; None before the first one is open."""
+        return self._path
+
+    async def __aenter__(self) -> Self:
+        self._loop = asyncio.get_running_loop()
+        self._done = self._loop.create_future()
+        self._recording = True
+        self._metadata.setdefault("real_offset_ns", str(self._clock.real_offset()))
+        threading.Thread(target=self._run, args=(self._clock.now(),), name="recorder", daemon=True).start()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._recording = False
+        self._queue.put(None)
+        await asyncio.shield(self._done)
+
+    def record(self, topic: Topic[Any], stamp: int, payload: bytes) -> None:
+        """Take one encoded message; never waits for the disk (except in deterministic runs).
+
+        Args:
+            topic: its row of the table; topics that are not logged are ignored.
+            stamp: the message's own stamp, ns.
+            payload: its bytes on the wire.
+        """
+        if not topic.logged:
+            return
+        sequence = self._sequences[topic.name]
+        self._sequences[topic.name] = sequence + 1
+        if not self._recording or not self._room.acquire(blocking=self._deterministic):
+            self._drops += 1
+            return
+        self._messages += 1
+        self._bytes += len(payload)
+        if self._digest is not None:
+            self._digest.update(topic.name, stamp, payload)
+        self._queue.put(Entry(topic, self._clock.now(), stamp, sequence, payload))
+
+    def health(self, seq: int) -> RecorderHealth:
+        """State of the recording; counts are of messages and payload bytes handed to the writer."""
+        now = self._clock.now()
+        return RecorderHealth(
+            stamp=now,
+            received=now,
+            seq=seq,
+            recording=self._recording,
+            path=None if self._path is None or self._deterministic else str(self._path),
+            bytes_written=self._bytes,
+            messages=self._messages,
+            drops=self._drops,
+            reason=self._reason,
+        )
+
+    def _run(self, start: int) -> None:
+        """The thread."""
+        stop = threading.Event()
+        repair = threading.Thread(
+            target=recover_directory, args=(Path(self._config.directory), stop), name="log-repair", daemon=True
+        )
+        try:
+            try:
+                with LogWriter(self._config, self._attachments, self._metadata, start) as writer:
+                    self._path = writer.path
+                    repair.start()
+                    self._write(writer)
+            except OSError as error:
+                reason = Reason.DISK_FULL if error.errno in _FULL else Reason.RECORDING_FAILED
+                self._fail(reason, f"recording stopped: {error}")
+            except Exception as error:
+                log.exception("recorder: bug")
+                self._fail(Reason.INTERNAL, f"recording stopped: {error!r}")
+        finally:
+            stop.set()
+            if repair.ident is not None:
+                repair.join()
+            self._loop.call_soon_threadsafe(self._done.set_result, None)
+
+    def _write(self, writer: LogWriter) -> None:
+        for topic in TOPICS:
+            wire.schema(topic)  # once, before the first chunk is due
+        wait = None if self._deterministic else self._config.chunk_seconds / 2
+        while True:
+            try:
+                entry = self._queue.get(timeout=wait)
+            except queue.Empty:
+                writer.tick(self._clock.now())
+                continue
+            if entry is None:
+                self._ended = True
+                return
+            self._room.release()
+            writer.write(entry)
+            self._path = writer.path
+
+    def _fail(self, reason: Reason, text: str) -> None:
+        self._recording = False
+        self._reason = reason
+        self._loop.call_soon_threadsafe(self._on_failure, reason, text)
+        while not self._ended:  # nobody may wait for room that never comes
+            self._ended = self._queue.get() is None
+            self._room.release()
