@@ -1,0 +1,413 @@
+"""The safety gate as a pure state machine: requests and observations in, actuator commands out at every tick.
+
+States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
+A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so that it ends even if nothing
+is ever sent again. ``sources`` holds the rules of who drives, ``watch`` what stops or slows the truck, ``obstacles``
+the swept footprint, ``motion`` clipping and rates.
+
+Whatever stops the truck ends with standstill confirmed by the drive. Short trouble (a late scan, a lapsed lease) then
+lets the same source go on; trouble longer than ``disarm_after`` and what a human should look at disarms.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.ports import Value
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import HealthTable
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.events import EventLog
+from monstertruckd.gate.motion import Motion
+from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.output import GateOutput
+from monstertruckd.gate.sources import DRIVERS, OPERATORS, Source, Sources
+from monstertruckd.gate.watch import Judgement, Watch
+
+URGENT: Final = frozenset(
+    {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
+)
+"""These stop by quick stop, which jumps every queue; the others by the drive's ordinary ramp."""
+
+DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED})
+"""After these somebody has to arm again, however short they were."""
+
+ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
+
+
+class Gate:
+    """The safety gate, without any input or output of its own.
+
+    Args:
+        config: limits.
+        steering: the truck's geometry.
+        drivetrain: motor to wheel.
+        linkage: axle to servo.
+        footprint: the truck's outline.
+        lidar: pose (x, y, yaw) of the lidar in base.
+        nonce: of this run; requests must carry it.
+        latched: whether the emergency stop was latched when the daemon last ran.
+
+    Raises:
+        ConfigError: the steering linkage cannot reach ``config.angle``.
+    """
+
+    def __init__(
+        self,
+        config: GateConfig,
+        *,
+        steering: FourWheelSteering,
+        drivetrain: DriveTrain,
+        linkage: SteeringPolynomials,
+        footprint: Footprint,
+        lidar: tuple[float, float, float],
+        nonce: str,
+        latched: bool = False,
+    ) -> None:
+        reach = min(abs(end) for axle in (linkage.front, linkage.rear) for end in axle.axle_limits)
+        if config.angle > reach:
+            msg = f"gate.angle {config.angle} rad: expected at most {reach:.4f} rad, which the steering linkage reaches"
+            raise ConfigError(msg)
+        self._config = config
+        self._drivetrain = drivetrain
+        self._linkage = linkage
+        self._sources = Sources(nonce, config.leases)
+        self._watch = Watch(config, drivetrain)
+        self._obstacles = ObstacleGuard(config, steering, footprint, lidar)
+        self._motion = Motion(config, steering)
+        self._events = EventLog(config.event_interval)
+        self._mode = GateMode.ESTOPPED if latched else GateMode.DISARMED
+        self._holder: Source | None = None
+        self._stop_reasons: tuple[Reason, ...] = ()
+        self._known: frozenset[Reason] = frozenset()
+        self._since = 0
+        self._driven = 0
+        self._ticked: int | None = None
+        self._stalled_until = 0
+        self._disarm_at_rest = False
+        self._blocked_ahead = False
+        self._emergency = False
+        self._shut_down = False
+
+    @property
+    def mode(self) -> GateMode:
+        """State now."""
+        return self._mode
+
+    @property
+    def nonce(self) -> str:
+        """Nonce of this run."""
+        return self._sources.nonce
+
+    # Observations
+
+    def observe_scan(self, scan: LaserScan) -> None:
+        """Take the newest scan."""
+        if self._watch.observe_scan(scan):
+            self._obstacles.observe(scan)
+
+    def observe_attitude(self, attitude: Attitude) -> None:
+        """Take the newest attitude."""
+        self._watch.observe_attitude(attitude)
+
+    def observe_drive(self, feedback: DriveFeedback) -> None:
+        """Take the newest drive feedback."""
+        self._watch.observe_drive(feedback)
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take the newest steering feedback."""
+        self._watch.observe_steering(feedback)
+
+    def observe_battery(self, battery: Battery) -> None:
+        """Take the newest battery reading."""
+        self._watch.observe_battery(battery)
+
+    def observe_health(self, table: HealthTable) -> None:
+        """Take the newest health table."""
+        self._watch.observe_health(table)
+
+    # Requests
+
+    def request(self, request: DriveRequest, now: int) -> Reason:
+        """Take a drive request; returns OK, or the reason why it does not move the truck now."""
+        reason = self._sources.authenticate(request)
+        if reason is Reason.OK and request.role not in DRIVERS:
+            reason = Reason.BAD_ROLE
+        wrong = {n: v for n in ("speed", "front", "rear") if not math.isfinite(v := getattr(request, n))}
+        if reason is Reason.OK and wrong:
+            text = ", ".join(f"{name} is {value}" for name, value in wrong.items()) + ": expected finite numbers"
+            return self._refuse(now, Reason.NOT_FINITE, request, text)
+        if reason is not Reason.OK:
+            return self._refuse(now, reason, request)
+        source = self._sources.add(request, now)
+        if self._mode is GateMode.ESTOPPED:
+            return self._refuse(now, Reason.ESTOPPED, request)
+        if self._mode is GateMode.DISARMED:
+            return self._refuse(now, Reason.DISARMED, request)
+        reason = self._sources.standing(source, now, self._holder_name())
+        if reason is not Reason.OK:
+            return self._refuse(now, reason, request)
+        return next(iter(self._blocks(self._watch.judge(now), now)), Reason.OK)
+
+    def control(self, request: ControlRequest, now: int) -> Reason:
+        """Carry out an order; returns OK, or why it was refused.
+
+        ESTOP and STOP are taken from anybody, authentic or not: stopping is always safe. ARM and RESET need an
+        operator's role, a truck at rest and no stick deflected.
+        """
+        if request.order is Order.ESTOP:
+            return self._estop(request, now)
+        if request.order is Order.STOP:
+            return self._give_up(request, now)
+        reason = self._sources.authenticate(request)
+        if reason is not Reason.OK:
+            return self._refuse(now, reason, request)
+        if request.order is Order.DISARM:
+            return self._disarm_by(request, now)
+        if request.role not in OPERATORS:
+            return self._refuse(now, Reason.BAD_ROLE, request)
+        return self._arm(request, now) if request.order is Order.ARM else self._reset(request, now)
+
+    def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
+        what = request.order.value if isinstance(request, ControlRequest) else "drive"
+        values = {"role": request.role.value, "request": what}
+        self._events.tell(now, reason, Severity.WARNING, text, values, source=request.source)
+        return reason
+
+    def _estop(self, request: ControlRequest, now: int) -> Reason:
+        if self._mode is not GateMode.ESTOPPED:
+            self._mode, self._since, self._holder = GateMode.ESTOPPED, now, None
+            values = {"role": request.role.value}
+            self._events.tell(
+                now, Reason.ESTOP_REQUESTED, Severity.ERROR, "", values, source=request.source, always=True
+            )
+        return Reason.OK
+
+    def _give_up(self, request: ControlRequest, now: int) -> Reason:
+        if request.role is not Role.TRACKER:
+            self._sources.claim(request.role)
+        self._sources.hold()
+        if self._mode is GateMode.DRIVING:
+            self._stop(now, (Reason.STOPPED,))
+            self._tell_transition(now, Reason.STOPPED, f"stop ordered by {request.source}")
+        return Reason.OK
+
+    def _disarm_by(self, request: ControlRequest, now: int) -> Reason:
+        text = f"disarmed by {request.source}"
+        if self._mode is GateMode.ARMED:
+            self._disarm(now, text)
+        elif self._mode in ACTIVE:
+            self._disarm_at_rest = True
+            if self._mode is GateMode.DRIVING:
+                self._stop(now, (Reason.DISARMED,))
+                self._tell_transition(now, Reason.DISARMED, text)
+        return Reason.OK
+
+    def _arm(self, request: ControlRequest, now: int) -> Reason:
+        if self._mode is GateMode.ESTOPPED:
+            return self._refuse(now, Reason.ESTOPPED, request)
+        blocks = self._blocks(self._watch.judge(now), now)
+        if blocks:
+            return self._refuse(now, blocks[0], request)
+        moving = self._mode is GateMode.STOPPING or not self._watch.at_rest(now)
+        if moving or self._sources.pushing(now, OPERATORS):
+            return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
+        self._sources.admit()
+        self._driven = now
+        if self._mode is GateMode.DISARMED:
+            self._mode, self._since, self._disarm_at_rest = GateMode.ARMED, now, False
+            self._events.tell(now, Reason.ARMED, Severity.INFO, source=request.source, always=True)
+        return Reason.OK
+
+    def _reset(self, request: ControlRequest, now: int) -> Reason:
+        if self._mode is not GateMode.ESTOPPED:
+            return Reason.OK
+        if not self._watch.at_rest(now) or self._sources.pushing(now):
+            return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
+        self._disarm(now, f"emergency stop reset by {request.source}")
+        return Reason.OK
+
+    # Ticks
+
+    def tick(self, now: int) -> GateOutput:
+        """Advance to ``now`` (ns) and decide what the actuators do."""
+        period = SECOND / self._config.rate
+        elapsed = period if self._ticked is None else now - self._ticked
+        self._ticked = now
+        if elapsed > self._config.tick_stall * SECOND:
+            self._stalled_until = now + round(self._config.stall_dwell * SECOND)
+        dt = min(elapsed, 2 * period) / SECOND
+
+        judgement = self._watch.judge(now)
+        blocks = self._blocks(judgement, now)
+        self._report(now, blocks, judgement.values, always=self._mode is GateMode.DRIVING)
+        self._advance(now, blocks)
+        limits = dict(judgement.limits)
+        if self._mode is GateMode.DRIVING and self._holder is not None:
+            self._follow(now, dt, self._holder.request, limits)
+        else:
+            self._motion.halt()
+            self._emergency = self._blocked_ahead = False
+        self._report(now, tuple(limits), judgement.values, always=False)
+        self._known = frozenset((*blocks, *limits))
+        return self._output(now, blocks, limits)
+
+    def neutral(self, now: int) -> GateOutput:
+        """Last output before the daemon ends: quick stop. From here on the gate never drives again."""
+        self._shut_down = True
+        self._motion.halt()
+        if self._mode in ACTIVE:
+            self._disarm(now, Reason.SHUTDOWN.text)
+        return self._output(now, (Reason.SHUTDOWN,), {})
+
+    def _blocks(self, judgement: Judgement, now: int) -> tuple[Reason, ...]:
+        own = [Reason.SHUTDOWN] if self._shut_down else []
+        if now < self._stalled_until:
+            own.append(Reason.TICK_STALLED)
+        return (*own, *judgement.blocks)
+
+    def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
+        """At most one transition per tick."""
+        if self._mode not in ACTIVE:
+            return
+        self._disarm_at_rest |= not DISARMING.isdisjoint(blocks)
+        driver = None if blocks else self._sources.driver(now, self._holder_name())
+        if self._mode is GateMode.DRIVING:
+            if driver is None:
+                if not blocks:
+                    self._tell_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {self._holder_name()}")
+                self._stop(now, blocks or (Reason.LEASE_EXPIRED,))
+            else:
+                self._take(now, driver)
+        elif self._mode is GateMode.STOPPING and self._watch.at_rest(now, self._since):
+            self._mode, self._since, self._stop_reasons = GateMode.ARMED, now, ()
+            self._events.tell(now, Reason.STOPPED, Severity.INFO, always=True)
+        elif self._mode is GateMode.ARMED and self._disarm_at_rest:
+            self._disarm(now, ", ".join(reason.text for reason in blocks))
+        elif self._mode is GateMode.ARMED and driver is not None:
+            self._mode, self._since = GateMode.DRIVING, now
+            self._take(now, driver)
+        elif now - self._driven > self._config.disarm_after * SECOND:
+            self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
+
+    def _take(self, now: int, driver: Source) -> None:
+        if self._holder_name() != driver.request.source:
+            role = driver.request.role
+            self._sources.claim(role)
+            values = {"role": role.value}
+            self._events.tell(now, Reason.DRIVING, Severity.INFO, "", values, source=driver.request.source, always=True)
+        self._holder, self._driven = driver, now
+
+    def _stop(self, now: int, reasons: tuple[Reason, ...]) -> None:
+        self._mode, self._since, self._stop_reasons, self._holder = GateMode.STOPPING, now, reasons, None
+
+    def _tell_transition(self, now: int, reason: Reason, text: str) -> None:
+        self._events.tell(now, reason, Severity.WARNING, text, always=True)
+
+    def _disarm(self, now: int, text: str) -> None:
+        self._mode, self._since, self._stop_reasons, self._holder = GateMode.DISARMED, now, (), None
+        self._disarm_at_rest = False
+        self._events.tell(now, Reason.DISARMED, Severity.INFO, text, always=True)
+
+    def _follow(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:
+        """Move the commanded motion towards the request, adding what limits it to ``limits``."""
+        motion = self._motion
+        front, rear, clipped = motion.clipped_angles(request)
+        motion.steer(front, rear, dt)
+        direction = math.copysign(1.0, motion.speed or request.speed)
+        cap = motion.cap(direction)
+        if clipped or abs(request.speed) > cap * (1 + 1e-6):
+            limits[Reason.CLIPPED] = cap
+        if motion.speed != 0 or request.speed != 0:
+            self._heed_obstacles(now, direction, max(abs(request.speed), abs(motion.speed)), limits)
+        allowed = min(*limits.values(), cap) if limits else cap
+        if allowed == 0:
+            motion.halt()
+        else:
+            motion.accelerate(min(max(request.speed, -allowed), allowed), dt)
+
+    def _heed_obstacles(self, now: int, direction: float, wanted: float, limits: dict[Reason, float]) -> None:
+        if not self._watch.scan_fresh(now):
+            return
+        arcs = [(self._motion.front, self._motion.rear)]
+        if self._watch.steering is not None and self._watch.steering_fresh(now):
+            arcs.append(self._axles(self._watch.steering))
+        free = self._obstacles.free_distance(direction, tuple(arcs))
+        allowed = self._obstacles.allowed_speed(free, now)
+        crawl = self._config.obstacle.crawl
+        self._blocked_ahead = allowed < (2 * crawl if self._blocked_ahead else crawl)
+        if self._blocked_ahead:
+            limits[Reason.OBSTACLE_STOP] = 0.0
+        elif allowed < wanted:
+            limits[Reason.OBSTACLE_SLOW] = allowed
+        speed = self._watch.speed(now) or 0.0
+        moving_there = speed * direction > self._config.standstill
+        near = self._blocked_ahead and self._obstacles.too_near(free, speed, now)
+        self._emergency = moving_there and (self._emergency or near)
+
+    def _axles(self, feedback: SteeringFeedback) -> tuple[float, float]:
+        front, rear = self._linkage.front, self._linkage.rear
+        return (
+            front.axle_from_servo(min(max(feedback.front, -front.servo_limit), front.servo_limit)),
+            rear.axle_from_servo(min(max(feedback.rear, -rear.servo_limit), rear.servo_limit)),
+        )
+
+    def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:
+        """Tell about reasons that were not there at the last tick."""
+        if self._mode not in ACTIVE:
+            return
+        for reason in reasons:
+            if reason not in self._known:
+                text = f"{reason.text}: {', '.join(self._watch.failed)}" if reason is Reason.SERVICE_FAILED else ""
+                self._events.tell(now, reason, Severity.WARNING, text, values, always=always)
+
+    def _holder_name(self) -> str | None:
+        return None if self._holder is None else self._holder.request.source
+
+    def _action(self, now: int, reasons: tuple[Reason, ...]) -> DriveAction:
+        if self._mode is GateMode.ESTOPPED or self._emergency or not URGENT.isdisjoint(reasons):
+            return DriveAction.QUICK_STOP
+        if self._mode is GateMode.DISARMED:
+            # A motor that still turns (a drive that outlived its daemon) must not be left to coast.
+            return DriveAction.DISABLE if self._watch.at_rest(now) else DriveAction.QUICK_STOP
+        return DriveAction.RUN
+
+    def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:
+        state = {
+            GateMode.ESTOPPED: (Reason.ESTOPPED,),
+            GateMode.DISARMED: (Reason.DISARMED,),
+        }.get(self._mode, self._stop_reasons)
+        slow = sorted(limits, key=limits.__getitem__)
+        reasons = tuple(dict.fromkeys((*state, *blocks, *slow)))
+        moving_allowed = self._mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
+        motion, holder = self._motion, self._holder
+        wheel_speed = motion.wheel_speed
+        travelling = max(abs(self._watch.speed(now) or 0.0), abs(wheel_speed))
+        front_servo, rear_servo = self._linkage.servo_from_axles(motion.front, motion.rear)
+        return GateOutput(
+            action=self._action(now, reasons),
+            speed=wheel_speed,
+            motor_velocity=self._drivetrain.motor_rate(wheel_speed),
+            front=motion.front,
+            rear=motion.rear,
+            front_servo=front_servo,
+            rear_servo=rear_servo,
+            mode=self._mode,
+            holder=self._holder_name(),
+            role=None if holder is None else holder.request.role,
+            lease_left=None if holder is None else (holder.deadline - now) / SECOND,
+            last_seq=None if holder is None else holder.request.seq,
+            speed_limit=min(limits.values(), default=self._config.speed) if moving_allowed else 0.0,
+            reasons=reasons,
+            stopping_distance=travelling * self._config.reaction + travelling**2 / (2 * self._config.deceleration),
+            events=self._events.drain(),
+        )

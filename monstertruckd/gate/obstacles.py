@@ -1,0 +1,90 @@
+"""How fast the truck may go before it meets what the newest scan shows."""
+
+import math
+
+import numpy as np
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, first_contact, scan_points, swept_poses
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import LaserScan
+from monstertruckd.gate.config import GateConfig
+
+POSES = 20
+"""Poses checked along the swept way."""
+
+Arcs = tuple[tuple[float, float], ...]
+
+
+class ObstacleGuard:
+    """Swept footprint against the newest scan.
+
+    The scan's own age is covered by distance: the truck may have driven on since.
+
+    Args:
+        config: limits.
+        steering: the truck's geometry.
+        footprint: its outline.
+        lidar: pose (x, y, yaw) of the lidar in base.
+    """
+
+    def __init__(
+        self,
+        config: GateConfig,
+        steering: FourWheelSteering,
+        footprint: Footprint,
+        lidar: tuple[float, float, float],
+    ) -> None:
+        self._config = config
+        self._steering = steering
+        self._footprint = footprint
+        self._lidar = lidar
+        self._points = np.empty((0, 2))
+        self._stamp = 0
+        self._checked: tuple[float, Arcs] | None = None
+        self._free = math.inf
+        delay = config.scan.stale_after + config.max_latency + config.reaction
+        self._reach = config.obstacle.ahead + self._way(config.speed, delay, config.obstacle.deceleration)
+
+    def observe(self, scan: LaserScan) -> None:
+        """Take a scan."""
+        self._points = scan_points(scan, self._lidar)
+        self._stamp = scan.stamp
+        self._checked = None
+
+    def free_distance(self, direction: float, arcs: Arcs) -> float:
+        """Way the footprint can go from where the scan was taken, m; +inf if nothing is within reach.
+
+        Args:
+            direction: +1 forward, -1 backward.
+            arcs: (front, rear) axle angles, each checked; the shortest way counts.
+        """
+        if self._checked != (direction, arcs):
+            self._checked = (direction, arcs)
+            self._free = min(self._free_way(direction, front, rear) for front, rear in arcs)
+        return self._free
+
+    def _free_way(self, direction: float, front: float, rear: float) -> float:
+        distances = np.linspace(0.0, self._reach, POSES)
+        poses = swept_poses(self._steering, front, rear, direction * distances)
+        contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.beside)
+        return math.inf if contact is None else float(distances[contact - 1])
+
+    def allowed_speed(self, free: float, now: int) -> float:
+        """Speed from which the truck still stops comfortably within ``free`` metres, m/s."""
+        if math.isinf(free):
+            return math.inf
+        room = max(free - self._config.obstacle.ahead, 0.0)
+        delay, deceleration = self._delay(now), self._config.obstacle.deceleration
+        return deceleration * (math.sqrt(delay**2 + 2 * room / deceleration) - delay)
+
+    def too_near(self, free: float, speed: float, now: int) -> bool:
+        """Whether an ordinary stop from ``speed`` needs more than ``free`` metres."""
+        return free < self._way(abs(speed), self._delay(now), self._config.deceleration)
+
+    def _delay(self, now: int) -> float:
+        return max(now - self._stamp, 0) / SECOND + self._config.reaction
+
+    @staticmethod
+    def _way(speed: float, delay: float, deceleration: float) -> float:
+        return speed * delay + speed**2 / (2 * deceleration)

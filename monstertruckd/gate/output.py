@@ -1,0 +1,32 @@
+"""What one tick of the gate decides."""
+
+from dataclasses import dataclass
+
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.events import GateEvent
+
+
+@dataclass(frozen=True, slots=True)
+class GateOutput:
+    """Commands and state of one tick: the fields of DriveCommand, SteeringCommand and GateState, and the events."""
+
+    action: DriveAction
+    speed: float
+    """Wheel speed over ground, m/s."""
+    motor_velocity: float
+    front: float
+    rear: float
+    front_servo: float
+    rear_servo: float
+    mode: GateMode
+    holder: str | None
+    role: Role | None
+    lease_left: float | None
+    last_seq: int | None
+    speed_limit: float
+    reasons: tuple[Reason, ...]
+    stopping_distance: float
+    events: tuple[GateEvent, ...]

@@ -1,0 +1,234 @@
+"""The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule, and alone writes to the actuators."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import HealthTable
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest
+from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.gate.core import Gate
+from monstertruckd.gate.latch import Latch
+from monstertruckd.gate.meter import Lateness, TickMeter
+from monstertruckd.gate.output import GateOutput
+
+STATE_PERIOD: Final = SECOND // 10
+"""``state/gate`` goes out on every change and at least this often, ns."""
+
+LATCH_RETRY: Final = 1.0
+"""Seconds between two tries to store the latch."""
+
+
+@dataclass(frozen=True, slots=True)
+class GateInputs:
+    """What the gate reads. Requests come as FIFOs, sensors by their newest message."""
+
+    requests: tuple[Subscription[DriveRequest], ...]
+    """``req/drive`` and ``plan/drive``."""
+    orders: Subscription[ControlRequest]
+    scan: Subscription[LaserScan]
+    attitude: Subscription[Attitude]
+    drive: Subscription[DriveFeedback]
+    steering: Subscription[SteeringFeedback]
+    battery: Subscription[Battery]
+    health: Subscription[HealthTable]
+
+
+@dataclass(frozen=True, slots=True)
+class GateOutputs:
+    """What the gate writes; nobody else gets the first two."""
+
+    drive: Publisher[DriveCommand]
+    steering: Publisher[SteeringCommand]
+    state: Publisher[GateState]
+
+
+class GateService:
+    """Thin shell around ``Gate``.
+
+    Args:
+        gate: the state machine, built with ``latched=latch.engaged()``.
+        rate: ticks per second.
+        clock: time.
+        inputs: subscriptions.
+        outputs: publishers.
+        events: where events go.
+        latch: keeps the emergency stop over restarts.
+    """
+
+    name = "gate"
+
+    def __init__(
+        self,
+        gate: Gate,
+        rate: float,
+        clock: Clock,
+        inputs: GateInputs,
+        outputs: GateOutputs,
+        events: EventSink,
+        latch: Latch,
+    ) -> None:
+        self._gate = gate
+        self._period = round(SECOND / rate)
+        self._clock = clock
+        self._inputs = inputs
+        self._outputs = outputs
+        self._events = events
+        self._latch = latch
+        self._latched = latch.engaged()
+        self._latch_differs = asyncio.Event()
+        self._meter = TickMeter()
+        self._told: tuple[object, ...] = ()
+        self._told_at = 0
+        self._feeds: list[_Feed] = [
+            _Feed(inputs.scan, gate.observe_scan),
+            _Feed(inputs.attitude, gate.observe_attitude),
+            _Feed(inputs.drive, gate.observe_drive),
+            _Feed(inputs.steering, gate.observe_steering),
+            _Feed(inputs.battery, gate.observe_battery),
+            _Feed(inputs.health, gate.observe_health),
+        ]
+
+    def lateness(self) -> Lateness:
+        """Punctuality of the tick; its count advances with every tick, for the watchdog."""
+        return self._meter.lateness()
+
+    def control(self, order: ControlRequest) -> Reason:
+        """Carry out an order at once, for callers that want the answer; see ``Gate.control``."""
+        return self._gate.control(order, self._clock.now())
+
+    def shut_down(self) -> None:
+        """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
+        self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
+
+    async def run(self, ready: Ready) -> None:
+        """Tick until cancelled; the last commands are neutral, whatever ends it."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for requests in self._inputs.requests:
+                    group.create_task(self._take_requests(requests), name="gate requests")
+                group.create_task(self._take_orders(), name="gate orders")
+                group.create_task(self._keep_latch(), name="gate latch")
+                await self._tick_for_ever(ready)
+        finally:
+            self.shut_down()
+            self._store_latch()
+
+    async def _tick_for_ever(self, ready: Ready) -> None:
+        due = self._clock.now()
+        while True:
+            now = self._clock.now()
+            self._meter.record((now - due) / SECOND)
+            for feed in self._feeds:
+                feed.poll()
+            self._publish(self._gate.tick(now), now)
+            ready()
+            # Stays on the grid; ticks that were missed are not made up for.
+            due += self._period * max(1, -((due - self._clock.now()) // self._period))
+            await self._clock.sleep_until(due)
+
+    async def _take_requests(self, requests: Subscription[DriveRequest]) -> None:
+        while True:
+            self._gate.request(await requests.next(), self._clock.now())
+
+    async def _take_orders(self) -> None:
+        while True:
+            self._gate.control(await self._inputs.orders.next(), self._clock.now())
+
+    def _publish(self, output: GateOutput, now: int) -> None:
+        drive, steering = self._outputs.drive, self._outputs.steering
+        drive.put(
+            DriveCommand(
+                stamp=now,
+                received=now,
+                seq=drive.next_seq(),
+                action=output.action,
+                speed=output.speed,
+                motor_velocity=output.motor_velocity,
+            )
+        )
+        steering.put(
+            SteeringCommand(
+                stamp=now,
+                received=now,
+                seq=steering.next_seq(),
+                front=output.front,
+                rear=output.rear,
+                front_servo=output.front_servo,
+                rear_servo=output.rear_servo,
+            )
+        )
+        for event in output.events:
+            self._events(event.reason, event.severity, self.name, event.text, **event.values)
+        news = (output.mode, output.holder, output.reasons)
+        if news != self._told or now - self._told_at >= STATE_PERIOD:
+            self._told, self._told_at = news, now
+            self._outputs.state.put(self._state(output, now))
+        if (output.mode is GateMode.ESTOPPED) != self._latched:
+            self._latch_differs.set()
+
+    def _state(self, output: GateOutput, now: int) -> GateState:
+        return GateState(
+            stamp=now,
+            received=now,
+            seq=self._outputs.state.next_seq(),
+            mode=output.mode,
+            nonce=self._gate.nonce,
+            holder=output.holder,
+            role=output.role,
+            lease_left=output.lease_left,
+            last_seq=output.last_seq,
+            speed_limit=output.speed_limit,
+            reasons=output.reasons,
+            stopping_distance=output.stopping_distance,
+        )
+
+    async def _keep_latch(self) -> None:
+        """Store the latch in a thread: a disk's sync must not delay the stop itself."""
+        while True:
+            await self._latch_differs.wait()
+            self._latch_differs.clear()
+            wanted = self._gate.mode is GateMode.ESTOPPED
+            if wanted == self._latched:
+                continue
+            try:
+                await asyncio.to_thread(self._latch.store, wanted)
+            except OSError as error:
+                self._complain(error)
+                await self._clock.sleep(LATCH_RETRY)
+            else:
+                self._latched = wanted
+
+    def _store_latch(self) -> None:
+        wanted = self._gate.mode is GateMode.ESTOPPED
+        if wanted != self._latched:
+            try:
+                self._latch.store(wanted)
+            except OSError as error:
+                self._complain(error)
+
+    def _complain(self, error: OSError) -> None:
+        text = f"the emergency stop's latch could not be stored: {error}"
+        self._events(Reason.INTERNAL, Severity.ERROR, self.name, text)
+
+
+class _Feed:
+    """Hands each newest message of a subscription on once."""
+
+    def __init__(self, subscription: Subscription[Any], observe: Callable[[Any], None]) -> None:
+        self._subscription = subscription
+        self._observe = observe
+        self._seen: object = None
+
+    def poll(self) -> None:
+        message = self._subscription.latest
+        if message is not None and message is not self._seen:
+            self._seen = message
+            self._observe(message)

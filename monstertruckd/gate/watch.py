@@ -1,0 +1,188 @@
+"""What the sensors and services say about driving: things that stop the truck, and things that slow it down."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.ports import Value
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.health import HealthTable, ServiceState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import (
+    Attitude,
+    Battery,
+    BatteryLevel,
+    DriveFeedback,
+    DriveMode,
+    LaserScan,
+    SteeringFeedback,
+)
+from monstertruckd.gate.config import GateConfig, SensorLimit, TiltLimits
+
+MEASURED: Final = frozenset({BatteryLevel.NORMAL, BatteryLevel.LOW, BatteryLevel.CRITICAL})
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Verdict of one tick."""
+
+    blocks: tuple[Reason, ...]
+    """Reasons to stand still, worst first."""
+    limits: dict[Reason, float]
+    """Reasons to go slowly, with the speed each allows, m/s."""
+    values: dict[str, Value]
+    """Measurements behind the verdict, for the event."""
+
+
+class Watch:
+    """Newest good sample of every sensor, judged at each tick.
+
+    Args:
+        config: limits.
+        drivetrain: motor to wheel.
+    """
+
+    def __init__(self, config: GateConfig, drivetrain: DriveTrain) -> None:
+        self._config = config
+        self._drivetrain = drivetrain
+        self.scan: LaserScan | None = None
+        self.drive: DriveFeedback | None = None
+        self.steering: SteeringFeedback | None = None
+        self._attitude: Attitude | None = None
+        self._battery: Battery | None = None
+        self._failed: tuple[str, ...] = ()
+        self._tilt = _Tilt(config.tilt)
+
+    def observe_scan(self, scan: LaserScan) -> bool:
+        """Take a scan; False if it is not a good sample."""
+        if self._good(scan):
+            self.scan = scan
+        return self.scan is scan
+
+    def observe_drive(self, feedback: DriveFeedback) -> None:
+        """Take drive feedback."""
+        if self._good(feedback):
+            self.drive = feedback
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take steering feedback; what the servo controller does not vouch for is no good sample."""
+        if self._good(feedback) and feedback.trusted:
+            self.steering = feedback
+
+    def observe_attitude(self, attitude: Attitude) -> None:
+        """Take an attitude; without a valid tilt it is no good sample."""
+        if self._good(attitude) and attitude.tilt_valid:
+            self._attitude = attitude
+            self._tilt.update(math.acos(math.cos(attitude.roll) * math.cos(attitude.pitch)))
+
+    def observe_battery(self, battery: Battery) -> None:
+        """Take a battery reading; without a judged voltage it is no good sample."""
+        if self._good(battery) and battery.level in MEASURED:
+            self._battery = battery
+
+    def observe_health(self, table: HealthTable) -> None:
+        """Take the services' health."""
+        self._failed = tuple(
+            row.name
+            for row in table.services
+            if row.state is ServiceState.FAILED and row.name not in self._config.tolerated_failures
+        )
+
+    def _good(self, message: Message) -> bool:
+        return abs(message.received - message.stamp) <= self._config.max_latency * SECOND
+
+    @staticmethod
+    def _fresh(message: Message | None, limit: SensorLimit, now: int) -> bool:
+        return message is not None and now - message.received <= limit.stale_after * SECOND
+
+    def scan_fresh(self, now: int) -> bool:
+        """Whether the scan still counts."""
+        return self._fresh(self.scan, self._config.scan, now)
+
+    def steering_fresh(self, now: int) -> bool:
+        """Whether the steering feedback still counts."""
+        return self._fresh(self.steering, self._config.steering, now)
+
+    def speed(self, now: int) -> float | None:
+        """Measured speed of the wheels over ground, m/s; None without fresh feedback."""
+        if self.drive is None or not self._fresh(self.drive, self._config.drive, now):
+            return None
+        return self._drivetrain.speed(self.drive.velocity)
+
+    def at_rest(self, now: int, since: int = 0) -> bool:
+        """Whether the truck is known to stand still, by a sample not older than ``since``.
+
+        A truck without a critical drive counts as standing.
+        """
+        speed = self.speed(now)
+        if speed is None or self.drive is None:
+            return not self._config.drive.critical
+        return self.drive.stamp >= since and abs(speed) < self._config.standstill
+
+    def judge(self, now: int) -> Judgement:
+        """Verdict at ``now``."""
+        config = self._config
+        blocks: list[Reason] = []
+        limits: dict[Reason, float] = {}
+        values: dict[str, Value] = {}
+        if self.drive is not None and self.drive.mode is DriveMode.FAULT:
+            blocks.append(Reason.DRIVE_FAULT)
+            values["drive_fault_code"] = self.drive.fault_code
+        if self._failed:
+            blocks.append(Reason.SERVICE_FAILED)
+        for message, limit, reason in (
+            (self.drive, config.drive, Reason.DRIVE_STALE),
+            (self.steering, config.steering, Reason.STEERING_STALE),
+            (self.scan, config.scan, Reason.SCAN_STALE),
+            (self._attitude, config.attitude, Reason.ATTITUDE_STALE),
+            (self._battery, config.battery, Reason.BATTERY_STALE),
+        ):
+            if limit.critical and not self._fresh(message, limit, now):
+                blocks.append(reason)
+        if self._fresh(self._attitude, config.attitude, now):
+            values["tilt"] = self._tilt.angle
+            if self._tilt.stop:
+                blocks.append(Reason.TILT_STOP)
+            elif self._tilt.slow:
+                limits[Reason.TILT_SLOW] = config.tilt.slow_speed
+        self._judge_battery(now, blocks, limits, values)
+        return Judgement(tuple(blocks), limits, values)
+
+    def _judge_battery(
+        self, now: int, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
+    ) -> None:
+        battery = self._battery
+        if battery is None:
+            return
+        values["battery_voltage"] = battery.voltage
+        # A pack that was critical stays so when its sensor falls silent.
+        if battery.level is BatteryLevel.CRITICAL:
+            blocks.append(Reason.BATTERY_CRITICAL)
+        elif battery.level is BatteryLevel.LOW:
+            limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
+        if not self._config.battery.critical and not self._fresh(battery, self._config.battery, now):
+            limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of the services whose failure stops the truck."""
+        return self._failed
+
+
+class _Tilt:
+    """Tilt limits with hysteresis."""
+
+    def __init__(self, limits: TiltLimits) -> None:
+        self._limits = limits
+        self.angle = 0.0
+        self.slow = False
+        self.stop = False
+
+    def update(self, angle: float) -> None:
+        """Judge a tilt angle, rad."""
+        self.angle = angle
+        limits = self._limits
+        self.slow = angle >= limits.slow - (limits.hysteresis if self.slow else 0.0)
+        self.stop = angle >= limits.stop - (limits.hysteresis if self.stop else 0.0)

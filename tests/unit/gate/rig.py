@@ -1,0 +1,178 @@
+"""A truck around the gate: fresh sensors on request and a motor that obeys."""
+
+import math
+
+import numpy as np
+
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.sensor import (
+    Attitude,
+    Battery,
+    BatteryLevel,
+    DriveFeedback,
+    DriveMode,
+    LaserScan,
+    SteeringFeedback,
+)
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.core import Gate
+
+TICK = SECOND // 50
+NONCE = "run-1"
+SENSORS = ("scan", "attitude", "drive", "steering", "battery")
+DRIVETRAIN = DriveTrain()
+LINKAGE = SteeringPolynomials()
+STEERING = FourWheelSteering()
+
+
+def make_gate(latched=False, nonce=NONCE, **config):
+    return Gate(
+        GateConfig(**config),
+        steering=STEERING,
+        drivetrain=DRIVETRAIN,
+        linkage=LINKAGE,
+        footprint=Footprint(),
+        lidar=(0.14, 0.0, 0.0),
+        nonce=nonce,
+        latched=latched,
+    )
+
+
+def header(now, seq=0, **more):
+    return {"stamp": now, "received": now, "seq": seq, **more}
+
+
+def scan(now, *obstacles, **more):
+    """A scan of the plane around a lidar at (0.14, 0), with every beam that meets one of the points given in base."""
+    ranges = np.full(682, math.inf)
+    codes = np.zeros(682, dtype=np.uint8)
+    step = math.radians(240) / 681
+    for x, y in obstacles:
+        beam = round((math.atan2(y, x - 0.14) + math.radians(120)) / step)
+        ranges[beam], codes[beam] = min(ranges[beam], math.hypot(x - 0.14, y)), 255
+    return LaserScan(
+        **header(now),
+        frame="lidar",
+        start_angle=-math.radians(120),
+        end_angle=math.radians(120),
+        time_increment=0.0,
+        scan_time=0.1,
+        range_min=0.06,
+        range_max=4.0,
+        ranges=ranges,
+        codes=codes,
+        **more,
+    )
+
+
+def attitude(now, roll=0.0, pitch=0.0, tilt_valid=True):
+    return Attitude(**header(now), heading=0.0, roll=roll, pitch=pitch, tilt_valid=tilt_valid)
+
+
+def feedback(now, speed=0.0, mode=DriveMode.ENABLED, fault_code=None):
+    rate = DRIVETRAIN.motor_rate(speed)
+    return DriveFeedback(**header(now), position=0.0, velocity=rate, mode=mode, fault_code=fault_code)
+
+
+def servos(now, front=0.0, rear=0.0, trusted=True):
+    return SteeringFeedback(**header(now), front=front, rear=rear, trusted=trusted)
+
+
+def battery(now, level=BatteryLevel.NORMAL, voltage=23.0):
+    return Battery(**header(now), voltage=voltage, raw_voltage=23.0, cells=6, level=level)
+
+
+def health(now, state=ServiceState.READY, name="planner"):
+    return HealthTable(**header(now), services=(ServiceHealth(name=name, state=state, since=now),))
+
+
+class Rig:
+    """A gate, the time, and a truck whose speed follows the commands as the drive controller's profile does."""
+
+    def __init__(self, latched=False, **config):
+        self.gate = make_gate(latched, **config)
+        self.config = GateConfig(**config)
+        self.now = SECOND
+        self.speed = 0.0
+        self.silent = set()
+        self.obstacles = ()
+        self.tilt = 0.0
+        self.level = BatteryLevel.NORMAL
+        self.fault = False
+        self.out = None
+        self.events = []
+        self.travelled = 0.0
+        self.driver = None
+        self._seq = 0
+
+    def seq(self):
+        self._seq += 1
+        return self._seq
+
+    def drive(self, speed=0.2, front=0.0, rear=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, **more):
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, **more}
+        return self.gate.request(
+            DriveRequest(source=source, role=role, lease=lease, speed=speed, front=front, rear=rear, **fields), self.now
+        )
+
+    def order(self, order, source="ann", role=Role.GAMEPAD, **more):
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, **more}
+        return self.gate.control(ControlRequest(source=source, role=role, lease=1.0, order=order, **fields), self.now)
+
+    def sense(self):
+        """Every sensor that is not silent delivers now."""
+        mode = DriveMode.FAULT if self.fault else DriveMode.ENABLED
+        samples = {
+            "scan": lambda: self.gate.observe_scan(scan(self.now, *self.obstacles)),
+            "attitude": lambda: self.gate.observe_attitude(attitude(self.now, roll=self.tilt)),
+            "drive": lambda: self.gate.observe_drive(feedback(self.now, self.speed, mode)),
+            "steering": lambda: self.gate.observe_steering(servos(self.now)),
+            "battery": lambda: self.gate.observe_battery(battery(self.now, self.level)),
+        }
+        for name, send in samples.items():
+            if name not in self.silent:
+                send()
+
+    def tick(self, count=1, sense=True):
+        """Advance by whole ticks; ``self.driver`` (keywords of ``drive``) asks at each of them."""
+        for _ in range(count):
+            self.now += TICK
+            if sense:
+                self.sense()
+            if self.driver is not None:
+                self.drive(**self.driver)
+            self.out = self.gate.tick(self.now)
+            self.events += self.out.events
+            self._obey()
+        return self.out
+
+    def _obey(self):
+        quick = self.out.action is DriveAction.QUICK_STOP
+        target = self.out.speed if self.out.action is DriveAction.RUN else 0.0
+        step = (self.config.quick_deceleration if quick else self.config.deceleration) * 0.02
+        self.speed += min(max(target - self.speed, -step), step)
+        self.travelled += abs(self.speed) * 0.02
+
+    def armed(self):
+        self.tick(2)
+        assert self.order(Order.ARM) == "ok"
+        self.tick()
+        assert self.out.mode is GateMode.ARMED
+        return self
+
+    def driving(self, ticks=40, **driver):
+        """Armed and driven by ``driver`` until at speed."""
+        self.armed()
+        self.driver = driver
+        self.tick(ticks)
+        assert self.out.mode is GateMode.DRIVING
+        return self
+
+    def told(self, reason):
+        return [event for event in self.events if event.reason is reason]

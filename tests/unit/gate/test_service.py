@@ -1,0 +1,348 @@
+import asyncio
+from collections import deque
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.latch import EstopLatch, MemoryLatch
+from monstertruckd.gate.meter import TickMeter
+from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from tests.unit.gate.rig import NONCE, attitude, battery, feedback, header, health, make_gate, scan, servos
+
+
+class Inbox:
+    """Both deliveries at once: newest message and a FIFO."""
+
+    def __init__(self):
+        self.latest = None
+        self.drops = 0
+        self._queue = asyncio.Queue()
+
+    def send(self, message):
+        self.latest = message
+        self._queue.put_nowait(message)
+
+    async def next(self):
+        return await self._queue.get()
+
+
+class Outbox:
+    def __init__(self):
+        self.messages = deque()
+
+    def next_seq(self):
+        return len(self.messages)
+
+    def put(self, message):
+        self.messages.append(message)
+
+    @property
+    def last(self):
+        return self.messages[-1]
+
+
+class Bench:
+    """A gate service with every sensor alive."""
+
+    def __init__(self, clock, latch=None):
+        self.clock = clock
+        self.latch = latch or MemoryLatch()
+        self.requests, self.wishes = Inbox(), Inbox()
+        self.orders, self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (
+            Inbox() for _ in range(7)
+        )
+        self.out = GateOutputs(Outbox(), Outbox(), Outbox())
+        self.events = []
+        self.readies = 0
+        inputs = GateInputs(
+            (self.requests, self.wishes),
+            self.orders,
+            self.scan,
+            self.attitude,
+            self.drive,
+            self.steering,
+            self.battery,
+            self.health,
+        )
+        gate = make_gate(self.latch.engaged())
+        self.service = GateService(gate, 50, clock, inputs, self.out, self.note, self.latch)
+
+    def note(self, reason, severity, source, text="", **values):
+        self.events.append((reason, source, text, values))
+
+    def ready(self):
+        self.readies += 1
+
+    async def sense(self):
+        while True:
+            now = self.clock.now()
+            self.scan.send(scan(now))
+            self.attitude.send(attitude(now))
+            self.drive.send(feedback(now))
+            self.steering.send(servos(now))
+            self.battery.send(battery(now))
+            self.health.send(health(now))
+            await self.clock.sleep(0.05)
+
+    def order(self, order):
+        now = self.clock.now()
+        self.orders.send(
+            ControlRequest(
+                **header(now, len(self.events) + now),
+                source="ann",
+                role=Role.STATION,
+                lease=1,
+                nonce=NONCE,
+                order=order,
+            )
+        )
+
+    def wish(self, inbox, role):
+        now = self.clock.now()
+        inbox.send(
+            DriveRequest(**header(now, now), source=role.value, role=role, lease=1, nonce=NONCE, speed=0.1, front=0.1)
+        )
+
+    @asynccontextmanager
+    async def running(self):
+        tasks = [asyncio.create_task(self.service.run(self.ready)), asyncio.create_task(self.sense())]
+        await self.clock.sleep(0.1)
+        yield
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def on_bench(scenario, latch=None):
+    async def main(clock):
+        bench = Bench(clock, latch)
+        async with bench.running():
+            await scenario(bench)
+        return bench
+
+    return run_virtual(main)
+
+
+def test_ticks_stay_on_an_absolute_grid():
+    async def scenario(bench):
+        await bench.clock.sleep(1.0)
+
+    bench = on_bench(scenario)
+    stamps = np.array([message.stamp for message in bench.out.drive.messages])[:-1]  # the last one is the farewell
+    assert len(stamps) == pytest.approx(56, abs=1)
+    assert np.abs((stamps - stamps[0]) - np.arange(len(stamps)) * SECOND // 50).max() < 1000  # ns: no drift
+    assert [m.seq for m in bench.out.drive.messages] == list(range(len(bench.out.drive.messages)))
+    assert len(bench.out.steering.messages) == len(bench.out.drive.messages)
+    assert bench.readies == len(stamps)
+    lateness = bench.service.lateness()
+    assert lateness.ticks == len(stamps)
+    assert 0 <= lateness.p50 <= lateness.p99 <= lateness.max < 1e-5
+
+
+def test_a_stall_skips_ticks_but_keeps_the_grid():
+    async def scenario(bench):
+        await bench.clock.sleep(0.1)
+        asyncio.get_running_loop().jump(0.105)  # the loop was busy elsewhere
+        await bench.clock.sleep(0.2)
+
+    bench = on_bench(scenario)
+    stamps = np.array([message.stamp for message in bench.out.drive.messages])[:-1]
+    assert np.diff(stamps).max() > 0.09 * SECOND
+    offsets = (stamps - stamps[0]) % (SECOND // 50)
+    late = np.minimum(offsets, SECOND // 50 - offsets) > 1000
+    assert late.sum() == 1  # only the one that woke up late
+    assert bench.service.lateness().max > 0.08
+
+
+def test_requests_of_both_kinds_reach_the_gate():
+    async def scenario(bench):
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.05)
+        assert bench.out.state.last.mode is GateMode.ARMED
+        bench.wish(bench.wishes, Role.TRACKER)
+        await bench.clock.sleep(0.05)
+        assert bench.out.state.last.holder == "tracker"
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.05)
+        assert bench.out.state.last.holder == "gamepad"
+        assert bench.out.drive.last.speed > 0
+        assert bench.out.drive.last.action is DriveAction.RUN
+        assert bench.out.steering.last.front > 0
+        assert bench.out.steering.last.front_servo > bench.out.steering.last.front
+
+    bench = on_bench(scenario)
+    assert [reason for reason, *_ in bench.events][:3] == [Reason.ARMED, Reason.DRIVING, Reason.DRIVING]
+    assert bench.events[0][1] == "gate"
+
+
+def test_state_goes_out_on_change_and_ten_times_a_second():
+    async def scenario(bench):
+        await bench.clock.sleep(0.9)
+        quiet = len(bench.out.state.messages)
+        assert quiet == pytest.approx(10, abs=2)
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.03)
+        assert len(bench.out.state.messages) > quiet
+        assert bench.out.state.last.nonce == NONCE
+
+    on_bench(scenario)
+
+
+def test_a_direct_order_is_answered():
+    async def scenario(bench):
+        now = bench.clock.now()
+        order = ControlRequest(**header(now), source="rpc", role=Role.TRACKER, lease=1.0, nonce=NONCE, order=Order.ARM)
+        assert bench.service.control(order) is Reason.BAD_ROLE
+
+    on_bench(scenario)
+
+
+def test_the_last_commands_are_neutral():
+    async def scenario(bench):
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.05)
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.1)
+        assert bench.out.drive.last.speed > 0
+
+    bench = on_bench(scenario)
+    assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+    assert bench.out.drive.last.speed == 0
+    assert Reason.SHUTDOWN in bench.out.state.last.reasons
+
+
+def test_shutting_down_stops_at_once_and_for_good():
+    async def scenario(bench):
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.05)
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.05)
+        bench.service.shut_down()
+        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.2)
+        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+
+    on_bench(scenario)
+
+
+def test_a_bug_ends_the_service_with_neutral_commands():
+    async def main(clock):
+        bench = Bench(clock)
+        bench.scan.latest = "not a scan"
+        with pytest.raises(ExceptionGroup):
+            await bench.service.run(bench.ready)
+        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+
+    run_virtual(main)
+
+
+# Latch
+
+
+def test_an_emergency_stop_survives_a_restart(tmp_path):
+    latch = EstopLatch(tmp_path / "state" / "estop")
+
+    async def stop(bench):
+        bench.order(Order.ESTOP)
+        await asyncio.sleep(0.05)
+        for _ in range(1000):
+            if latch.engaged():
+                break
+            await asyncio.to_thread(lambda: None)
+        assert latch.engaged()
+
+    on_bench(stop, latch)
+
+    async def restarted(bench):
+        assert bench.out.state.last.mode is GateMode.ESTOPPED
+        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        bench.order(Order.RESET)
+        await asyncio.sleep(0.05)
+
+    on_bench(restarted, EstopLatch(tmp_path / "state" / "estop"))
+    assert not latch.engaged()
+
+    async def released(bench):
+        assert bench.out.state.last.mode is GateMode.DISARMED
+
+    on_bench(released, latch)
+
+
+class BrokenLatch(MemoryLatch):
+    def store(self, engaged):
+        raise OSError(28, "no space left")
+
+
+def test_a_latch_that_cannot_be_stored_is_told_and_tried_again():
+    async def scenario(bench):
+        bench.order(Order.ESTOP)
+        await asyncio.sleep(0.05)
+        while not bench.events[1:]:
+            await asyncio.sleep(0.02)
+        assert bench.out.state.last.mode is GateMode.ESTOPPED
+        await asyncio.sleep(1.5)
+
+    bench = on_bench(scenario, BrokenLatch())
+    complaints = [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
+    assert len(complaints) >= 2  # retried, and once more at the end
+    assert "no space left" in complaints[0]
+
+
+def test_the_latch_is_stored_even_if_the_service_ends_in_the_same_instant():
+    latch = MemoryLatch()
+
+    async def scenario(bench):
+        bench.order(Order.ESTOP)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+
+    on_bench(scenario, latch)
+    assert latch.engaged()
+
+
+def test_after_quick_changes_of_mind_the_last_one_is_stored():
+    latch = MemoryLatch()
+
+    async def scenario(bench):
+        for _ in range(3):
+            bench.order(Order.ESTOP)
+            await bench.clock.sleep(0.021)
+            bench.order(Order.RESET)
+            await bench.clock.sleep(0.021)
+
+    on_bench(scenario, latch)
+    assert not latch.engaged()
+
+
+def test_the_latch_file_is_synced_and_leaves_no_draft(tmp_path):
+    latch = EstopLatch(tmp_path / "a" / "estop")
+    assert not latch.engaged()
+    latch.store(False)  # nothing there yet
+    latch.store(True)
+    assert latch.engaged()
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["estop"]
+    latch.store(False)
+    assert not latch.engaged()
+    (tmp_path / "a" / "estop").touch()
+    assert latch.engaged()  # an empty file stops, too
+
+
+def test_an_unreadable_latch_counts_as_engaged(tmp_path):
+    (tmp_path / "file").touch()
+    assert EstopLatch(tmp_path / "file" / "estop").engaged()  # not a directory
+
+
+def test_meter_forgets_percentiles_but_not_the_maximum():
+    meter = TickMeter(kept=4)
+    assert meter.lateness().ticks == 0
+    for lateness in (9.0, 1.0, 2.0, 3.0, 4.0):
+        meter.record(lateness)
+    found = meter.lateness()
+    assert (found.ticks, found.p50, found.max) == (5, 2.5, 9.0)

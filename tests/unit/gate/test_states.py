@@ -1,0 +1,363 @@
+import math
+from itertools import pairwise
+
+import pytest
+
+from monstertruck_kinematics.truck import AxlePolynomials, SteeringPolynomials
+from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order, Role
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.core import Gate
+from tests.unit.gate.rig import DRIVETRAIN, STEERING, TICK, Rig
+
+
+def seconds(ticks):
+    return ticks * TICK / SECOND
+
+
+def test_starts_disarmed_and_powerless():
+    out = Rig().tick()
+    assert out.mode is GateMode.DISARMED
+    assert out.action is DriveAction.DISABLE
+    assert (out.speed, out.front, out.rear, out.speed_limit) == (0, 0, 0, 0)
+    assert out.reasons == (Reason.DISARMED,)
+
+
+def test_arm_drive_and_let_go():
+    rig = Rig().armed()
+    assert rig.out.action is DriveAction.RUN
+    assert rig.out.speed == 0
+    rig.driver = {"speed": 0.2}
+    rig.tick(40)
+    assert rig.out.mode is GateMode.DRIVING
+    assert (rig.out.holder, rig.out.role) == ("ann", Role.GAMEPAD)
+    assert rig.out.speed == pytest.approx(0.2)
+    assert rig.out.motor_velocity == pytest.approx(DRIVETRAIN.motor_rate(0.2))
+    assert rig.out.lease_left == pytest.approx(0.25)
+    assert rig.out.last_seq == rig._seq
+    assert rig.out.stopping_distance == pytest.approx(0.2 * 0.08 + 0.04 / 2.4)
+    assert [e.reason for e in rig.events] == [Reason.ARMED, Reason.DRIVING]
+
+
+def test_a_lapsed_lease_stops_within_300_ms_and_stands_within_300_more():
+    rig = Rig().driving()
+    rig.driver = None
+    ticks = 0
+    while rig.out.mode is GateMode.DRIVING:
+        rig.tick()
+        ticks += 1
+    assert seconds(ticks) <= 0.3
+    assert (rig.out.action, rig.out.speed) == (DriveAction.RUN, 0.0)
+    assert rig.out.mode is GateMode.STOPPING
+    assert rig.out.reasons == (Reason.LEASE_EXPIRED,)
+    assert rig.out.speed_limit == 0
+    assert rig.told(Reason.LEASE_EXPIRED)
+    ticks = 0
+    while rig.out.mode is GateMode.STOPPING:
+        rig.tick()
+        ticks += 1
+    assert seconds(ticks) <= 0.3
+    assert rig.out.mode is GateMode.ARMED
+    assert rig.told(Reason.STOPPED)
+
+
+def test_nobody_for_a_while_disarms():
+    rig = Rig().driving()
+    rig.driver = None
+    rig.tick(round(1.4 / 0.02))
+    assert rig.out.mode is GateMode.ARMED
+    rig.tick(round(0.4 / 0.02))
+    assert rig.out.mode is GateMode.DISARMED
+    assert rig.out.action is DriveAction.DISABLE
+    assert "1.5 s" in rig.told(Reason.DISARMED)[0].text
+
+
+def test_armed_but_never_driven_disarms():
+    rig = Rig().armed()
+    rig.tick(76)
+    assert rig.out.mode is GateMode.DISARMED
+
+
+def test_a_request_while_stopping_waits_for_standstill():
+    rig = Rig().driving()
+    rig.driver = None
+    while rig.out.mode is not GateMode.STOPPING:
+        rig.tick()
+    rig.driver = {"speed": 0.2}
+    rig.tick()
+    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    while rig.out.mode is GateMode.STOPPING:
+        assert rig.out.speed == 0.0
+        rig.tick()
+    rig.tick()
+    assert rig.out.mode is GateMode.DRIVING
+
+
+def test_standstill_needs_a_sample_from_after_the_stop():
+    rig = Rig().driving(speed=0.0)
+    rig.silent = {"drive"}
+    rig.driver = None
+    while rig.out.mode is GateMode.DRIVING:
+        rig.tick()
+    rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    rig.silent = set()
+    rig.tick()
+    assert rig.out.mode is GateMode.ARMED
+
+
+def test_motion_limits_hold_on_the_way_up_and_down():
+    rig = Rig().armed()
+    rig.driver = {"speed": 0.21, "front": 0.3, "rear": -0.15}
+    speeds, fronts = [0.0], [0.0]
+    for _ in range(40):
+        rig.tick()
+        speeds.append(rig.gate._motion.speed)
+        fronts.append(rig.out.front)
+        assert rig.out.rear == pytest.approx(-rig.out.front / 2)
+    assert max(b - a for a, b in pairwise(speeds)) == pytest.approx(0.5 * 0.02)
+    assert max(b - a for a, b in pairwise(fronts)) == pytest.approx(1.0 * 0.02)
+    rig.driver = {"speed": -0.1, "front": 0.3, "rear": -0.15}
+    before = rig.gate._motion.speed
+    rig.tick()
+    assert before - rig.gate._motion.speed == pytest.approx(1.2 * 0.02)
+    passed = [rig.gate._motion.speed for _ in range(30) if rig.tick()]
+    assert 0.0 in passed  # never straight through zero
+    assert passed[-1] == pytest.approx(-0.1)
+
+
+def test_clipping_keeps_the_curvature():
+    rig = Rig().driving(speed=0.5, front=0.6, rear=-0.1, ticks=80)
+    assert STEERING.curvature(rig.out.front, rig.out.rear) == pytest.approx(STEERING.curvature(0.6, -0.1))
+    assert max(abs(rig.out.front), abs(rig.out.rear)) <= 0.436 + 1e-12
+    assert rig.out.speed == pytest.approx(0.21)  # of the wheels
+    assert Reason.CLIPPED in rig.out.reasons
+    assert len(rig.told(Reason.CLIPPED)) == 1
+    rig.driver = {"speed": 0.1, "front": 9.0, "rear": -9.0}
+    rig.tick(40)
+    assert (rig.out.front, rig.out.rear) == pytest.approx((0.436, -0.436))
+
+
+def test_crab_goes_as_fast_as_straight_and_a_curve_as_fast_as_the_wheels_may():
+    assert Rig().driving(speed=0.21, front=0.3, rear=0.3).out.speed == pytest.approx(0.21)
+    rig = Rig().driving(speed=0.21, front=0.4, rear=-0.4, ticks=80)
+    assert rig.out.speed == pytest.approx(0.21)
+    assert rig.gate._motion.speed < 0.2
+
+
+def test_reversing_has_its_own_limit():
+    assert Rig().driving(speed=-0.2, ticks=60).out.speed == pytest.approx(-0.15)
+
+
+def test_servo_angles_belong_to_the_axle_angles():
+    rig = Rig().driving(front=0.2, rear=-0.1)
+    axles = SteeringPolynomials().axles_from_servo(rig.out.front_servo, rig.out.rear_servo)
+    assert axles == pytest.approx((0.2, -0.1))
+
+
+# Orders
+
+
+def test_estop_latches_whoever_asks():
+    rig = Rig().driving()
+    assert rig.order(Order.ESTOP, source="cy", role=Role.TRACKER, nonce="wrong") == Reason.OK
+    rig.tick()
+    assert rig.out.mode is GateMode.ESTOPPED
+    assert rig.out.action is DriveAction.QUICK_STOP
+    assert rig.out.reasons[0] is Reason.ESTOPPED
+    assert rig.told(Reason.ESTOP_REQUESTED)[0].values == {"role": "tracker", "by": "cy"}
+    assert rig.told(Reason.ESTOP_REQUESTED)[0].severity is Severity.ERROR
+    rig.tick(100)
+    assert rig.out.mode is GateMode.ESTOPPED
+    assert rig.out.action is DriveAction.QUICK_STOP
+    assert rig.drive() is Reason.ESTOPPED
+    rig.driver = None
+    assert rig.order(Order.ARM) is Reason.ESTOPPED
+    rig.order(Order.ESTOP)
+    rig.tick()
+    assert len(rig.told(Reason.ESTOP_REQUESTED)) == 1
+
+
+def test_estop_is_cleared_by_reset_with_neutral_stick_then_arm():
+    rig = Rig(latched=True)
+    rig.driver = {"speed": 0.1}
+    rig.tick(5)
+    assert rig.out.mode is GateMode.ESTOPPED
+    assert rig.order(Order.RESET) is Reason.NOT_ARMED_SPEED  # stick
+    rig.driver = {"speed": 0.0}
+    rig.speed = 0.1
+    rig.tick()
+    assert rig.order(Order.RESET) is Reason.NOT_ARMED_SPEED  # rolling
+    rig.tick(20)
+    assert rig.order(Order.RESET, role=Role.TRACKER) is Reason.BAD_ROLE
+    assert rig.order(Order.RESET, role=Role.ESTOP) is Reason.BAD_ROLE
+    assert rig.order(Order.RESET) is Reason.OK
+    rig.tick()
+    assert rig.out.mode is GateMode.DISARMED
+    assert "reset by ann" in rig.told(Reason.DISARMED)[0].text
+    assert rig.order(Order.ARM) is Reason.OK
+    assert rig.order(Order.RESET) is Reason.OK  # nothing to reset
+    rig.tick()
+    assert rig.out.mode in (GateMode.ARMED, GateMode.DRIVING)
+
+
+def test_arming_is_refused_while_moving_pushed_or_blocked():
+    rig = Rig()
+    rig.tick()
+    assert rig.order(Order.ARM, role=Role.TRACKER) is Reason.BAD_ROLE
+    rig.speed = 0.1
+    rig.tick()
+    assert rig.order(Order.ARM) is Reason.NOT_ARMED_SPEED
+    rig.tick(10)
+    rig.drive(speed=0.1)
+    assert rig.order(Order.ARM, source="bob") is Reason.NOT_ARMED_SPEED
+    rig.tick(15)  # the stick's lease is over
+    rig.silent = {"scan"}
+    rig.tick(15)
+    assert rig.order(Order.ARM) is Reason.SCAN_STALE
+    rig.silent = set()
+    rig.tick()
+    assert rig.order(Order.ARM) is Reason.OK
+    assert [e.values["request"] for e in rig.told(Reason.NOT_ARMED_SPEED)] == ["arm", "arm"]
+
+
+def test_a_waiting_tracker_does_not_hinder_arming():
+    rig = Rig()
+    rig.driver = {"speed": 0.2, "source": "track", "role": Role.TRACKER}
+    rig.tick(5)
+    assert rig.drive(**rig.driver) is Reason.DISARMED
+    assert rig.order(Order.ARM, role=Role.STATION) is Reason.OK
+    rig.tick(2)
+    assert rig.out.mode is GateMode.DRIVING
+
+
+def test_disarm_stops_first():
+    rig = Rig().driving()
+    assert rig.order(Order.DISARM) is Reason.OK
+    rig.tick()
+    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    rig.order(Order.DISARM)  # again while stopping
+    rig.tick(20)
+    assert rig.out.mode is GateMode.DISARMED
+    rig.order(Order.DISARM)  # nothing to do
+    rig.driver = None
+    rig.tick(20)
+    rig.armed()
+    rig.order(Order.DISARM)
+    rig.tick()
+    assert rig.out.mode is GateMode.DISARMED
+    assert rig.told(Reason.DISARMED)
+
+
+def test_arming_twice_is_no_harm():
+    rig = Rig().armed()
+    assert rig.order(Order.ARM) is Reason.OK
+    rig.tick()
+    assert len(rig.told(Reason.ARMED)) == 1
+
+
+def test_arming_while_stopping_is_refused():
+    rig = Rig().driving()
+    rig.order(Order.STOP)
+    rig.driver = None
+    rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    assert rig.order(Order.ARM) is Reason.NOT_ARMED_SPEED
+
+
+# Shutdown and the process's own trouble
+
+
+def test_shutdown_is_a_quick_stop_for_good():
+    rig = Rig().driving()
+    out = rig.gate.neutral(rig.now)
+    assert (out.action, out.speed, out.motor_velocity) == (DriveAction.QUICK_STOP, 0.0, 0.0)
+    assert out.mode is GateMode.DISARMED
+    assert Reason.SHUTDOWN in out.reasons
+    assert out.events[-1].reason is Reason.DISARMED
+    rig.driver = None
+    rig.tick(20)
+    assert rig.out.action is DriveAction.QUICK_STOP
+    assert rig.order(Order.ARM) is Reason.SHUTDOWN
+
+
+def test_shutdown_keeps_an_emergency_stop():
+    rig = Rig(latched=True)
+    assert rig.gate.neutral(rig.now).mode is GateMode.ESTOPPED
+
+
+def test_a_stalled_tick_stops_quickly_and_recovers():
+    rig = Rig().driving()
+    rig.now += round(0.2 * SECOND)
+    rig.tick()
+    assert (rig.out.mode, rig.out.action) == (GateMode.STOPPING, DriveAction.QUICK_STOP)
+    assert rig.told(Reason.TICK_STALLED)
+    rig.tick(24)
+    assert rig.out.mode is GateMode.ARMED
+    rig.tick(3)
+    assert rig.out.mode is GateMode.DRIVING
+
+
+def test_a_drive_that_outlived_the_daemon_is_stopped_while_disarmed():
+    rig = Rig()
+    rig.speed = 0.2
+    rig.tick()
+    assert rig.out.action is DriveAction.QUICK_STOP
+    rig.tick(10)
+    assert rig.out.action is DriveAction.DISABLE
+
+
+def test_a_truck_without_a_drive_counts_as_standing():
+    rig = Rig(drive={"stale_after": 0.2, "critical": False})
+    rig.silent = {"drive"}
+    rig.tick()
+    assert rig.out.action is DriveAction.DISABLE
+    assert rig.order(Order.ARM) is Reason.OK
+
+
+def test_equal_events_are_counted_not_repeated():
+    rig = Rig()
+    rig.driver = {"speed": 0.1}
+    rig.tick(120)
+    refusals = rig.told(Reason.DISARMED)
+    assert len(refusals) == 3
+    assert refusals[1].values["repeated"] == 49
+    assert refusals[0].values == {"role": "gamepad", "request": "drive", "by": "ann"}
+
+
+def test_the_linkage_must_reach_the_limit():
+    short = AxlePolynomials((0.5, 0.0), (1.0, 0.0))
+    with pytest.raises(ConfigError, match=r"gate\.angle .* 0\.3927 rad"):
+        Gate(
+            GateConfig(),
+            steering=STEERING,
+            drivetrain=DRIVETRAIN,
+            linkage=SteeringPolynomials(short, short),
+            footprint=Footprint(),
+            lidar=(0.14, 0.0, 0.0),
+            nonce="n",
+        )
+
+
+@pytest.mark.parametrize(
+    ("bad", "hint"),
+    [
+        ({"quick_deceleration": 1.0}, "quick_deceleration"),
+        ({"tick_stall": 0.01}, "tick_stall"),
+        ({"standstill": 0.3}, "standstill"),
+        ({"disarm_after": 0.2}, "disarm_after"),
+        ({"tilt": {"slow": 0.4, "stop": 0.3}}, "slow < stop"),
+        ({"tilt": {"slow": 0.02}}, "hysteresis"),
+        ({"angle": math.nan}, "angle"),
+        ({"leases": {"tracker": 3.0}}, "tracker"),
+    ],
+)
+def test_contradictory_configs_are_refused(bad, hint):
+    with pytest.raises(ValueError, match=hint):
+        GateConfig.model_validate(bad)
