@@ -118,10 +118,11 @@ def _copy(reader: LogReader, output: BinaryIO, stop: threading.Event | None) -> 
         if stop is not None and stop.is_set():
             msg = f"{reader.path}: repair abandoned"
             raise InputError(msg)
-        if isinstance(record, Header):
-            writer.start(record.profile, record.library)
+        if not started:
+            header = record if isinstance(record, Header) else Header("", "")
+            writer.start(header.profile, header.library)
             started = True
-        elif isinstance(record, Schema) and record.id not in schemas:
+        if isinstance(record, Schema) and record.id not in schemas:
             schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
         elif isinstance(record, Channel) and record.id not in channels:
             schema = schemas.get(record.schema_id, 0)

@@ -64,14 +64,14 @@ class LogWriter:
         self._file.add(entry)
 
     def tick(self, now: int) -> None:
-        """Close the chunk and sync the file if they are due at log time ``now``."""
+        """Close the chunk, sync the file and keep the quota if that is due at log time ``now``."""
         since = self._file.open_since
         if since is not None and now - since >= self._config.chunk_seconds * SECOND:
             self._file.flush()
-            self._keep_quota()
         if now - self._synced >= self._config.fsync_seconds * SECOND:
             self._file.sync()
             self._synced = now
+            self._keep_quota()
 
     def _open(self, start: int) -> LogFile:
         while True:
