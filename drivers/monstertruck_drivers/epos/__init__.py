@@ -1,0 +1,1 @@
+"""maxon EPOS 24/1 motor controller (first generation) over RS232."""

@@ -1,0 +1,395 @@
+"""Drive service: the EPOS 24/1 in profile velocity mode behind ``cmd/drive`` and ``sensor/drive``.
+
+Everything goes through one schedule of exchanges; before each of them the newest command is looked at, so a stop
+waits for at most the exchange in flight. What the controller should do and where its statusword says it is are
+compared every cycle, and one controlword brings it a step closer: enabling, stopping, running again after a quick
+stop and coming back from a fault are one and the same loop.
+
+The controller keeps its last speed when the host goes silent. So the first bytes of every session are a quick stop,
+and the last ones are a quick stop and power stage off.
+"""
+
+import math
+from contextlib import suppress
+
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, ObjectError
+from monstertruck_drivers.epos.identity import read_identity
+from monstertruck_drivers.epos.objects import Entry
+from monstertruck_drivers.epos.policy import RAD_S_PER_RPM, Odometer, Wanted, drive_mode, settled, sign, wanted
+from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
+from monstertruck_drivers.link import Port
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import (
+    DeviceError,
+    DeviceFaultError,
+    DeviceLostError,
+    DeviceMismatchError,
+    DeviceTimeoutError,
+    ProtocolError,
+    WrongDeviceError,
+)
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.service import RestartPolicy
+from monstertruck_schemas.cmd import DriveCommand
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import DriveFeedback
+
+RESTART_POLICY = RestartPolicy(max_delay=0.5)
+"""Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
+
+HANDSHAKE_ATTEMPTS = 2
+FAILURE_LIMIT = 3
+"""Failed exchanges in a row that end the session."""
+SAFE_DEADLINE = 0.3
+"""Seconds a session may take to leave the motor stopped and disabled."""
+DISABLE_TIME = 0.04
+"""Seconds of ``SAFE_DEADLINE`` kept for the last exchange."""
+REENABLE_LIMIT = 0.3
+"""Seconds after which running again from a quick stop goes the long way, through power stage off."""
+GOAL_LIMIT = 2.0
+"""Seconds after which the operator is told that the controller does not do as it is told."""
+
+
+class EposDriver:
+    """Service of the drive controller; supervise it with ``RESTART_POLICY``.
+
+    Args:
+        config: see ``EposConfig``.
+        port: where the controller hangs.
+        clock: time.
+        commands: ``cmd/drive``; read by this driver alone.
+        out: ``sensor/drive``, ``stamp`` in the middle of the exchange that read the position.
+        events: gets the identity of the controller, and faults.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: EposConfig,
+        port: Port,
+        clock: Clock,
+        commands: Subscription[DriveCommand],
+        out: Publisher[DriveFeedback],
+        events: EventSink,
+        name: str = "drive",
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.clock = clock
+        self.commands = commands
+        self.out = out
+        self.events = events
+        self.odometer = Odometer()
+        self.resets: list[int] = []
+        """Instants of the fault resets of the last ``fault_reset_window``."""
+        self.reported_fault: int | None = None
+        """Fault the operator was told about and that is still there."""
+        self._port = port
+        self._quiet_until = 0
+
+    async def run(self, ready: Ready) -> None:
+        """One session, from the stop of a motor that may still turn to the stop at its end.
+
+        Raises:
+            DeviceLostError: nothing plugged in; the link went down; the controller restarted.
+            PortBusyError: another process holds the port.
+            WrongDeviceError: something else answers.
+            DeviceMismatchError: motor or encoder data contradict the configuration.
+            DeviceFaultError: a fault that resets do not clear.
+            DeviceTimeoutError, ProtocolError: no usable answers.
+        """
+        async with await self._port.open() as link:
+            line = Exchanger(link, self.clock, self.config.node, self._quiet_until)
+            session = _Session(self, line)
+            try:
+                await session.start()
+                await session.serve(ready)
+            finally:
+                try:
+                    if not link.is_lost:
+                        await session.make_safe()
+                finally:
+                    self._quiet_until = line.quiet_until
+                    await line.close()
+
+
+class _Session:
+    """One connection: what was sent and what the controller last said."""
+
+    def __init__(self, driver: EposDriver, line: Exchanger) -> None:
+        self._driver = driver
+        self._config = driver.config
+        self._clock = driver.clock
+        self._line = line
+        self._sign = sign(driver.config)
+        self._counts_per_turn = 1
+        self._state = State.UNKNOWN
+        self._sent_rpm: int | None = None
+        """Target in the controller; None = not known."""
+        self._rpm = 0
+        self._current: float | None = None
+        self._fault: int | None = None
+        self._stopping = False
+        """The quick stop that is wanted now was sent."""
+        self._prepared = False
+        """Mode and profile are those configured."""
+        self._commands_after = self._clock.now()
+        """Older commands do not count."""
+        self._goal = State.UNKNOWN
+        self._goal_since = 0
+        self._told_late = False
+        self._status_due = 0
+        self._current_due = 0
+        self._reset_due = 0
+
+    # Begin and end
+
+    async def start(self) -> None:
+        """Stop whatever moves, then find out who answers."""
+        await self._stop_first()
+        await self._line.write(od.TARGET_VELOCITY, 0, ATTEMPTS)
+        self._sent_rpm = 0
+        identity = await read_identity(self._line)
+        identity.check(self._config)
+        self._counts_per_turn = identity.counts_per_turn(self._config)
+        self._state = state_of(await self._line.read(od.STATUSWORD, ATTEMPTS))
+        if self._state not in POWERED:
+            self._driver.odometer.restart()
+        await self._prepare()
+        self._tell(
+            Reason.DEVICE_READY, Severity.INFO, f"EPOS, software 0x{identity.software:04X}", **identity.as_values()
+        )
+
+    async def _stop_first(self) -> None:
+        try:
+            await self._line.write(od.CONTROLWORD, Control.QUICK_STOP, HANDSHAKE_ATTEMPTS)
+        except ObjectError as error:
+            if error.code == od.WRONG_NODE:
+                raise DeviceMismatchError(f"{error}, configured {self._config.node}") from error
+            if error.code != od.WRONG_STATE:
+                raise WrongDeviceError(f"no EPOS 24/1: {error}") from error
+        except (DeviceTimeoutError, ProtocolError) as error:
+            if self._line.strange and not self._line.acknowledged:
+                raise WrongDeviceError(f"no EPOS, sends {self._line.strange[:20]!r}: {error}") from error
+            raise
+
+    async def make_safe(self) -> None:
+        """Brake, and switch the power stage off once the motor rests; gives up after ``SAFE_DEADLINE``."""
+        end = self._clock.now() + int(SAFE_DEADLINE * SECOND)
+        with suppress(DeviceError, TimeoutError):
+            async with self._clock.deadline(SAFE_DEADLINE):
+                await self._line.finish()
+                if self._line.quiet_until > end:
+                    return
+                await self._control(Control.QUICK_STOP)
+                while abs(await self._line.read(od.VELOCITY_AVERAGED)) > self._config.standstill_rpm:
+                    if self._clock.now() > end - int(DISABLE_TIME * SECOND):
+                        return  # a power stage switched off would let it roll
+                await self._control(Control.DISABLE_VOLTAGE)
+
+    # The schedule
+
+    async def serve(self, ready: Ready) -> None:
+        """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
+        tick, failures, told_ready = self._clock.now(), 0, False
+        while True:
+            try:
+                await self._cycle()
+                if not told_ready and self._state not in FAULTED:
+                    told_ready = True
+                    ready()
+                tick = max(tick + int(SECOND / self._config.rate), self._clock.now())
+                await self._idle(tick)
+            except (DeviceTimeoutError, ProtocolError):
+                failures += 1
+                if failures >= FAILURE_LIMIT:
+                    raise
+                self._sent_rpm = None  # whether the last write arrived is not known
+                self._stopping = False
+                self._prepared = False  # it may have restarted
+                await self._line.settle()
+            else:
+                failures = 0
+
+    async def _cycle(self) -> None:
+        await self._act(also_faster=True)
+        self._rpm = await self._read(od.VELOCITY_AVERAGED)
+        raw = await self._read(od.POSITION)
+        self._publish(raw, (self._line.began + self._line.ended) // 2)
+        now = self._clock.now()
+        if now >= self._status_due or not settled(self._state, self._want().goal):
+            self._status_due = now + int(self._config.status_period * SECOND)
+            await self._look()
+            await self._step(self._want().goal)
+        elif now >= self._current_due:
+            self._current_due = now + int(self._config.current_period * SECOND)
+            self._current = await self._read(od.CURRENT) / 1000 * self._sign
+
+    async def _idle(self, until: int) -> None:
+        """Wait for the next cycle; a command to stop is obeyed at once."""
+        while (left := until - self._clock.now()) > 0:
+            try:
+                async with self._clock.deadline(left / SECOND):
+                    await self._driver.commands.next()
+            except TimeoutError:
+                return
+            await self._act()
+
+    async def _read(self, entry: Entry) -> int:
+        await self._act()
+        return await self._line.read(entry)
+
+    def _publish(self, raw: int, stamp: int) -> None:
+        fastest = self._config.max_motor_rpm / 60 * self._counts_per_turn
+        counts = self._driver.odometer.update(raw, stamp, fastest)
+        self._driver.out.put(
+            DriveFeedback(
+                stamp=stamp,
+                received=self._clock.now(),
+                seq=self._driver.out.next_seq(),
+                position=self._sign * counts / self._counts_per_turn * 2 * math.pi,
+                velocity=self._sign * self._rpm * RAD_S_PER_RPM,
+                current=self._current,
+                mode=drive_mode(self._state),
+                fault_code=self._fault,
+            )
+        )
+        self._current = None
+
+    # What to do
+
+    def _want(self) -> Wanted:
+        """What the newest valid command asks for now; a moving motor is braked before it is switched off."""
+        command = self._driver.commands.latest
+        if command is not None and command.stamp < self._commands_after:
+            command = None
+        want = wanted(command, self._clock.now(), self._config)
+        moving = self._state in POWERED and abs(self._rpm) > self._config.standstill_rpm
+        return Wanted(State.QUICK_STOP) if want.goal is State.SWITCH_ON_DISABLED and moving else want
+
+    async def _act(self, *, also_faster: bool = False) -> None:
+        """Send what must not wait: a quick stop, a slower target; at the start of a cycle a faster one too."""
+        want = self._want()
+        if want.goal is not State.QUICK_STOP:
+            self._stopping = False
+        elif not self._stopping:
+            await self._control(Control.QUICK_STOP)
+            self._stopping = True
+            self._status_due = 0
+            if self._state in POWERED:
+                self._state = State.QUICK_STOP
+        rpm = want.rpm if self._state is State.ENABLED else 0
+        if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
+            self._sent_rpm = None
+            await self._line.write(od.TARGET_VELOCITY, rpm)
+            self._sent_rpm = rpm
+
+    async def _look(self) -> None:
+        """Read the power state and judge its changes."""
+        was, self._state = self._state, state_of(await self._read(od.STATUSWORD))
+        if self._state in OFF and was not in OFF:
+            self._prepared = False
+        if was is State.ENABLED and self._state in OFF:
+            raise DeviceLostError("the controller restarted")
+        if self._state in FAULTED:
+            await self._attend_fault()
+        elif self._fault is not None:
+            self._tell(Reason.DEVICE_READY, Severity.INFO, f"fault {od.fault_text(self._fault)} is gone")
+            self._fault = None
+            self._commands_after = self._clock.now()
+        if self._state not in FAULTED:
+            self._driver.reported_fault = None
+
+    async def _step(self, goal: State) -> None:
+        """One controlword towards ``goal``."""
+        now = self._clock.now()
+        if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
+            self._goal, self._goal_since, self._told_late = goal, now, False
+        late = (now - self._goal_since) / SECOND
+        if late > GOAL_LIMIT and not self._told_late:
+            self._told_late = True
+            text = f"controller stays in {self._state.name}, wanted {goal.name}"
+            self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
+        control = next_control(self._state, goal)
+        if control is Control.SHUTDOWN:
+            await self._prepare()
+        at_rest = abs(self._rpm) <= self._config.standstill_rpm
+        if self._state is State.QUICK_STOP and control is Control.ENABLE and late > REENABLE_LIMIT and at_rest:
+            control = Control.DISABLE_VOLTAGE
+        if control is not None:
+            await self._control(control)
+
+    async def _control(self, control: Control) -> None:
+        try:
+            await self._line.write(od.CONTROLWORD, control)
+        except ObjectError as error:
+            if error.code != od.WRONG_STATE:  # the statusword will tell
+                raise
+
+    async def _prepare(self) -> None:
+        """Mode, limits and ramps; a controller that was off has forgotten them.
+
+        Raises:
+            ProtocolError: the mode is not taken.
+        """
+        if self._prepared:
+            return
+        await self._line.write(od.MODE, od.PROFILE_VELOCITY, ATTEMPTS)
+        mode = await self._line.read(od.MODE_DISPLAY, ATTEMPTS)
+        if mode != od.PROFILE_VELOCITY:
+            raise ProtocolError(f"mode {mode} instead of {od.PROFILE_VELOCITY} (profile velocity)")
+        for entry, value in (
+            (od.TARGET_VELOCITY, 0),
+            (od.MAX_VELOCITY, self._config.max_motor_rpm),
+            (od.ACCELERATION, self._config.acceleration_rpm_s),
+            (od.DECELERATION, self._config.deceleration_rpm_s),
+            (od.QUICK_STOP_DECELERATION, self._config.quick_stop_deceleration_rpm_s),
+        ):
+            await self._line.write(entry, value, ATTEMPTS)
+        self._sent_rpm = 0
+        self._prepared = True
+
+    # Faults
+
+    async def _attend_fault(self) -> None:
+        now = self._clock.now()
+        if self._fault is None:
+            history = await self._history()
+            self._fault = history[0] if history else 0
+            self._reset_due = now + int(self._config.fault_reset_pause * SECOND)
+            if self._fault != self._driver.reported_fault:
+                self._driver.reported_fault = self._fault
+                text = "history, newest first: " + ", ".join(map(od.fault_text, history))
+                self._tell(Reason.DRIVE_FAULT, Severity.ERROR, text, code=self._fault)
+        elif self._state is State.FAULT and now >= self._reset_due:
+            await self._reset_fault(now, self._fault)
+
+    async def _history(self) -> list[int]:
+        count = min(await self._read(od.ERROR_COUNT), od.HISTORY_SIZE)
+        return [await self._read(entry) & 0xFFFF for entry in od.ERROR_HISTORY[:count]]
+
+    async def _reset_fault(self, now: int, code: int) -> None:
+        """One reset, by an edge of the reset bit.
+
+        Raises:
+            DeviceFaultError: too many of late.
+        """
+        window = int(self._config.fault_reset_window * SECOND)
+        recent = [instant for instant in self._driver.resets if now - instant < window]
+        if len(recent) >= self._config.fault_resets:
+            raise DeviceFaultError(f"fault {od.fault_text(code)} stays after {len(recent)} resets")
+        self._driver.resets = [*recent, now]
+        self._reset_due = now + int(self._config.fault_reset_pause * SECOND)
+        await self._control(Control.DISABLE_VOLTAGE)
+        await self._control(Control.FAULT_RESET)
+
+    def _tell(self, reason: Reason, severity: Severity, text: str, **values: int | None) -> None:
+        self._driver.events(reason, severity, self._driver.name, text, **values)
+
+
+def _slower(rpm: int, sent: int | None) -> bool:
+    """Whether a target brakes the motor compared with the one it has."""
+    return sent is None or abs(rpm) < abs(sent) or rpm * sent < 0

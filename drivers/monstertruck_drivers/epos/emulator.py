@@ -1,0 +1,317 @@
+"""The EPOS 24/1 as seen from the cable, byte for byte, with faults on request.
+
+Keeps its last speed when the host goes silent: nothing on RS232 watches the host.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+
+from monstertruck_drivers.base import MotorPlant
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
+from monstertruck_drivers.epos.protocol import (
+    ANSWER,
+    FRAME_TIMEOUT,
+    MAX_WORDS,
+    READY,
+    REFUSED,
+    Frame,
+    FrameError,
+    NmtCommand,
+    Opcode,
+    Segment,
+    State,
+    answer,
+    body_size,
+    decode_body,
+    join,
+    split,
+)
+from monstertruck_drivers.link import DeviceEnd
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+TURN_AROUND = 0.001
+"""Seconds from the last byte received to the first one sent; most of it is the host's USB converter."""
+BOOT_TIME = 0.4
+WATCH_PERIOD = 0.05
+"""Seconds between looks at the supply while no host asks anything."""
+SEGMENT_BYTES = 4
+STRAY = 0xA5
+FOR_EVER = 1 << 62
+
+FAULT_NAMES = {
+    "over_current": od.OVER_CURRENT,
+    "over_voltage": od.OVER_VOLTAGE,
+    "under_voltage": od.UNDER_VOLTAGE,
+    "encoder": od.POSITION_SENSOR,
+    "following": od.FOLLOWING_ERROR,
+}
+
+
+class EposEmulator:
+    """Emulated controller; set ``end.baud = 38400`` for exchanges as long as real ones.
+
+    Args:
+        clock: time.
+        motor: shaft and load; None = a free motor of its own.
+        seed: of delays and noise.
+        name: in messages.
+        node: node id it answers to (besides 0).
+    """
+
+    def __init__(
+        self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, name: str = "epos", node: int = 1
+    ) -> None:
+        self.name = name
+        self.firmware = Firmware(clock.now, motor or FreeMotor(), np.random.default_rng(seed))
+        self.received: deque[tuple[int, bytes]] = deque(maxlen=4096)
+        """Newest bytes from the host, with their instants."""
+        self.frames: deque[tuple[int, Frame]] = deque(maxlen=1024)
+        """Newest frames accepted from the host."""
+        self.repeat_refused = False
+        """An answer the host refuses is sent again (it is not documented whether the real one does)."""
+        self._clock = clock
+        self._node = node
+        self._inbox = bytearray()
+        self._power = True
+        self._powered: asyncio.Timeout | None = None
+        self._booted_at = 0
+        self._silent = False
+        self._counts = dict.fromkeys(("busy", "refuse", "delay", "flip", "stray"), 0)
+        self._delay = 0.0
+        self._long: tuple[bytes, bool] = (b"", False)
+        self._faults: dict[str, tuple[str, Callable[..., None]]] = {
+            "fault": ("CODE|NAME [passing]", self._inject_fault),
+            "clear": ("", self._inject_clear),
+            "power": ("on|off", lambda word: self._switch_power(_flag(word))),
+            "busy": ("COUNT", lambda n="1": self._count("busy", n)),
+            "refuse": ("COUNT", lambda n="1": self._count("refuse", n)),
+            "delay": ("MILLISECONDS [COUNT]", self._inject_delay),
+            "flip": ("COUNT", lambda n="1": self._count("flip", n)),
+            "stray": ("COUNT", lambda n="1": self._count("stray", n)),
+            "silent": ("on|off", self._inject_silent),
+            "line": ("on|off", lambda word: self.set_quick_stop_input(_flag(word))),
+            "supply_limit": ("VOLTS", self._inject_supply_limit),
+            "strict": ("on|off", self._inject_strict),
+            "repeat": ("on|off", self._inject_repeat),
+        }
+
+    # Faults and switches
+
+    def power_cycle(self) -> None:
+        """Supply off and on: comes back switch-on disabled, with target 0 and stored settings."""
+        self._switch_power(False)
+        self._switch_power(True)
+
+    def set_quick_stop_input(self, active: bool) -> None:
+        """The hardware deadman line on a digital input: while active the controller stops by itself."""
+        self.firmware.set_quick_stop_input(active)
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a device fault.
+
+        ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing. ``busy``,
+        ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit, bytes
+        before acknowledges. ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
+        ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again): ``on|off``.
+        ``supply_limit VOLTS``: over-voltage above that.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        usage, act = self._faults.get(fault, ("", None))
+        if act is None:
+            raise InputError(f"{self.name}: unknown fault {fault!r}; known: {', '.join(self._faults)}")
+        try:
+            act(*values)
+        except (LookupError, ValueError, TypeError) as error:
+            raise InputError(f"{self.name}: expected '{fault} {usage}', got {' '.join((fault, *values))!r}") from error
+
+    def _count(self, what: str, count: str) -> None:
+        self._counts[what] = int(count)
+
+    def _inject_fault(self, name: str, *passing: str) -> None:
+        code = FAULT_NAMES[name] if name in FAULT_NAMES else int(name, 16)
+        if passing not in ((), ("passing",)):
+            raise ValueError(passing)
+        if not passing:
+            self.firmware.causes.add(code)
+        if self._power:
+            self.firmware.advance()
+            self.firmware.fail(code)
+
+    def _inject_clear(self) -> None:
+        self.firmware.causes.clear()
+
+    def _inject_delay(self, milliseconds: str, count: str | None = None) -> None:
+        self._delay = float(milliseconds) / 1000
+        self._counts["delay"] = FOR_EVER if count is None else int(count)
+
+    def _inject_silent(self, word: str) -> None:
+        self._silent = _flag(word)
+
+    def _inject_supply_limit(self, volts: str) -> None:
+        self.firmware.over_voltage_above = float(volts)
+
+    def _inject_strict(self, word: str) -> None:
+        self.firmware.strict_transitions = _flag(word)
+
+    def _inject_repeat(self, word: str) -> None:
+        self.repeat_refused = _flag(word)
+
+    def _switch_power(self, on: bool) -> None:
+        if self._power and not on:
+            self.firmware.shut_down()
+        elif on and not self._power:
+            self.firmware.boot()
+            self._booted_at = self._clock.now() + int(BOOT_TIME * SECOND)
+        self._power = on
+        if self._powered is not None and not self._powered.expired():  # whatever exchange is under way ends here
+            self._powered.reschedule(0)
+
+    def _due(self, what: str) -> bool:
+        """Use up one of the counted faults."""
+        if self._counts[what] <= 0:
+            return False
+        self._counts[what] -= 1
+        return True
+
+    # The line
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve for ever."""
+        watch = asyncio.create_task(self._watch())
+        try:
+            while True:
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(None) as self._powered:
+                        await self._serve(end)
+        finally:
+            self._powered = None
+            watch.cancel()
+            with suppress(asyncio.CancelledError):
+                await watch
+
+    async def _watch(self) -> None:
+        """A controller lives without being asked: supply faults stop the motor."""
+        while True:
+            await self._clock.sleep(WATCH_PERIOD)
+            if self._power:
+                self.firmware.advance()
+
+    async def _serve(self, end: DeviceEnd) -> None:
+        self._inbox.clear()
+        while True:
+            opcode = (await self._take(end, 1))[0]
+            with suppress(TimeoutError):  # a half frame is dropped without a word
+                await self._exchange(end, opcode)
+
+    async def _exchange(self, end: DeviceEnd, opcode: int) -> None:
+        if self._due("busy"):
+            await self._send(end, bytes((REFUSED,)))
+            return
+        await self._acknowledge(end)
+        head = await self._within(end, 1)
+        body = head + await self._within(end, body_size(head[0]))
+        try:
+            request = decode_body(opcode, body)
+        except FrameError:
+            request = None
+        if request is None or len(request.words) > MAX_WORDS or self._due("refuse"):
+            await self._send(end, bytes((REFUSED,)))
+            return
+        self.frames.append((self._clock.now(), request))
+        if opcode == Opcode.NMT:
+            await self._acknowledge(end)
+            self._network(request)
+            return
+        reply = self._execute(request)
+        await self._acknowledge(end)
+        await self._reply(end, reply)
+
+    async def _reply(self, end: DeviceEnd, reply: Frame) -> None:
+        if self._due("delay"):
+            await self._clock.sleep(self._delay)
+        end.write(bytes((ANSWER,)))
+        if (await self._within(end, 1))[0] != READY:
+            return
+        body = reply.body
+        if self._due("flip"):
+            body = body[:-3] + bytes((body[-3] ^ 0x10,)) + body[-2:]
+        await self._send(end, body)
+        if (await self._within(end, 1))[0] == REFUSED and self.repeat_refused:
+            await self._send(end, reply.body)
+            await self._within(end, 1)
+
+    async def _acknowledge(self, end: DeviceEnd) -> None:
+        if self._due("stray"):
+            end.write(bytes((STRAY,)))
+        await self._send(end, bytes((READY,)))
+
+    async def _send(self, end: DeviceEnd, data: bytes) -> None:
+        await self._clock.sleep(TURN_AROUND)
+        end.write(data)
+
+    async def _within(self, end: DeviceEnd, count: int) -> bytes:
+        """Bytes of a frame; a pause of ``FRAME_TIMEOUT`` raises ``TimeoutError``."""
+        return await self._take(end, count, FRAME_TIMEOUT)
+
+    async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
+        while len(self._inbox) < count:
+            async with asyncio.timeout(pause):
+                data = await end.read()
+            if self._power and not self._silent and self._clock.now() >= self._booted_at:
+                self.received.append((self._clock.now(), data))
+                self._inbox += data
+        taken = bytes(self._inbox[:count])
+        del self._inbox[:count]
+        return taken
+
+    # Services
+
+    def _execute(self, request: Frame) -> Frame:
+        try:
+            match request.opcode, request.words:
+                case Opcode.READ, (index, address):
+                    return answer(0, *split(self.firmware.read(index, self._sub(address))))
+                case Opcode.WRITE, (index, address, low, high):
+                    self.firmware.write(index, self._sub(address), join(low, high))
+                    return answer()
+                case Opcode.INITIATE_SEGMENTED_READ, (index, address):
+                    self._long = self.firmware.read_long(index, self._sub(address)), False
+                    return answer()
+                case Opcode.SEGMENTED_READ, (control,):
+                    return answer(0, *self._segment(bool(control & 0x40)).words)
+        except AccessRefusedError as error:
+            return answer(error.code)
+        return answer(od.ILLEGAL_COMMAND)
+
+    def _sub(self, address: int) -> int:
+        if address >> 8 not in (0, self._node):
+            raise AccessRefusedError(od.WRONG_NODE)
+        return address & 0xFF
+
+    def _segment(self, toggle: bool) -> Segment:
+        data, expected = self._long
+        if toggle is not expected:
+            raise AccessRefusedError(od.TOGGLE_ERROR)
+        self._long = data[SEGMENT_BYTES:], not toggle
+        return Segment(data[:SEGMENT_BYTES], toggle, len(data) > SEGMENT_BYTES)
+
+    def _network(self, request: Frame) -> None:
+        if request.words in ((0, NmtCommand.RESET_NODE), (self._node, NmtCommand.RESET_NODE)):
+            self.power_cycle()
+
+    @property
+    def state(self) -> State:
+        """Power state as of the newest look."""
+        return self.firmware.state
+
+
+def _flag(word: str) -> bool:
+    return {"on": True, "off": False}[word]

@@ -1,0 +1,290 @@
+"""The byte handshake of the EPOS over a link: one exchange at a time, with its time-outs and recovery."""
+
+import asyncio
+from contextlib import suppress
+
+from monstertruck_drivers.epos.objects import Entry, abort_text
+from monstertruck_drivers.epos.protocol import (
+    ANSWER,
+    READY,
+    REFUSED,
+    Frame,
+    FrameError,
+    NmtCommand,
+    Opcode,
+    body_size,
+    decode_body,
+    decode_segment,
+    error_of,
+    join,
+    nmt_request,
+    read_request,
+    segment_request,
+    segmented_read_request,
+    write_request,
+)
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
+
+ACKNOWLEDGE_TIMEOUT = 0.1
+ANSWER_TIMEOUT = 0.25
+QUIET = 0.55
+"""Seconds of silence after which the controller has surely dropped a half frame."""
+QUIET_LIMIT = 1.1
+"""Seconds after which a line that never falls silent is used anyway: it is not an EPOS."""
+BUSY_PAUSE = 0.01
+BUSY_RETRIES = 3
+REST_OF_FRAME = 0.005
+"""Seconds in which the rest of a damaged answer has come in."""
+REPEAT_WAIT = 0.03
+"""Seconds in which a controller that repeats a refused answer has begun to do so."""
+SEGMENT_LIMIT = 16
+STRAY_LIMIT = 3
+"""Unknown bytes skipped before an acknowledge."""
+ATTEMPTS = 3
+"""Of an exchange outside the schedule."""
+
+_ANSWER_LENGTHS: dict[int, frozenset[int]] = {Opcode.READ: frozenset((1, 3)), Opcode.WRITE: frozenset((1,))}
+
+
+class ObjectError(ProtocolError):
+    """The controller answered with a communication error.
+
+    Args:
+        subject: what was asked for.
+        code: 32-bit error code.
+    """
+
+    def __init__(self, subject: str, code: int) -> None:
+        super().__init__(f"{subject}: {abort_text(code)}")
+        self.code = code
+
+
+class Exchanger:
+    """Object access over one link.
+
+    An exchange that has begun is finished even if its caller is cancelled, so that the next frame (a stop,
+    most likely) finds a controller that listens; ``finish`` waits for that.
+
+    Args:
+        link: open link to the controller.
+        clock: time.
+        node: node id.
+        quiet_until: instant before which nothing may be sent, left by an earlier link.
+    """
+
+    def __init__(self, link: Link, clock: Clock, node: int, quiet_until: int = 0) -> None:
+        self._link = link
+        self._clock = clock
+        self._node = node
+        self._flight: asyncio.Task[Frame | None] | None = None
+        self.quiet_until = quiet_until
+        """Instant from which the controller listens again; in the past while all is well."""
+        self.strange = b""
+        """Newest bytes that did not belong where they came."""
+        self.acknowledged = False
+        """True once something answered as an EPOS does."""
+        self.began = 0
+        """Instant of the first byte of the newest exchange."""
+        self.ended = 0
+        """Instant of the last byte of the newest complete exchange."""
+
+    async def read(self, entry: Entry, attempts: int = 1) -> int:
+        """Value of an object.
+
+        Raises:
+            ObjectError: the controller refuses.
+            DeviceTimeoutError, ProtocolError: no usable answer in ``attempts`` tries.
+            DeviceLostError: the link is down.
+        """
+        words = (await self._answer(read_request(entry, self._node), str(entry), attempts)).words
+        if len(words) != 4:
+            raise ProtocolError(f"{self._link.name}: {entry}: answer of {len(words)} words")
+        return entry.decode(join(words[2], words[3]))
+
+    async def write(self, entry: Entry, value: int, attempts: int = 1) -> None:
+        """Set an object.
+
+        Raises:
+            ValueError: ``value`` does not fit the object.
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+        """
+        await self._answer(write_request(entry, value, self._node), f"{entry} = {value}", attempts)
+
+    async def read_long(self, entry: Entry) -> bytes:
+        """Raw bytes of an object of more than 32 bits, by segments.
+
+        Raises:
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+        """
+        await self._answer(segmented_read_request(entry, self._node), str(entry), 1)
+        data, toggle = b"", False
+        for _ in range(SEGMENT_LIMIT):
+            answer = await self._answer(segment_request(toggle), str(entry), 1)
+            try:
+                segment = decode_segment(answer.words[2:])
+            except FrameError as error:
+                raise ProtocolError(f"{self._link.name}: {entry}: {error}") from error
+            data += segment.data
+            if not segment.more:
+                return data
+            toggle = not toggle
+        raise ProtocolError(f"{self._link.name}: {entry}: more than {SEGMENT_LIMIT} segments")
+
+    async def network(self, command: NmtCommand) -> None:
+        """Send a network management command, which has no answer.
+
+        Raises:
+            DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+        """
+        await self._transact(nmt_request(command, self._node), answered=False)
+
+    async def finish(self) -> None:
+        """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
+        flight, self._flight = self._flight, None
+        if flight is not None:
+            with suppress(DeviceTimeoutError, ProtocolError, DeviceLostError):
+                await flight
+
+    async def close(self) -> None:
+        """Give up an exchange that is still under way."""
+        if self._flight is not None:
+            self._flight.cancel()
+            with suppress(asyncio.CancelledError):
+                await self.finish()
+
+    async def _answer(self, request: Frame, subject: str, attempts: int) -> Frame:
+        for left in reversed(range(attempts)):
+            try:
+                frame = await self._transact(request)
+            except (DeviceTimeoutError, ProtocolError):
+                if not left:
+                    raise
+            else:
+                assert frame is not None
+                if code := error_of(frame):
+                    raise ObjectError(f"{self._link.name}: {subject}", code)
+                return frame
+        raise ValueError("at least one attempt")
+
+    async def _transact(self, request: Frame, *, answered: bool = True) -> Frame | None:
+        await self.finish()
+        await self.settle()
+        self._flight = asyncio.create_task(self._run(request, answered))
+        frame = await asyncio.shield(self._flight)
+        self._flight = None
+        return frame
+
+    async def settle(self) -> None:
+        """Let the controller forget a half frame: silence on the line, from both sides.
+
+        Raises:
+            DeviceLostError: the link went down.
+        """
+        limit = self._clock.now() + int(QUIET_LIMIT * SECOND)
+        while (left := min(self.quiet_until, limit) - self._clock.now()) > 0:
+            with suppress(TimeoutError):
+                async with self._clock.deadline(left / SECOND):
+                    self.strange = await self._link.read()
+                    self.quiet_until = self._quiet()
+        self._link.discard()
+
+    def _quiet(self) -> int:
+        return self._clock.now() + int(QUIET * SECOND)
+
+    async def _run(self, request: Frame, answered: bool) -> Frame | None:
+        """One exchange; whatever goes wrong in its middle is followed by silence."""
+        self.began = self._clock.now()
+        try:
+            frame = await self._converse(request, answered)
+        except _BusyError as error:
+            raise DeviceTimeoutError(str(error)) from None
+        except BaseException:
+            self.quiet_until = self._quiet()
+            raise
+        self.ended = self._clock.now()
+        return frame
+
+    async def _converse(self, request: Frame, answered: bool) -> Frame | None:
+        for _ in range(2):
+            await self._send(request)
+            if not answered:
+                return None
+            frame = await self._receive(_ANSWER_LENGTHS.get(request.opcode))
+            if frame is not None:
+                return frame
+        raise ProtocolError(f"{self._link.name}: answer damaged twice")
+
+    async def _send(self, request: Frame) -> None:
+        for _ in range(2):
+            await self._ask(request)
+            self._link.write(request.body)
+            if await self._acknowledge() == READY:
+                return
+        raise ProtocolError(f"{self._link.name}: frame refused twice")
+
+    async def _ask(self, request: Frame) -> None:
+        for attempt in range(1 + BUSY_RETRIES):
+            if attempt:
+                await self._clock.sleep(BUSY_PAUSE)
+            self._link.write(request.head)
+            if await self._acknowledge() == READY:
+                return
+        raise _BusyError(f"{self._link.name}: controller stays busy")
+
+    async def _acknowledge(self) -> int:
+        skipped = b""
+        while len(skipped) <= STRAY_LIMIT:
+            byte = await self._exactly(1, ACKNOWLEDGE_TIMEOUT)
+            if byte[0] in (READY, REFUSED):
+                self.acknowledged = True
+                return byte[0]
+            self.strange = skipped = skipped + byte
+        raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an acknowledge")
+
+    async def _receive(self, lengths: frozenset[int] | None) -> Frame | None:
+        """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
+        byte = await self._exactly(1, ANSWER_TIMEOUT)
+        if byte[0] != ANSWER:
+            self.strange = byte
+            raise ProtocolError(f"{self._link.name}: {byte.hex()} instead of an answer")
+        self._link.write(bytes((READY,)))
+        frame: Frame | None
+        try:
+            frame = await self._frame(lengths)
+        except FrameError:
+            frame = await self._repeated(lengths)
+        if frame is not None:
+            self._link.write(bytes((READY,)))
+        return frame
+
+    async def _repeated(self, lengths: frozenset[int] | None) -> Frame | None:
+        """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
+        await self._clock.sleep(REST_OF_FRAME)
+        self._link.discard()
+        self._link.write(bytes((REFUSED,)))
+        try:
+            async with self._clock.deadline(REPEAT_WAIT):
+                return await self._frame(lengths)
+        except TimeoutError:
+            return None
+        except FrameError as error:
+            raise ProtocolError(f"{self._link.name}: repeated answer is damaged too: {error}") from error
+
+    async def _frame(self, lengths: frozenset[int] | None) -> Frame:
+        head = await self._exactly(1, ACKNOWLEDGE_TIMEOUT)
+        if lengths is not None and head[0] not in lengths:
+            raise FrameError(f"length byte {head[0]}")
+        return decode_body(ANSWER, head + await self._exactly(body_size(head[0]), ACKNOWLEDGE_TIMEOUT))
+
+    async def _exactly(self, count: int, timeout: float) -> bytes:
+        try:
+            async with self._clock.deadline(timeout):
+                return await self._link.exactly(count)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
+
+
+class _BusyError(Exception):
+    """The controller refused the opcode again and again; nothing is half sent."""

@@ -1,0 +1,366 @@
+"""Inside of the emulated EPOS: objects, power states, velocity profile, faults. Knows no bytes."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from monstertruck_drivers.base import MotorPlant, MotorReading
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.objects import OBJECTS, Entry
+from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State
+from monstertruck_runtime.clock import SECOND
+
+DEFAULTS: dict[Entry, int] = {
+    od.NODE_ID: 1,
+    od.RS232_RATE: 3,
+    od.SOFTWARE_VERSION: 0x2024,
+    od.HARDWARE_VERSION: 0x4320,
+    od.RS232_TIMEOUT: 500,
+    od.INPUT_MASK: od.QUICK_STOP_INPUT,
+    od.INPUT_EXECUTION: od.QUICK_STOP_INPUT,
+    od.ENCODER_PULSES: 500,
+    od.SENSOR_TYPE: 1,
+    od.MODE: 1,
+    od.MAX_VELOCITY: 25_000,
+    od.ACCELERATION: 10_000,
+    od.DECELERATION: 10_000,
+    od.QUICK_STOP_DECELERATION: 10_000,
+    od.MOTOR_TYPE: 10,
+    od.CONTINUOUS_CURRENT: 1_000,
+    od.PEAK_CURRENT: 2_000,
+    od.POLE_PAIRS: 1,
+    od.MOTOR_MAX_SPEED: 25_000,
+    od.THERMAL_TIME: 40,
+}
+"""Factory settings that are not 0."""
+
+VOLATILE = (od.CONTROLWORD, od.TARGET_VELOCITY, od.MODE)
+"""Never stored: 0 (mode: its default) after power-up."""
+
+RANGES: dict[Entry, tuple[int, int]] = {
+    od.NODE_ID: (1, 127),
+    od.RS232_RATE: (0, 5),
+    od.MODE: (-6, 6),
+    od.VELOCITY_NOTATION: (-3, 0),
+    od.MAX_VELOCITY: (1, 100_000),
+    od.TARGET_VELOCITY: (-100_000, 100_000),
+    od.ERROR_COUNT: (0, 0),
+    od.ENCODER_PULSES: (16, 7_500),
+    **dict.fromkeys((od.ACCELERATION, od.DECELERATION, od.QUICK_STOP_DECELERATION), (1, 2**32 - 1)),
+}
+
+SERIAL = bytes.fromhex("6301602400001234")
+REMOTE = 1 << 9
+TARGET_REACHED = 1 << 10
+STANDSTILL = 1 << 12
+
+UNDER_VOLTAGE_BELOW = 9.0
+OVER_VOLTAGE_ABOVE = 27.0
+"""Volts; the real limit is not known."""
+VELOCITY_WINDOW = 50.0
+AVERAGE_TIME = 0.02
+"""Time constant of the averaged velocity and current, s."""
+CURRENT_NOISE = 8.0
+"""Standard deviation, mA."""
+REACTION_TIME = 0.05
+"""Seconds a fault reaction lasts before the state is FAULT."""
+
+
+class AccessRefusedError(Exception):
+    """An object access ends with a communication error code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(od.abort_text(code))
+        self.code = code
+
+
+class FreeMotor:
+    """Motor without load, for the emulator alone: exact ramps, slow coasting.
+
+    Args:
+        supply_v: supply voltage.
+    """
+
+    COAST_RPM_S = 20_000.0
+
+    def __init__(self, supply_v: float = 24.0) -> None:
+        self.supply_v = supply_v
+        self._time = 0
+        self._turns = 0.0
+        self._rpm = 0.0
+        self._goal = 0.0
+        self._accel = self.COAST_RPM_S
+
+    def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
+        """As ``MotorPlant.command``."""
+        self._advance(time_ns)
+        self._goal = target_rpm or 0.0
+        self._accel = self.COAST_RPM_S if target_rpm is None else accel_rpm_s
+
+    def reading(self, time_ns: int) -> MotorReading:
+        """As ``MotorPlant.reading``."""
+        self._advance(time_ns)
+        current = 60.0 * math.copysign(self._rpm != 0, self._rpm) + 0.01 * (self._goal - self._rpm)
+        return MotorReading(self._turns, self._rpm, self._rpm, current, self.supply_v)
+
+    def _advance(self, time_ns: int) -> None:
+        span = max(0.0, (time_ns - self._time) / SECOND)
+        self._time = max(self._time, time_ns)
+        ramp = min(span, abs(self._goal - self._rpm) / self._accel)
+        speed = self._rpm + math.copysign(self._accel * ramp, self._goal - self._rpm)
+        if ramp < span:
+            speed = self._goal
+        self._turns += ((self._rpm + speed) / 2 * ramp + speed * (span - ramp)) / 60
+        self._rpm = speed
+
+
+class Firmware:
+    """The controller itself.
+
+    Args:
+        now: time, ns.
+        motor: shaft and its load.
+        rng: source of noise and of the states' delays.
+    """
+
+    def __init__(self, now: Callable[[], int], motor: MotorPlant, rng: np.random.Generator) -> None:
+        self._now = now
+        self._motor = motor
+        self._rng = rng
+        self.strict_transitions = False
+        """Answer an impossible controlword with "wrong device state" instead of ignoring it."""
+        self.over_voltage_above = OVER_VOLTAGE_ABOVE
+        self.causes: set[int] = set()
+        """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
+        self.quick_stop_input = False
+        self._live: dict[Entry, Callable[[MotorReading], int]] = {
+            od.STATUSWORD: self._statusword,
+            od.POSITION: self._position,
+            od.VELOCITY: self._velocity,
+            od.VELOCITY_AVERAGED: lambda _: round(self._velocity_average),
+            od.VELOCITY_DEMAND: lambda reading: round(reading.demand_rpm),
+            od.CURRENT: self._current,
+            od.CURRENT_AVERAGED: lambda _: round(self._current_average),
+            od.ERROR_COUNT: lambda _: len(self._history),
+            od.ERROR_REGISTER: lambda _: int(self.state in FAULTED),
+            od.DIGITAL_INPUTS: lambda _: od.QUICK_STOP_INPUT * self.quick_stop_input,
+            od.MODE_DISPLAY: lambda _: self._values[od.MODE],
+        }
+        self._stored = self._factory()
+        self.boot()
+
+    def boot(self) -> None:
+        """Power-up: stored settings, switch-on disabled, target 0, position 0, empty error history."""
+        self.state = State.SWITCH_ON_DISABLED
+        self._values = dict(self._stored)
+        self._history: list[int] = []
+        self._pending: tuple[int, State] | None = None
+        self._supply: set[int] = set()
+        self._command_motor()
+        reading = self._motor.reading(self._now())
+        self._origin = reading.turns
+        self._seen = (self._now(), reading.turns)
+        self._velocity_average = reading.rpm
+        self._current_average = reading.current_ma
+
+    def shut_down(self) -> None:
+        """Supply lost: the power stage is off."""
+        self._set(State.NOT_READY)
+
+    @staticmethod
+    def _factory() -> dict[Entry, int]:
+        return {entry: DEFAULTS.get(entry, 0) for entry in OBJECTS.values()}
+
+    # Objects
+
+    def read(self, index: int, sub: int) -> int:
+        """32 bits of an object.
+
+        Raises:
+            AccessRefusedError: no such object, or not readable.
+        """
+        entry = self._find(index, sub)
+        if entry.access == "wo" or entry.width > 32:
+            raise AccessRefusedError(od.READ_OF_WRITE_ONLY if entry.access == "wo" else od.LENGTH_MISMATCH)
+        self.advance()
+        low, high = entry.limits
+        return entry.encode(min(max(self._measured(entry), low), high))
+
+    def read_long(self, index: int, sub: int) -> bytes:
+        """Bytes of an object for a segmented read.
+
+        Raises:
+            AccessRefusedError: no such object.
+        """
+        entry = self._find(index, sub)
+        return SERIAL if entry is od.SERIAL_NUMBER else self.read(index, sub).to_bytes(4, "little")[: entry.width // 8]
+
+    def write(self, index: int, sub: int, raw: int) -> None:
+        """Set an object.
+
+        Raises:
+            AccessRefusedError: no such object, read-only, out of range, or wrong state.
+        """
+        entry = self._find(index, sub)
+        if entry.access == "ro":
+            raise AccessRefusedError(od.WRITE_OF_READ_ONLY)
+        value = entry.decode(raw)
+        low, high = RANGES.get(entry, entry.limits)
+        if value < low:
+            raise AccessRefusedError(od.TOO_LOW)
+        if value > high:
+            raise AccessRefusedError(od.TOO_HIGH)
+        self.advance()
+        self._apply(entry, value)
+
+    def _find(self, index: int, sub: int) -> Entry:
+        entry = OBJECTS.get((index, sub))
+        if entry is None:
+            known = any(index == known for known, _ in OBJECTS)
+            raise AccessRefusedError(od.NO_SUBINDEX if known else od.NO_OBJECT)
+        return entry
+
+    def _measured(self, entry: Entry) -> int:
+        if entry in od.ERROR_HISTORY:
+            return self._history[entry.sub - 1] if entry.sub <= len(self._history) else 0
+        live = self._live.get(entry)
+        return self._values[entry] if live is None else live(self._motor.reading(self._now()))
+
+    def _position(self, reading: MotorReading) -> int:
+        counts = math.floor((reading.turns - self._origin) * self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE)
+        return (counts + 2**31) % 2**32 - 2**31
+
+    def _velocity(self, reading: MotorReading) -> int:
+        """Counts within 1 ms, as rpm: coarse."""
+        per_ms = self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE / 60_000
+        return round(round(reading.rpm * per_ms + self._rng.uniform(-0.5, 0.5)) / per_ms)
+
+    def _current(self, reading: MotorReading) -> int:
+        return round(reading.current_ma + CURRENT_NOISE * self._rng.standard_normal())
+
+    def _statusword(self, reading: MotorReading) -> int:
+        word = self.state.value | REMOTE
+        if self.state is State.ENABLED and abs(reading.rpm - self._target()) < VELOCITY_WINDOW:
+            word |= TARGET_REACHED
+        return word | (STANDSTILL if abs(reading.rpm) < VELOCITY_WINDOW else 0)
+
+    def _apply(self, entry: Entry, value: int) -> None:
+        match entry:
+            case od.CONTROLWORD:
+                self._control(value)
+            case od.ERROR_COUNT:
+                self._history.clear()
+            case od.STORE:
+                if value != od.SAVE:
+                    raise AccessRefusedError(od.CANNOT_STORE)
+                self._stored = {**self._values, **{entry: DEFAULTS.get(entry, 0) for entry in VOLATILE}}
+            case od.RESTORE:
+                if value != od.LOAD:
+                    raise AccessRefusedError(od.CANNOT_STORE)
+                self._stored = self._factory()
+            case _:
+                self._values[entry] = value
+                if self.state is State.ENABLED and entry in (od.TARGET_VELOCITY, od.MODE, od.MAX_VELOCITY):
+                    self._command_motor()
+
+    # Power states
+
+    def _control(self, word: int) -> None:
+        edge = word & ~self._values[od.CONTROLWORD] & Control.FAULT_RESET
+        self._values[od.CONTROLWORD] = word
+        if self.state in FAULTED:
+            if edge and self.state is State.FAULT and not (self.causes or self._supply):
+                self._set(State.SWITCH_ON_DISABLED)
+            return
+        new = self._transition(word)
+        if new is None:
+            if self.strict_transitions:
+                raise AccessRefusedError(od.WRONG_STATE)
+        elif new in (State.SWITCHED_ON, State.ENABLED) and self.state in (State.READY, State.SWITCHED_ON):
+            passing = State.REFRESH if new is State.SWITCHED_ON else State.MEASURE_INIT
+            self._set(passing)
+            self._pending = (self._now() + int(self._rng.uniform(0.1, 0.3) * SECOND), new)
+        else:
+            self._set(new)
+            if new is State.ENABLED:  # also when it was: the halt bit may have changed
+                self._command_motor()
+
+    def _transition(self, word: int) -> State | None:
+        """State a controlword asks for; None = impossible from here."""
+        if not word & 0x02:
+            return State.SWITCH_ON_DISABLED
+        if not word & 0x04:
+            return State.QUICK_STOP if self.state in POWERED else State.SWITCH_ON_DISABLED
+        if self.quick_stop_input:
+            return None
+        if not word & 0x01:
+            return None if self.state is State.QUICK_STOP else State.READY
+        if not word & 0x08:
+            return State.SWITCHED_ON if self.state in (State.READY, State.ENABLED) else None
+        return State.ENABLED if self.state in (State.SWITCHED_ON, *POWERED) else None
+
+    def set_quick_stop_input(self, active: bool) -> None:
+        """The hardware line: while active the motor is stopped and cannot be enabled."""
+        self.advance()
+        self.quick_stop_input = active
+        if active and self.state is State.ENABLED:
+            self._set(State.QUICK_STOP)
+        elif active and self.state not in FAULTED | OFF | {State.QUICK_STOP}:
+            self._set(State.SWITCH_ON_DISABLED)
+
+    def fail(self, code: int) -> None:
+        """A fault: history, reaction, power stage off."""
+        self._history = [code, *self._history][: od.HISTORY_SIZE]
+        running = self.state in POWERED
+        self._set(State.FAULT_REACTION_ENABLED if running else State.FAULT_REACTION_DISABLED)
+        self._pending = (self._now() + int(REACTION_TIME * SECOND), State.FAULT)
+
+    def advance(self) -> None:
+        """Let time-driven things happen: filters, supply faults, states that pass."""
+        now = self._now()
+        reading = self._motor.reading(now)
+        then, turns = self._seen
+        if now > then:
+            span = (now - then) / SECOND
+            share = 1 - math.exp(-span / AVERAGE_TIME)
+            self._velocity_average += share * ((reading.turns - turns) / span * 60 - self._velocity_average)
+            self._current_average += share * (reading.current_ma - self._current_average)
+            self._seen = (now, reading.turns)
+        supply = self._supply_faults(reading.supply_v)
+        fresh, self._supply = supply - self._supply, supply
+        if fresh and self.state not in FAULTED:
+            self.fail(min(fresh))
+        if self._pending is not None and now >= self._pending[0]:
+            self._set(self._pending[1])
+
+    def _supply_faults(self, volts: float) -> set[int]:
+        if volts < UNDER_VOLTAGE_BELOW:
+            return {od.UNDER_VOLTAGE}
+        return {od.OVER_VOLTAGE} if volts > self.over_voltage_above else set()
+
+    def _set(self, state: State) -> None:
+        self._pending = None
+        if state is not self.state:
+            self.state = state
+            self._command_motor()
+
+    def _target(self) -> int:
+        halted = self._values[od.CONTROLWORD] & (Control.HALT & ~Control.ENABLE)
+        if halted or self._values[od.MODE] != od.PROFILE_VELOCITY:
+            return 0
+        limit = self._values[od.MAX_VELOCITY]
+        return min(max(self._values[od.TARGET_VELOCITY], -limit), limit)
+
+    def _command_motor(self) -> None:
+        now = self._now()
+        match self.state:
+            case State.ENABLED:
+                target, rpm = self._target(), self._motor.reading(now).rpm
+                speeding = abs(target) > abs(rpm) and target * rpm >= 0
+                ramp = self._values[od.ACCELERATION if speeding else od.DECELERATION]
+                self._motor.command(now, float(target), float(ramp))
+            case State.QUICK_STOP | State.FAULT_REACTION_ENABLED:
+                self._motor.command(now, 0.0, float(self._values[od.QUICK_STOP_DECELERATION]))
+            case _:
+                self._motor.command(now, None, 0.0)

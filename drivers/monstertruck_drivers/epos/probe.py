@@ -1,0 +1,76 @@
+"""Look at a controller without moving or changing anything."""
+
+from typing import Any
+
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger
+from monstertruck_drivers.epos.identity import read_identity
+from monstertruck_drivers.epos.protocol import state_of
+from monstertruck_drivers.link import Port
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+SAMPLES = 5
+SAMPLE_PERIOD = 0.05
+
+
+async def probe(port: Port, clock: Clock, node: int = 1) -> dict[str, Any]:
+    """Handshake, identity, state, fault history and first samples; only reads.
+
+    Args:
+        port: where the controller hangs, at 38400 baud.
+        clock: time.
+        node: node id; 0 = whichever is there.
+
+    Returns:
+        JSON-able report in the controller's own units and sign.
+
+    Raises:
+        DeviceLostError, PortBusyError: the port cannot be opened, or the link went down.
+        DeviceTimeoutError, ProtocolError: no usable answers.
+        WrongDeviceError: something else answers.
+    """
+    async with await port.open() as link:
+        line = Exchanger(link, clock, node)
+        try:
+            return await _report(line, clock)
+        except (DeviceTimeoutError, ProtocolError) as error:
+            if line.strange and not line.acknowledged:
+                raise WrongDeviceError(f"no EPOS, sends {line.strange[:20]!r}: {error}") from error
+            raise
+        finally:
+            await line.close()
+
+
+async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
+    statusword = await line.read(od.STATUSWORD, ATTEMPTS)
+    identity = await read_identity(line)
+    count = min(await line.read(od.ERROR_COUNT, ATTEMPTS), od.HISTORY_SIZE)
+    history = [await line.read(entry, ATTEMPTS) & 0xFFFF for entry in od.ERROR_HISTORY[:count]]
+    samples = []
+    for _ in range(SAMPLES):
+        samples.append(
+            {
+                "position_counts": await line.read(od.POSITION, ATTEMPTS),
+                "velocity_rpm": await line.read(od.VELOCITY_AVERAGED, ATTEMPTS),
+                "current_ma": await line.read(od.CURRENT, ATTEMPTS),
+            }
+        )
+        await clock.sleep(SAMPLE_PERIOD)
+    return {
+        "device": "maxon EPOS 24/1",
+        "identity": {**identity.as_values(), "serial_number": await _serial_number(line)},
+        "state": state_of(statusword).name,
+        "statusword": statusword,
+        "mode": await line.read(od.MODE_DISPLAY, ATTEMPTS),
+        "faults": [{"code": code, "text": od.fault_text(code)} for code in history],
+        "samples": samples,
+    }
+
+
+async def _serial_number(line: Exchanger) -> str | None:
+    """Hexadecimal; None where the firmware's segmented service differs from what is documented."""
+    try:
+        return (await line.read_long(od.SERIAL_NUMBER)).hex()
+    except (DeviceTimeoutError, ProtocolError):
+        return None
