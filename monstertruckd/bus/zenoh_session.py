@@ -9,7 +9,7 @@ import logging
 import re
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import zenoh
 from zenoh import ext
@@ -17,8 +17,8 @@ from zenoh import ext
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import BusyError, ConfigError, InputError
-from monstertruck_runtime.hop import ThreadHop
 from monstertruck_runtime.ports import Ready
+from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -28,8 +28,6 @@ from monstertruckd.bus.rpc import Rpc, topic_rows
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 MAX_REQUEST = 262_144
 """Bytes of the largest request; decoding more would stall the control tick."""
@@ -77,13 +75,13 @@ class ZenohBridge:
             ConfigError: Zenoh refuses the configuration.
         """
         if self._session is None:
-            await _in_thread(self._open)
+            await in_thread(self._open)
 
     async def close(self) -> None:
         """Give endpoints and name back; ``run`` does it too."""
         session, self._session = self._session, None
         if session is not None:
-            await _in_thread(session.close)
+            await in_thread(session.close)
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled.
@@ -97,14 +95,14 @@ class ZenohBridge:
             assert self._session is not None
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             hop = ThreadHop(partial(_guarded, failed), _DEPTH, self._bus.add_drops)
-            publishers = await _in_thread(partial(self._declare_publishers, self._session))
+            publishers = await in_thread(partial(self._declare_publishers, self._session))
             tap = self._bus.tap(
                 partial(self._send, publishers), (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE)
             )
             try:
                 async with asyncio.TaskGroup() as calls:
                     try:
-                        with await _in_thread(partial(self._declare_inputs, self._session, hop, calls)):
+                        with await in_thread(partial(self._declare_inputs, self._session, hop, calls)):
                             ready()
                             await failed
                     finally:
@@ -268,13 +266,3 @@ def _guarded(failed: "asyncio.Future[None]", job: Callable[[], None]) -> None:
     except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine
         if not failed.done():
             failed.set_exception(bug)
-
-
-async def _in_thread(function: Callable[[], T]) -> T:
-    """Run a blocking ``function`` beside the loop, to its end even if the caller is cancelled meanwhile."""
-    work = asyncio.ensure_future(asyncio.to_thread(function))
-    try:
-        return await asyncio.shield(work)
-    except asyncio.CancelledError:
-        await asyncio.wait([work])
-        raise

@@ -18,8 +18,8 @@ from zenoh import ext, handlers
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, WallClock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
-from monstertruck_runtime.hop import ThreadHop
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message, Pose2D, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
@@ -97,13 +97,10 @@ class TruckClient:
         Raises:
             NotFoundError: nothing answers there.
         """
-        opening = asyncio.ensure_future(asyncio.to_thread(self._open))
         try:
-            self._session = await asyncio.shield(opening)
+            await in_thread(self._open)
         except asyncio.CancelledError:
-            await asyncio.wait([opening])
-            if opening.exception() is None:
-                await asyncio.to_thread(opening.result().close)
+            await self._close()
             raise
         return self
 
@@ -113,9 +110,7 @@ class TruckClient:
         """End all subscriptions and the session."""
         for mailbox in list(self._subscriptions):
             mailbox.close()
-        session, self._session = self._session, None
-        if session is not None:
-            await asyncio.shield(asyncio.to_thread(session.close))
+        await self._close()
 
     # Watching
 
@@ -256,7 +251,12 @@ class TruckClient:
 
     # Zenoh
 
-    def _open(self) -> zenoh.Session:
+    async def _close(self) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            await in_thread(session.close)
+
+    def _open(self) -> None:
         config: dict[str, Any] = {
             "mode": "client",
             "connect": {
@@ -278,7 +278,7 @@ class TruckClient:
                 }
             }
         try:
-            return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             msg = f"no robot answers at {self.endpoint} within {self._timeout} s"
             raise NotFoundError(msg) from error

@@ -6,8 +6,8 @@ import threading
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.hop import ThreadHop
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.threads import ThreadHop
 from monstertruck_schemas.base import Message
 
 

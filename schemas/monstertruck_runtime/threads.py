@@ -1,4 +1,4 @@
-"""The hop from foreign threads onto the event loop."""
+"""Between the event loop and threads: blocking work beside the loop, and the hop back onto it."""
 
 import asyncio
 import threading
@@ -56,3 +56,13 @@ class ThreadHop(Generic[T]):
             self._on_loss(lost)
         for item in batch:
             self._deliver(item)
+
+
+async def in_thread(function: Callable[[], T]) -> T:
+    """Run a blocking ``function`` beside the loop, to its end even if the caller is cancelled meanwhile."""
+    work = asyncio.ensure_future(asyncio.to_thread(function))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait([work])
+        raise

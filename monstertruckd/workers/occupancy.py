@@ -1,0 +1,101 @@
+"""A growing raster of what lidar scans hit and what they saw through."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_GROW = 32
+"""Cells of margin added at a time, so that growing is rare."""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """Axis-aligned rectangle, m."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+
+class OccupancyRaster:
+    """Counts, per cell, in how many scans it was hit and in how many it was seen through.
+
+    Args:
+        cell: edge of a cell, m.
+    """
+
+    def __init__(self, cell: float = 0.05) -> None:
+        self.cell = cell
+        self._corner = np.zeros(2, dtype=np.int64)
+        self._hits = np.zeros((0, 0), dtype=np.uint16)
+        self._passes = np.zeros((0, 0), dtype=np.uint16)
+
+    @property
+    def area(self) -> Area:
+        """What the raster covers."""
+        low = self._corner * self.cell
+        rows, columns = self._hits.shape
+        return Area(float(low[0]), float(low[1]), float(low[0] + columns * self.cell), float(low[1] + rows * self.cell))
+
+    def add(self, origin: Floats, points: Floats) -> None:
+        """Take in one scan.
+
+        Args:
+            origin: shape (2,), the sensor in the map frame, m.
+            points: shape (n, 2), where its beams ended, in the map frame, m.
+        """
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points) == 0:
+            return
+        ends = self._cells(points)
+        seen = self._cells(_beams(origin, points, self.cell / 2))
+        self._cover(np.vstack([ends, seen]))
+        hit = np.zeros(self._hits.shape, dtype=bool)
+        hit[tuple((ends - self._corner).T[::-1])] = True
+        through = np.zeros(self._hits.shape, dtype=bool)
+        through[tuple((seen - self._corner).T[::-1])] = True
+        self._hits += hit
+        self._passes += through & ~hit
+
+    def occupancy(self) -> Floats:
+        """Share of hits, shape (rows, columns), row 0 at the lowest y; NaN where nothing was seen."""
+        total = self._hits.astype(np.float64) + self._passes
+        with np.errstate(invalid="ignore"):
+            return self._hits / total
+
+    def _cells(self, points: Floats) -> NDArray[np.int64]:
+        return np.floor(points / self.cell).astype(np.int64)
+
+    def _cover(self, cells: NDArray[np.int64]) -> None:
+        """Grow until ``cells`` are inside."""
+        low, high = cells.min(axis=0), cells.max(axis=0) + 1
+        size = np.array(self._hits.shape[::-1])
+        if size.any():
+            if (low >= self._corner).all() and (high <= self._corner + size).all():
+                return
+            low, high = np.minimum(low, self._corner), np.maximum(high, self._corner + size)
+        corner, shape = low - _GROW, high - low + 2 * _GROW
+        shift = self._corner - corner
+        for name in ("_hits", "_passes"):
+            old = getattr(self, name)
+            grown = np.zeros(shape[::-1], dtype=old.dtype)
+            grown[shift[1] : shift[1] + old.shape[0], shift[0] : shift[0] + old.shape[1]] = old
+            setattr(self, name, grown)
+        self._corner = corner
+
+
+def _beams(origin: Floats, points: Floats, step: float) -> Floats:
+    """Points every ``step`` along each beam, its last step left out; shape (m, 2)."""
+    beams = points - origin
+    lengths = np.hypot(beams[:, 0], beams[:, 1])
+    counts = np.floor(lengths / step).astype(np.int64)
+    beam = np.repeat(np.arange(len(points)), counts)
+    nth = np.arange(len(beam)) - np.repeat(np.cumsum(counts) - counts, counts)
+    along = nth * step / lengths[beam]
+    sampled: Floats = origin + beams[beam] * along[:, None]
+    return sampled
