@@ -79,8 +79,7 @@ class HokuyoDriver:
                 else:
                     await self._stream(session, sensor, ready)
             finally:
-                if not link.is_lost:
-                    await session.stop()
+                await session.stop()
 
     # SCIP 2.0
 
@@ -102,7 +101,7 @@ class HokuyoDriver:
             self.dropped += session.parser.rejected - rejected
             if reply.answers_scan(command):
                 outcome = classify(command, reply.status)
-                if outcome is Outcome.DATA and (block := self._decode(reply, shape)) is not None:
+                if outcome is Outcome.DATA and (block := self._decode(reply, shape, bad)) is not None:
                     if first:
                         ready()
                         self._tell_ready(sensor)
@@ -148,7 +147,7 @@ class HokuyoDriver:
         bad, first = 0, True
         while True:
             asked = self._clock.now()
-            block = self._decode(await session.demand(scip1_scan_command(*shape)), shape)
+            block = self._decode(await session.demand(scip1_scan_command(*shape)), shape, bad)
             if block is not None:
                 if first:
                     ready()
@@ -174,13 +173,14 @@ class HokuyoDriver:
         except DeviceTimeoutError as error:
             raise DeviceTimeoutError(f"{self._port.name}: no good scan in time") from error
 
-    def _decode(self, reply: Reply, shape: tuple[int, int, int]) -> ScanBlock | None:
-        """The scan, or None if it is damaged."""
+    def _decode(self, reply: Reply, shape: tuple[int, int, int], bad: int) -> ScanBlock | None:
+        """The scan, or None if it is damaged; told unless ``bad`` others came just before."""
         try:
             return decode_scan(reply, *shape)
         except ProtocolError as error:
             self.dropped += 1
-            self._tell(Severity.WARNING, str(error), reason=Reason.DEVICE_PROTOCOL, dropped=self.dropped)
+            if bad == 0:
+                self._tell(Severity.WARNING, str(error), reason=Reason.DEVICE_PROTOCOL, dropped=self.dropped)
             return None
 
     def _publish(self, block: ScanBlock, step_0: int, geometry: Parameters, received: int) -> None:

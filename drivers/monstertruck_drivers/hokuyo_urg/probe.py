@@ -33,8 +33,7 @@ async def probe(port: Port, clock: Clock) -> dict[str, object]:
         try:
             block = await _one_scan(session, sensor)
         finally:
-            if not link.is_lost:
-                await session.stop()
+            await session.stop()
     return {
         "device": "hokuyo_urg",
         "port": port.name,

@@ -218,7 +218,7 @@ def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> byt
 
 _ECHO = rb"(?:VV|PP|II|BM|QT|RS|TM[012]|SS\d{6}|SCIP2\.0|G[DS]\d{10}|M[DS]\d{13}|V|L[01]|G\d{8})"
 # Not tied to the start of a line: it may be glued to one that was cut.
-_HEADER = re.compile(_ECHO + rb"(?:;[^\n]{0,16})?\n(?:[0-9A-Z]{2}[0-o]|[0-9A-Z])\n")
+_HEADER = re.compile(_ECHO + rb"\n(?:[0-9A-Z]{2}[0-o]|[0-9A-Z])\n")
 _FIRST_LINES = re.compile(rb"([\x20-\x7e]{1,64})\n(?:([0-9A-Z]{2})([0-o])|([0-9A-Z]))\n")
 _TEXT_LINE = re.compile(rb"[A-Z]{4}:")
 
