@@ -208,8 +208,10 @@ class EposEmulator:
         self._inbox.clear()
         while True:
             opcode = (await self._take(end, 1))[0]
-            with suppress(TimeoutError):  # a half frame is dropped without a word
+            try:
                 await self._exchange(end, opcode)
+            except TimeoutError:  # a half frame is dropped without a word
+                self._inbox.clear()
 
     async def _exchange(self, end: DeviceEnd, opcode: int) -> None:
         if self._due("busy"):
