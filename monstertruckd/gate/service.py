@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HealthTable
@@ -76,7 +77,7 @@ class GateService:
         latch: Latch,
     ) -> None:
         self._gate = gate
-        self._period = round(SECOND / rate)
+        self._rate = rate
         self._clock = clock
         self._inputs = inputs
         self._outputs = outputs
@@ -122,17 +123,15 @@ class GateService:
             self._store_latch()
 
     async def _tick_for_ever(self, ready: Ready) -> None:
-        due = self._clock.now()
+        schedule = Schedule(self._clock, self._rate)
         while True:
+            due = await schedule.next()
             now = self._clock.now()
             self._meter.record((now - due) / SECOND)
             for feed in self._feeds:
                 feed.poll()
             self._publish(self._gate.tick(now), now)
             ready()
-            # Stays on the grid; ticks that were missed are not made up for.
-            due += self._period * max(1, -((due - self._clock.now()) // self._period))
-            await self._clock.sleep_until(due)
 
     async def _take_requests(self, requests: Subscription[DriveRequest]) -> None:
         while True:

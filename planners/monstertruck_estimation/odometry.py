@@ -1,0 +1,311 @@
+"""Dead reckoning of the truck: motor turns along the steered arc, the heading held by the compass.
+
+Between two drive readings the pose is a prediction, and its covariance grows with the reading's age.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.motion import integrate, integration_jacobians
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.base import Pose2D, Schema, Twist2D
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.state import Odometry
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+Share = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+
+STILL: Final = 0.02
+"""Way, m, after which the truck no longer counts as standing at its start."""
+
+MEMORY: Final = SECOND
+"""A compass reading counts as a source of the estimate for this long, ns."""
+
+
+class CompassConfig(Schema):
+    """How the compass holds the heading."""
+
+    noise: Positive = 0.05
+    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors last."""
+    gate: Positive = 3.0
+    """A heading further off than this many standard deviations is left out."""
+    alignment: Annotated[int, Field(ge=1)] = 10
+    """Headings averaged at the start to find north in the odom frame, unless the truck drives off earlier."""
+
+
+class OdometryConfig(Schema):
+    """Dead reckoning: start and trust."""
+
+    rate: Annotated[float, Field(gt=0, le=200)] = 50.0
+    """Poses per second."""
+    start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
+    """Pose of base in odom at the start, m and rad."""
+    distance_noise: Share = 0.02
+    """Standard deviation of the way per root metre driven, m."""
+    lateral_noise: Share = 0.01
+    """Standard deviation of sideways slip per root metre driven, m."""
+    yaw_noise: Share = 0.05
+    """Standard deviation of the heading per root metre driven, rad."""
+    speed_noise: Share = 0.05
+    """Standard deviation of the speed while it is predicted, m/s."""
+    turn_noise: Share = 0.1
+    """Standard deviation of the yaw rate while it is predicted, rad/s."""
+    max_prediction: Positive = 0.3
+    """Seconds the last motion is carried on without a drive reading; then the pose waits, its covariance grows on."""
+    max_speed: Positive = 0.6
+    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a way."""
+    compass: CompassConfig | None = CompassConfig()
+    """None leaves the heading to the wheels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Pose of base in odom, twist in base, at one instant."""
+
+    pose: Vector
+    """x, y (m), yaw (rad, in [-pi, pi])."""
+    twist: Vector
+    """vx, vy (m/s), wz (rad/s)."""
+    pose_covariance: Array
+    """Shape (3, 3)."""
+    twist_covariance: Array
+    """Shape (3, 3)."""
+    age: float
+    """Seconds since the newest drive reading."""
+    sources: tuple[str, ...]
+
+
+class DeadReckoning:
+    """Extended Kalman filter of (x, y, yaw): the drive moves it, the compass corrects its yaw.
+
+    Args:
+        config: start and noise.
+        steering: the truck's geometry.
+        drivetrain: motor to wheel.
+        linkage: servo to axle.
+    """
+
+    def __init__(
+        self,
+        config: OdometryConfig,
+        *,
+        steering: FourWheelSteering,
+        drivetrain: DriveTrain,
+        linkage: SteeringPolynomials,
+    ) -> None:
+        self._config = config
+        self._steering = steering
+        self._drivetrain = drivetrain
+        self._linkage = linkage
+        self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
+        self._covariance: Array = np.zeros((3, 3))
+        self._drive: DriveFeedback | None = None
+        self._steered = False
+        self._angles = (0.0, 0.0)
+        self._angles_then = (0.0, 0.0)
+        self._speed = 0.0
+        self._driven = 0.0
+        self._aligning: list[float] = []
+        self._north: float | None = None
+        self._compass_used: int | None = None
+        self.rejected_headings = 0
+        """Headings left out because they were too far off."""
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take the servo angles being sent."""
+        front, rear = self._linkage.front, self._linkage.rear
+        self._angles = (
+            front.axle_from_servo(min(max(feedback.front, -front.servo_limit), front.servo_limit)),
+            rear.axle_from_servo(min(max(feedback.rear, -rear.servo_limit), rear.servo_limit)),
+        )
+        self._steered = True
+
+    def observe_drive(self, feedback: DriveFeedback) -> None:
+        """Take a motor position and move the pose along the arc driven since the last one."""
+        before, angles_then = self._drive, self._angles_then
+        if before is None:
+            self._drive, self._angles_then = feedback, self._angles
+            return
+        dt = (feedback.stamp - before.stamp) / SECOND
+        if dt <= 0:
+            return
+        self._drive, self._angles_then = feedback, self._angles
+        rolled = self._drivetrain.distance(feedback.position - before.position)
+        if abs(rolled) > self._config.max_speed * dt:
+            self._lose(dt)
+            return
+        front = (angles_then[0] + self._angles[0]) / 2
+        rear = (angles_then[1] + self._angles[1]) / 2
+        self._speed = rolled / dt / self._steering.drive_speed(1.0, front, rear)
+        twist = self._steering.body_twist(self._speed, front, rear)
+        way = abs(self._speed) * dt
+        self._driven += way
+        config = self._config
+        noise = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2 * way / dt**2
+        self._covariance = self._propagated(twist, dt, noise)
+        self._pose = integrate(self._pose, *twist, dt)
+
+    def observe_attitude(self, attitude: Attitude) -> None:
+        """Take a heading: the first ones find north, the others correct the yaw."""
+        config = self._config.compass
+        if config is None or attitude.heading_disturbed or self._drive is None:
+            return
+        ahead = min(max((attitude.stamp - self._drive.stamp) / SECOND, -1.0), self._config.max_prediction)
+        yaw = self._pose[2] + self._twist()[2] * ahead
+        # The device counts clockwise from north.
+        off = -attitude.heading - yaw
+        if self._north is None:
+            self._align(off, config)
+            return
+        innovation = wrap_angle(off - self._north)
+        variance = float(self._covariance[2, 2]) + config.noise**2
+        if innovation**2 > config.gate**2 * variance:
+            self.rejected_headings += 1
+            return
+        gain = self._covariance[:, 2] / variance
+        x, y, heading = self._pose
+        self._pose = (
+            x + float(gain[0]) * innovation,
+            y + float(gain[1]) * innovation,
+            heading + float(gain[2]) * innovation,
+        )
+        self._covariance = self._covariance - np.outer(gain, self._covariance[2])
+        self._compass_used = attitude.stamp
+
+    def estimate(self, now: int) -> Estimate | None:
+        """Pose predicted to ``now`` (ns); None before the first drive reading."""
+        if self._drive is None:
+            return None
+        config = self._config
+        age = max((now - self._drive.stamp) / SECOND, 0.0)
+        twist = self._twist()
+        x, y, yaw = integrate(self._pose, *twist, min(age, config.max_prediction))
+        noise = np.array((config.speed_noise, config.speed_noise, config.turn_noise)) ** 2
+        sources = ["drive"]
+        if self._steered:
+            sources.append("steering")
+        if self._compass_used is not None and now - self._compass_used <= MEMORY:
+            sources.append("compass")
+        return Estimate(
+            pose=(x, y, wrap_angle(yaw)),
+            twist=twist,
+            pose_covariance=self._propagated(twist, age, noise),
+            twist_covariance=np.diag(noise),
+            age=age,
+            sources=tuple(sources),
+        )
+
+    def _twist(self) -> Vector:
+        return self._steering.body_twist(self._speed, *self._angles)
+
+    def _propagated(self, twist: Vector, dt: float, noise: Array) -> Array:
+        """Pose covariance after holding ``twist``, whose components have the variances ``noise``, for dt."""
+        by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
+        moved = by_pose @ self._covariance @ by_pose.T + by_twist @ np.diag(noise) @ by_twist.T
+        return np.asarray((moved + moved.T) / 2)
+
+    def _lose(self, dt: float) -> None:
+        """The drive counts from a new origin: what it did in between is not known."""
+        self._speed = 0.0
+        lost = (self._config.max_speed * dt) ** 2
+        turned = lost * self._steering.curvature(0.4, -0.4) ** 2
+        self._covariance = self._covariance + np.diag((lost, lost, turned))
+
+    def _align(self, off: float, config: CompassConfig) -> None:
+        self._aligning.append(off)
+        if len(self._aligning) >= config.alignment or self._driven > STILL:
+            self._north = math.atan2(
+                sum(math.sin(value) for value in self._aligning), sum(math.cos(value) for value in self._aligning)
+            )
+
+
+class OdometryService:
+    """Publishes dead reckoning on an absolute schedule, in odom and, unchanged, in map.
+
+    Args:
+        reckoning: the filter.
+        clock: time.
+        drive: motor feedback.
+        steering: servo feedback.
+        compass: headings, if there is a compass.
+        odometry: ``state/odometry``.
+        pose: ``state/pose``.
+        rate: poses per second.
+    """
+
+    name = "odometry"
+
+    def __init__(
+        self,
+        reckoning: DeadReckoning,
+        clock: Clock,
+        *,
+        drive: Subscription[DriveFeedback],
+        steering: Subscription[SteeringFeedback],
+        compass: Subscription[Attitude] | None,
+        odometry: Publisher[Odometry],
+        pose: Publisher[Odometry],
+        rate: float = 50.0,
+    ) -> None:
+        self._reckoning = reckoning
+        self._clock = clock
+        self._drive = drive
+        self._steering = steering
+        self._compass = compass
+        self._out = (("odom", odometry), ("map", pose))
+        self._rate = rate
+        self._seen: tuple[object, object, object] = (None, None, None)
+
+    async def run(self, ready: Ready) -> None:
+        """Publish until cancelled; the first pose follows the first drive reading."""
+        ready()
+        schedule = Schedule(self._clock, self._rate)
+        while True:
+            await schedule.next()
+            self._take()
+            now = self._clock.now()
+            estimate = self._reckoning.estimate(now)
+            if estimate is not None:
+                for frame, out in self._out:
+                    out.put(_message(estimate, frame, now, out.next_seq()))
+
+    def _take(self) -> None:
+        steering, drive = self._steering.latest, self._drive.latest
+        compass = None if self._compass is None else self._compass.latest
+        before = self._seen
+        self._seen = (steering, drive, compass)
+        if steering is not None and steering is not before[0]:
+            self._reckoning.observe_steering(steering)
+        if drive is not None and drive is not before[1]:
+            self._reckoning.observe_drive(drive)
+        if compass is not None and compass is not before[2]:
+            self._reckoning.observe_attitude(compass)
+
+
+def _message(estimate: Estimate, frame: str, now: int, seq: int) -> Odometry:
+    x, y, yaw = estimate.pose
+    vx, vy, wz = estimate.twist
+    return Odometry(
+        stamp=now,
+        received=now,
+        seq=seq,
+        frame=frame,
+        pose=Pose2D(x=x, y=y, yaw=yaw),
+        twist=Twist2D(vx=vx, vy=vy, wz=wz),
+        pose_covariance=estimate.pose_covariance.ravel(),
+        twist_covariance=estimate.twist_covariance.ravel(),
+        age=estimate.age,
+        sources=estimate.sources,
+    )

@@ -1,0 +1,250 @@
+"""The frame tree: angles and quaternions in one place, look-up between any two frames, and the service that tells it.
+
+map > odom > base > sensors (REP 105). map to odom is the identity until something localises the truck in the map.
+A transform is the pose of ``child`` in ``parent``.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.state import Odometry, Transform, Transforms
+
+Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+
+IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+
+FIXED: Final = 0
+"""Stamp of a transform that never changes."""
+
+
+def wrap_angle(angle: float) -> float:
+    """The same angle in [-pi, pi], rad."""
+    return math.remainder(angle, math.tau)
+
+
+def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Unit quaternion (x, y, z, w) of turning about x, then y, then z of the parent frame (REP 103), rad."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def quaternion_from_yaw(yaw: float) -> Quaternion:
+    """Unit quaternion of a turn about z, rad."""
+    return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def yaw_of(rotation: Quaternion) -> float:
+    """Yaw, rad, of a unit quaternion."""
+    x, y, z, w = rotation
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Rotation ``b`` followed by rotation ``a`` (both in the parent frame)."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def conjugate(rotation: Quaternion) -> Quaternion:
+    """The opposite rotation."""
+    x, y, z, w = rotation
+    return -x, -y, -z, w
+
+
+def rotate(rotation: Quaternion, vector: Vector) -> Vector:
+    """Vector of the child frame in the parent frame."""
+    x, y, z, _ = multiply(multiply(rotation, (*vector, 0.0)), conjugate(rotation))
+    return x, y, z
+
+
+def compose(outer: Transform, inner: Transform) -> Transform:
+    """Pose of ``inner.child`` in ``outer.parent``; as old as the older of the two that is not ``FIXED``."""
+    shifted = rotate(outer.rotation, inner.translation)
+    return Transform(
+        parent=outer.parent,
+        child=inner.child,
+        stamp=min(outer.stamp, inner.stamp) or max(outer.stamp, inner.stamp),
+        translation=_sum(outer.translation, shifted),
+        rotation=multiply(outer.rotation, inner.rotation),
+    )
+
+
+def invert(transform: Transform) -> Transform:
+    """Pose of the parent in the child."""
+    back = conjugate(transform.rotation)
+    x, y, z = rotate(back, transform.translation)
+    return Transform(
+        parent=transform.child,
+        child=transform.parent,
+        stamp=transform.stamp,
+        translation=(-x, -y, -z),
+        rotation=back,
+    )
+
+
+def transform_points(transform: Transform, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points, shape (n, 3), of the child frame in the parent frame, m."""
+    x, y, z, w = transform.rotation
+    matrix = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return np.asarray(points @ matrix.T + np.array(transform.translation))
+
+
+def mount(child: str, position: Vector, rpy: Vector = (0.0, 0.0, 0.0), parent: str = "base") -> Transform:
+    """Fixed pose of a sensor: position in m, roll, pitch, yaw in rad."""
+    return Transform(parent=parent, child=child, stamp=FIXED, translation=position, rotation=quaternion_from_rpy(*rpy))
+
+
+def planar(parent: str, child: str, stamp: int, pose: Vector) -> Transform:
+    """Transform of a planar pose (x, y, yaw)."""
+    x, y, yaw = pose
+    return Transform(
+        parent=parent, child=child, stamp=stamp, translation=(x, y, 0.0), rotation=quaternion_from_yaw(yaw)
+    )
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+class FrameTree:
+    """Transforms between neighbouring frames, and between any two of them.
+
+    Args:
+        transforms: to begin with.
+    """
+
+    def __init__(self, transforms: Iterable[Transform] = ()) -> None:
+        self._by_child: dict[str, Transform] = {}
+        for transform in transforms:
+            self.put(transform)
+
+    def put(self, transform: Transform) -> None:
+        """Add or renew the pose of a frame in its parent.
+
+        Raises:
+            InputError: the frame has another parent already, or would be its own ancestor.
+        """
+        child, parent = transform.child, transform.parent
+        known = self._by_child.get(child)
+        if known is not None and known.parent != parent:
+            msg = f"frame {child!r} hangs on {known.parent!r}: expected no second parent, got {parent!r}"
+            raise InputError(msg)
+        if known is None and (child == parent or child in self._ancestors(parent)):
+            msg = f"frame {child!r} on {parent!r} closes a loop: expected a tree"
+            raise InputError(msg)
+        self._by_child[child] = transform
+
+    def lookup(self, parent: str, child: str) -> Transform:
+        """Pose of ``child`` in ``parent``, whatever the way between them.
+
+        Raises:
+            NotFoundError: no such frame, or nothing connects the two.
+        """
+        known = {*self._by_child, *(transform.parent for transform in self._by_child.values())}
+        there = self._ancestors(parent)
+        shared = next((frame for frame in self._ancestors(child) if frame in there and frame in known), None)
+        if shared is None:
+            names = ", ".join(sorted(known)) or "none"
+            msg = f"no transform from {child!r} to {parent!r}: known frames are {names}"
+            raise NotFoundError(msg)
+        return compose(invert(self._chain(parent, shared)), self._chain(child, shared))
+
+    def all(self, now: int) -> tuple[Transform, ...]:
+        """Every transform put in, newest of each frame; fixed ones are true ``now``."""
+        return tuple(
+            transform.model_copy(update={"stamp": now}) if transform.stamp == FIXED else transform
+            for transform in self._by_child.values()
+        )
+
+    def _ancestors(self, frame: str) -> list[str]:
+        """The frame and everything it hangs on."""
+        line = [frame]
+        while (above := self._by_child.get(line[-1])) is not None:
+            line.append(above.parent)
+        return line
+
+    def _chain(self, frame: str, ancestor: str) -> Transform:
+        """Pose of ``frame`` in its ``ancestor``."""
+        pose = Transform(parent=frame, child=frame, stamp=FIXED, translation=(0.0, 0.0, 0.0), rotation=IDENTITY)
+        while frame != ancestor:
+            step = self._by_child[frame]
+            pose, frame = compose(step, pose), step.parent
+        return pose
+
+
+class TransformService:
+    """Publishes the whole frame tree and answers look-ups.
+
+    Args:
+        mounts: fixed poses of the sensors, see ``mount``.
+        clock: time.
+        odometry: pose of base in odom.
+        out: where the tree goes.
+        rate: messages per second.
+    """
+
+    name = "transforms"
+
+    def __init__(
+        self,
+        mounts: Sequence[Transform],
+        clock: Clock,
+        odometry: Subscription[Odometry],
+        out: Publisher[Transforms],
+        rate: float = 10.0,
+    ) -> None:
+        self._clock = clock
+        self._odometry = odometry
+        self._out = out
+        self._rate = rate
+        self._tree = FrameTree([planar("map", "odom", FIXED, (0.0, 0.0, 0.0)), *mounts])
+
+    def lookup(self, parent: str, child: str) -> Transform:
+        """Newest pose of ``child`` in ``parent``; see ``FrameTree.lookup``."""
+        self._refresh()
+        return self._tree.lookup(parent, child)
+
+    async def run(self, ready: Ready) -> None:
+        """Publish until cancelled."""
+        ready()
+        schedule = Schedule(self._clock, self._rate)
+        while True:
+            await schedule.next()
+            self._refresh()
+            now, seq = self._clock.now(), self._out.next_seq()
+            frames = self._tree.all(now)
+            self._out.put(Transforms(stamp=now, received=now, seq=seq, frame="map", transforms=frames))
+
+    def _refresh(self) -> None:
+        odometry = self._odometry.latest
+        if odometry is not None:
+            pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
+            self._tree.put(planar("odom", "base", odometry.stamp, pose))
