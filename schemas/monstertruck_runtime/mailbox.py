@@ -81,18 +81,9 @@ class Mailbox(Generic[M]):
         Raises:
             RuntimeError: the mailbox is closed, or another task already waits on it.
         """
-        while not self._unread:
-            if self._closed:
-                msg = "the subscription is closed"
-                raise RuntimeError(msg)
-            if self._reader is not None:
-                msg = "a subscription has one reader; subscribe again for another"
-                raise RuntimeError(msg)
-            self._reader = asyncio.get_running_loop().create_future()
-            try:
-                await self._reader
-            finally:
-                self._reader = None
+        if not await self._arrival():
+            msg = "the subscription is closed"
+            raise RuntimeError(msg)
         return self._unread.popleft()
 
     def close(self) -> None:
@@ -104,6 +95,19 @@ class Mailbox(Generic[M]):
         self._wake()
         self._on_close(self)
 
+    async def _arrival(self) -> bool:
+        """Wait until a message is unread; False if the mailbox is closed."""
+        while not self._unread and not self._closed:
+            if self._reader is not None:
+                msg = "a subscription has one reader; subscribe again for another"
+                raise RuntimeError(msg)
+            self._reader = asyncio.get_running_loop().create_future()
+            try:
+                await self._reader
+            finally:
+                self._reader = None
+        return not self._closed
+
     def _wake(self) -> None:
         if self._reader is not None and not self._reader.done():
             self._reader.set_result(None)
@@ -112,14 +116,9 @@ class Mailbox(Generic[M]):
         return self
 
     async def __anext__(self) -> M:
-        while True:
-            if self._closed:
-                raise StopAsyncIteration
-            try:
-                return await self.next()
-            except RuntimeError:
-                if not self._closed:
-                    raise
+        if not await self._arrival():
+            raise StopAsyncIteration
+        return self._unread.popleft()
 
     def __enter__(self) -> Self:
         return self

@@ -2,6 +2,8 @@
 
 import asyncio
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -210,3 +212,11 @@ async def test_a_dial_that_is_cancelled_leaves_nothing_open():
 def test_the_default_source_is_acceptable():
     assert TruckClient().source.count(":") == 1
     assert re.fullmatch(r"[A-Za-z0-9_.@:-]{1,64}", TruckClient().source)
+
+
+def test_a_station_needs_nothing_of_the_robot():
+    code = (
+        "import sys, monstertruck_runtime.client; "
+        "sys.exit(bool({'monstertruckd', 'monstertruck_drivers', 'mcap', 'PIL', 'serial'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
