@@ -252,3 +252,18 @@ def test_configuration_is_checked():
         HokuyoConfig(cluster=0)
     with pytest.raises(ValidationError):
         HokuyoConfig(port="x")  # type: ignore[call-arg]
+
+
+def test_what_was_left_in_the_pipe_is_thrown_away_before_the_first_request():
+    script = Script()
+
+    async def talk(session: ScipSession, clock: VirtualClock) -> int:
+        task = asyncio.create_task(session.handshake())
+        await clock.sleep(0.04)
+        assert script.heard == []
+        session._link.feed(b"00P\n\nQT\n0")
+        await task
+        return session.parser.rejected
+
+    assert converse(script, talk) == 1
+    assert script.heard[0] == "QT"
