@@ -41,6 +41,12 @@ def derivative(coefficients: Coefficients) -> Coefficients:
     return tuple(c * (top - i) for i, c in enumerate(coefficients[:-1]))
 
 
+def round_trip_error(there: Coefficients, back: Coefficients, limit: float) -> float:
+    """Largest |back(there(x)) - x| for |x| up to ``limit``, rad: how well two fitted directions agree."""
+    x = np.linspace(-limit, limit, 2001)
+    return float(np.abs(polynomial(back, polynomial(there, x)) - x).max())
+
+
 @dataclass(frozen=True)
 class AxlePolynomials:
     """Steering of one axle.

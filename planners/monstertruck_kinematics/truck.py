@@ -16,6 +16,7 @@ from monstertruck_kinematics.elementary import (
     any_zero,
     asin,
     atan,
+    atan2,
     clip,
     cos,
     hypot,
@@ -191,10 +192,17 @@ class FourWheelSteering:
         return sign(vx) * hypot(vx, vy), atan((vy + self.l_f * wz) / ahead), atan((vy - self.l_r * wz) / ahead)
 
     def wheel_angles(self, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
-        """Angles of the four wheels through the common ICR (eqs. 2.27-2.30), in (-90, 90) deg."""
+        """Angles of the four wheels through the common ICR (eqs. 2.27-2.30), within +-90 deg."""
         tan_f, tan_r = self._tangents(front, rear)
         left, right = self._sides(tan_f, tan_r)
-        return atan(tan_f / left), atan(tan_f / right), atan(tan_r / left), atan(tan_r / right)
+        facing_left, facing_right = sign(left), sign(right)
+        ahead_left, ahead_right = abs(left), abs(right)
+        return (
+            atan2(facing_left * tan_f, ahead_left),
+            atan2(facing_right * tan_f, ahead_right),
+            atan2(facing_left * tan_r, ahead_left),
+            atan2(facing_right * tan_r, ahead_right),
+        )
 
     def wheel_speeds(self, speed: Real, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
         """Ground speeds of the four wheels along their own angle, m/s (eqs. 2.43-2.46).
@@ -224,16 +232,9 @@ class FourWheelSteering:
         return vx * (0.5 * (hypot(1.0 + 0.0 * tan_f, tan_f) + hypot(1.0 + 0.0 * tan_r, tan_r)))
 
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
-        """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37.
-
-        Raises:
-            KinematicsError: the ICR lies under a wheel, whose angle is then undefined.
-        """
+        """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37."""
         lean = (tan_f - tan_r) * (0.5 * self.track / self.wheelbase)
-        left, right = 1.0 - lean, 1.0 + lean
-        if any_zero(left * right):
-            raise KinematicsError("front, rear: the turning centre lies on a wheel's line, its angle is undefined")
-        return left, right
+        return 1.0 - lean, 1.0 + lean
 
     def limit_keeping_curvature(
         self, front: Real, rear: Real, limit: float, rear_limit: float | None = None

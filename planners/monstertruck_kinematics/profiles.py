@@ -1,0 +1,300 @@
+"""Basic motion control: moves (radius, length, angle) driven under trapezoidal or cubic speed profiles."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array, require_finite, require_positive
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.families.base import Drive
+from monstertruck_kinematics.motion import integrate
+
+
+@dataclass(frozen=True)
+class CubicRamp:
+    """Speed change V(t) = v0 + a0 t + a1 t^2 + a2 t^3 that ends at v1 without acceleration.
+
+    Args:
+        v0: speed at the start.
+        v1: speed at the end.
+        duration: T, s.
+        a0: acceleration at the start.
+
+    Raises:
+        KinematicsError: a figure that is not finite, or a duration not above 0.
+    """
+
+    v0: float
+    v1: float
+    duration: float
+    a0: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("v0", "v1", "a0"):
+            require_finite(name, getattr(self, name))
+        require_positive("duration", self.duration)
+
+    @property
+    def coefficients(self) -> tuple[float, float]:
+        """a1 = (3 (v1 - v0) - 2 a0 T)/T^2 and a2 = (a0 T - 2 (v1 - v0))/T^3."""
+        change, time = self.v1 - self.v0, self.duration
+        return (3.0 * change - 2.0 * self.a0 * time) / time**2, (self.a0 * time - 2.0 * change) / time**3
+
+    def speed(self, t: float) -> float:
+        """Speed at time t; before and after the ramp its end values."""
+        t = min(max(t, 0.0), self.duration)
+        a1, a2 = self.coefficients
+        return self.v0 + t * (self.a0 + t * (a1 + t * a2))
+
+    def acceleration(self, t: float) -> float:
+        """Acceleration at time t; 0 outside the ramp."""
+        if not 0.0 <= t <= self.duration:
+            return 0.0
+        a1, a2 = self.coefficients
+        return self.a0 + t * (2.0 * a1 + t * 3.0 * a2)
+
+
+class SpeedProfile(Protocol):
+    """A way from rest to rest."""
+
+    @property
+    def duration(self) -> float:
+        """Whole time, s."""
+        ...
+
+    def position(self, times: Array) -> Array:
+        """(N,) way done, m (rad for a turn on the spot); its ends hold outside the duration."""
+        ...
+
+    def speed(self, times: Array) -> Array:
+        """(N,) its derivative."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrapezoidalProfile:
+    """Constant acceleration, constant speed, constant braking; a triangle if the way is short.
+
+    Args:
+        distance: way, m (or rad), negative for backwards.
+        max_speed: m/s.
+        max_acceleration: m/s^2.
+
+    Raises:
+        KinematicsError: a limit not above 0, or a distance that is not finite.
+    """
+
+    distance: float
+    max_speed: float
+    max_acceleration: float
+
+    def __post_init__(self) -> None:
+        require_finite("distance", self.distance)
+        require_positive("max_speed", self.max_speed)
+        require_positive("max_acceleration", self.max_acceleration)
+
+    @property
+    def peak(self) -> float:
+        """Speed reached, m/s, positive."""
+        return min(self.max_speed, math.sqrt(abs(self.distance) * self.max_acceleration))
+
+    @property
+    def duration(self) -> float:
+        """Whole time, s."""
+        return abs(self.distance) / self.peak + self.peak / self.max_acceleration if self.distance else 0.0
+
+    def position(self, times: Array) -> Array:
+        """(N,) way done."""
+        t = np.clip(times, 0.0, self.duration)
+        ramp = self.peak / self.max_acceleration
+        left = self.duration - t
+        up = 0.5 * self.max_acceleration * t**2
+        down = abs(self.distance) - 0.5 * self.max_acceleration * left**2
+        along = self.peak * (t - 0.5 * ramp)
+        return np.asarray(np.sign(self.distance) * np.where(t < ramp, up, np.where(left < ramp, down, along)))
+
+    def speed(self, times: Array) -> Array:
+        """(N,) speed, with the distance's sign."""
+        inside = np.minimum(times, self.duration - times)
+        return np.asarray(np.sign(self.distance) * np.clip(self.max_acceleration * inside, 0.0, self.peak))
+
+
+@dataclass(frozen=True)
+class CubicProfile:
+    """Cubic ramp up, constant speed, cubic ramp down: no jump of the acceleration.
+
+    A way too short for the full speed is driven with both ramps at a lower one.
+
+    Args:
+        distance: way, m (or rad), negative for backwards.
+        max_speed: m/s.
+        ramp_time: of either ramp, s; the peak acceleration is 1.5 max_speed / ramp_time.
+
+    Raises:
+        KinematicsError: a limit not above 0, or a distance that is not finite.
+    """
+
+    distance: float
+    max_speed: float
+    ramp_time: float
+
+    def __post_init__(self) -> None:
+        require_finite("distance", self.distance)
+        require_positive("max_speed", self.max_speed)
+        require_positive("ramp_time", self.ramp_time)
+
+    @property
+    def peak(self) -> float:
+        """Speed reached, m/s, positive."""
+        return min(self.max_speed, abs(self.distance) / self.ramp_time)
+
+    @property
+    def duration(self) -> float:
+        """Whole time, s."""
+        return abs(self.distance) / self.peak + self.ramp_time if self.distance else 0.0
+
+    def position(self, times: Array) -> Array:
+        """(N,) way done."""
+        t = np.clip(times, 0.0, self.duration)
+        left = self.duration - t
+        along = self.peak * (t - 0.5 * self.ramp_time)
+        way = np.where(
+            t < self.ramp_time,
+            self._ramp_way(t),
+            np.where(left < self.ramp_time, abs(self.distance) - self._ramp_way(left), along),
+        )
+        return np.asarray(np.sign(self.distance) * way)
+
+    def speed(self, times: Array) -> Array:
+        """(N,) speed, with the distance's sign."""
+        share = np.clip(np.minimum(times, self.duration - times) / self.ramp_time, 0.0, 1.0)
+        return np.asarray(np.sign(self.distance) * self.peak * share**2 * (3.0 - 2.0 * share))
+
+    def _ramp_way(self, t: Array) -> Array:
+        share = t / self.ramp_time
+        return np.asarray(self.peak * self.ramp_time * share**3 * (1.0 - 0.5 * share))
+
+
+@dataclass(frozen=True)
+class Move:
+    """One basic move: an arc of radius R (left positive) and length D turns by phi = D/R.
+
+    R = 0 turns on the spot (D = 0, phi given), infinite R goes straight (phi = 0).
+
+    Args:
+        radius: R, m.
+        length: D, m, negative backwards.
+        angle: phi, rad.
+
+    Raises:
+        KinematicsError: figures that contradict phi = D/R, or NaN.
+    """
+
+    radius: float
+    length: float
+    angle: float
+
+    def __post_init__(self) -> None:
+        require_finite("length", self.length)
+        require_finite("angle", self.angle)
+        if math.isnan(self.radius):
+            raise KinematicsError("radius is nan: expected metres, 0 or infinity")
+        turned = 0.0 if math.isinf(self.radius) else self.angle * self.radius
+        if abs(self.length - turned) > 1e-9 * (1.0 + abs(self.length)) and not math.isinf(self.radius):
+            raise KinematicsError(f"length is {self.length}: expected radius x angle = {turned:.6g}")
+        if math.isinf(self.radius) and self.angle != 0.0:
+            raise KinematicsError(f"angle is {self.angle}: expected 0 for a straight move")
+
+    @classmethod
+    def straight(cls, length: float) -> "Move":
+        """Straight ahead (or back)."""
+        return cls(math.inf, length, 0.0)
+
+    @classmethod
+    def spot(cls, angle: float) -> "Move":
+        """Turn on the spot."""
+        return cls(0.0, 0.0, angle)
+
+    @classmethod
+    def arc(cls, radius: float, length: float) -> "Move":
+        """Arc of a length; the turn follows.
+
+        Raises:
+            KinematicsError: the radius is 0 (that is ``spot``).
+        """
+        if radius == 0.0:
+            raise KinematicsError("radius is 0: expected an arc; a turn on the spot has an angle, no length")
+        return cls(radius, length, length / radius)
+
+    @property
+    def way(self) -> float:
+        """What a speed profile covers: the length, m, or the angle, rad, of a turn on the spot."""
+        return self.angle if self.radius == 0.0 else self.length
+
+    @property
+    def direction(self) -> tuple[float, float, float]:
+        """Twist at unit rate of ``way``."""
+        return (0.0, 0.0, 1.0) if self.radius == 0.0 else (1.0, 0.0, 1.0 / self.radius)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A move as driven.
+
+    Attributes:
+        times: (N,) s.
+        commands: (m, N) of the drive.
+        twists: (3, N) in the body frame.
+        poses: (3, N) in the world frame.
+    """
+
+    times: Array
+    commands: Array
+    twists: Array
+    poses: Array
+
+
+def drive_move(
+    drive: Drive,
+    move: Move,
+    profile: SpeedProfile,
+    *,
+    period: float = 0.02,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Motion:
+    """Commands and poses of a move under a speed profile, for any drive family.
+
+    Steering stands at its angle for the whole move, also at its ends where the speed is 0.
+
+    Args:
+        drive: the robot.
+        move: what to drive.
+        profile: over ``move.way``.
+        period: between samples, s; the last sample is the move's end.
+        start: pose at the beginning.
+
+    Raises:
+        KinematicsError: the profile is for another way, the drive cannot make the move, or not within its limits.
+    """
+    require_positive("period", period)
+    ends = profile.position(np.array([profile.duration]))
+    if abs(float(ends[0]) - move.way) > 1e-9 * (1.0 + abs(move.way)):
+        raise KinematicsError(f"profile covers {float(ends[0]):.6g}: expected the move's {move.way:.6g}")
+    times = np.append(np.arange(0.0, profile.duration, period), profile.duration)
+    rates = profile.speed(times)
+    once, twice = (np.array(drive.inverse(tuple(k * d for d in move.direction))) for k in (1.0, 2.0))
+    # Speeds are proportional to the rate, angles independent of it: every input is affine in it.
+    commands = once[:, None] + (twice - once)[:, None] * (rates - 1.0)
+    kept = np.array(drive.limited(tuple(commands)))
+    for name, wanted, allowed in zip(drive.inputs, commands, kept, strict=True):
+        if np.abs(wanted - allowed).max() > 1e-9 * (1.0 + np.abs(wanted).max()):
+            worst = float(wanted[np.abs(wanted).argmax()])
+            raise KinematicsError(f"{name} would be {worst:.6g}: the move is beyond the drive's limits")
+    ways = profile.position(times)
+    unit = tuple(d * ways for d in move.direction)
+    origin = (np.full_like(times, start[0]), np.full_like(times, start[1]), np.full_like(times, start[2]))
+    poses = integrate(origin, unit[0], unit[1], unit[2], 1.0)
+    twists = np.array(move.direction)[:, None] * rates
+    return Motion(times, commands, twists, np.array(poses))

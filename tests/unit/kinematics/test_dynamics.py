@@ -1,0 +1,113 @@
+"""Single-track dynamics: steady turns, the kinematic limit, and an independent integration."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.dynamics import SingleTrack
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.truck import FourWheelSteering
+
+NEUTRAL = SingleTrack()
+UNDERSTEER = SingleTrack(FourWheelSteering(cg_split=0.4), front_stiffness=100.0, rear_stiffness=140.0)
+
+
+def settled(model, speed, front, rear, dt=0.01, steps=500):
+    twist = (0.0, 0.0, 0.0)
+    for _ in range(steps):
+        twist = model.step(twist, speed, front, rear, dt)
+    return twist
+
+
+@pytest.mark.parametrize("speed", [1.0, 2.0])
+@pytest.mark.parametrize("model", [NEUTRAL, UNDERSTEER], ids=["neutral", "understeer"])
+def test_steady_turn_has_the_textbook_yaw_rate(model, speed):
+    front, rear = 0.01, -0.004
+    gain = model.geometry.wheelbase + model.understeer_gradient * speed**2
+    assert settled(model, speed, front, rear)[2] == pytest.approx(speed * (front - rear) / gain, rel=1e-3)
+
+
+def test_understeer_gradient_signs():
+    assert NEUTRAL.understeer_gradient == 0.0
+    assert UNDERSTEER.understeer_gradient > 0.0
+
+
+def test_creeping_is_kinematic_at_once():
+    model = NEUTRAL
+    for speed in (0.04, -0.04, 0.0):
+        twist = model.step((0.0, 0.3, -0.5), speed, 0.3, -0.2, 0.001)
+        assert twist == pytest.approx(model.geometry.body_twist(speed, 0.3, -0.2), abs=1e-15)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_slow_turns_approach_the_kinematic_ones(sign):
+    twist = settled(NEUTRAL, sign * 0.2, 0.3, -0.2)
+    rolled = NEUTRAL.geometry.body_twist(sign * 0.2, 0.3, -0.2)
+    assert twist[2] == pytest.approx(rolled[2], rel=1e-3)
+    assert twist[1] == pytest.approx(rolled[1], abs=1e-3)
+    assert twist[2] * sign > 0.0
+
+
+def test_step_follows_the_differential_equation():
+    vx = UNDERSTEER.geometry.body_twist(2.0, 0.1, 0.0)[0]
+    state, h = np.zeros(2), 1e-4
+
+    def f(x):
+        return np.array(UNDERSTEER.rates(np.array(vx), x[0], x[1], np.array(0.1), np.array(0.0)))
+
+    for _ in range(1000):
+        k1 = f(state)
+        k2 = f(state + h / 2 * k1)
+        k3 = f(state + h / 2 * k2)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(state + h * k3))
+    twist = (0.0, 0.0, 0.0)
+    for _ in range(100):
+        twist = UNDERSTEER.step(twist, 2.0, 0.1, 0.0, 0.001)
+    assert twist == pytest.approx((vx, *state), abs=1e-6)
+
+
+def test_any_step_is_stable(rng):
+    twist = tuple(rng.uniform(-0.1, 0.1, (3, 200)))
+    speed, front, rear = rng.uniform(-0.3, 0.3, 200), rng.uniform(-0.4, 0.4, 200), rng.uniform(-0.4, 0.4, 200)
+    for _ in range(20):
+        twist = NEUTRAL.step(twist, speed, front, rear, 0.5)
+    assert np.abs(twist).max() < 1.0
+    one = NEUTRAL.step(tuple(float(c[3]) for c in twist), float(speed[3]), float(front[3]), float(rear[3]), 0.5)
+    many = NEUTRAL.step(twist, speed, front, rear, 0.5)
+    assert one == pytest.approx([float(c[3]) for c in many], abs=1e-14)
+
+
+def test_blend_has_no_jump():
+    speeds = np.linspace(0.0, 0.3, 3001)
+    twist = (0.0 * speeds, 0.0 * speeds, 0.0 * speeds)
+    _, vy, wz = NEUTRAL.step(twist, speeds, 0.0 * speeds + 0.3, 0.0 * speeds, 0.005)
+    assert np.abs(np.diff(wz)).max() < 2e-3
+    assert np.abs(np.diff(vy)).max() < 2e-3
+
+
+def test_rolling_inertia_grows_with_curvature():
+    assert NEUTRAL.rolling_acceleration(7.25, 0.2, 0.0, 0.0) == pytest.approx(1.0)
+    assert NEUTRAL.rolling_acceleration(7.25, 0.2, 2.0, 0.0) == pytest.approx(7.25 / (7.25 + 0.8))
+    # Energy (m + I k^2) v^2 / 2 is kept when no force acts.
+    v, k, rate, h = 0.2, 1.0, 0.5, 1e-5
+    energy = (7.25 + 0.2 * k**2) * v**2
+    for _ in range(1000):
+        v += h * NEUTRAL.rolling_acceleration(0.0, v, k, rate)
+        k += h * rate
+    assert (7.25 + 0.2 * k**2) * v**2 == pytest.approx(energy, rel=1e-6)
+
+
+def test_bad_dynamics_are_named():
+    for changes, field in (
+        ({"mass": 0.0}, "mass"),
+        ({"yaw_inertia": -1.0}, "yaw_inertia"),
+        ({"front_stiffness": math.nan}, "front_stiffness"),
+        ({"blend_from": 0.2}, "blend_to"),
+    ):
+        with pytest.raises(KinematicsError, match=field):
+            SingleTrack(**changes)
+    with pytest.raises(KinematicsError, match="vy is nan"):
+        NEUTRAL.step((0.0, math.nan, 0.0), 0.1, 0.0, 0.0, 0.01)
+    with pytest.raises(KinematicsError, match="dt is 0"):
+        NEUTRAL.step((0.0, 0.0, 0.0), 0.1, 0.0, 0.0, 0.0)

@@ -1,0 +1,120 @@
+"""Moves (R, D, phi) under both speed profiles, for every family."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.families import (
+    Ackermann,
+    Bicycle,
+    Differential,
+    FourWheelSteer,
+    IndependentSteer,
+    Synchro,
+    Tricycle,
+    mecanum,
+    omni,
+)
+from monstertruck_kinematics.profiles import CubicProfile, CubicRamp, Move, TrapezoidalProfile, drive_move
+from monstertruck_kinematics.skid_steer import SkidSteer
+
+ARCS = (Move.arc(1.0, 0.8), Move.arc(-1.0, -0.5), Move.straight(0.6))
+ROBOTS = {
+    "differential": (Differential(), (*ARCS, Move.spot(1.0))),
+    "tricycle": (Tricycle(max_steer=math.pi / 2), (*ARCS, Move.spot(-1.0))),
+    "bicycle": (Bicycle(), ARCS),
+    "ackermann": (Ackermann(), ARCS),
+    "four-wheel steer": (FourWheelSteer(), ARCS),
+    "independent": (IndependentSteer(), (*ARCS, Move.spot(1.0), Move.arc(0.05, 0.3))),
+    "synchro": (Synchro(), (*ARCS, Move.spot(1.0))),
+    "omni": (omni(), (*ARCS, Move.spot(1.0))),
+    "mecanum": (mecanum(), (*ARCS, Move.spot(1.0))),
+    "skid steer": (SkidSteer(0.02, 0.07, -0.06), (*ARCS, Move.spot(1.0))),
+}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("profile", ["trapezoidal", "cubic"])
+def test_every_family_drives_its_moves(name, profile):
+    drive, moves = ROBOTS[name]
+    for move in moves:
+        speeds = (
+            TrapezoidalProfile(move.way, 0.2, 0.4) if profile == "trapezoidal" else CubicProfile(move.way, 0.2, 0.5)
+        )
+        motion = drive_move(drive, move, speeds, start=(1.0, 2.0, 0.5))
+        np.testing.assert_allclose(drive.forward(tuple(motion.commands)), motion.twists, atol=1e-12)
+        assert motion.twists[:, [0, -1]] == pytest.approx(0.0, abs=1e-12)
+        end = motion.poses[:, -1]
+        assert end[2] - 0.5 == pytest.approx(move.angle)
+        if move.radius == 0.0:
+            assert end[:2] == pytest.approx([1.0, 2.0])
+        else:
+            chord = move.length if math.isinf(move.radius) else 2.0 * move.radius * math.sin(move.angle / 2.0)
+            heading = 0.5 + move.angle / 2.0
+            assert end[:2] == pytest.approx([1.0 + chord * math.cos(heading), 2.0 + chord * math.sin(heading)])
+        steers = [i for i, n in enumerate(drive.inputs) if n.startswith("steer") or n in ("front", "rear")]
+        assert (np.ptp(motion.commands[steers], axis=1) < 1e-12).all()
+
+
+@pytest.mark.parametrize("distance", [0.02, 0.5, -0.5, 3.0, 0.0])
+@pytest.mark.parametrize("kind", ["trapezoidal", "cubic"])
+def test_profiles_run_from_rest_to_rest(distance, kind):
+    profile = TrapezoidalProfile(distance, 0.2, 0.4) if kind == "trapezoidal" else CubicProfile(distance, 0.2, 0.5)
+    times = np.linspace(-0.1, profile.duration + 0.1, 20001)
+    way, speed = profile.position(times), profile.speed(times)
+    assert way[[0, -1]] == pytest.approx([0.0, distance], abs=1e-12)
+    assert speed[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert np.abs(speed).max() <= 0.2 + 1e-12
+    step = times[1] - times[0]
+    np.testing.assert_allclose(np.gradient(way, step), speed, atol=2e-4)
+    steepest = 0.4 if kind == "trapezoidal" else 1.5 * 0.2 / 0.5
+    assert np.abs(np.diff(speed)).max() / step <= steepest * (1 + 1e-9)
+    if abs(distance) >= 0.5:
+        assert np.abs(speed).max() == pytest.approx(0.2)
+
+
+def test_ramp_as_published():
+    ramp = CubicRamp(0.0, 0.2, 0.5)
+    assert ramp.coefficients == pytest.approx((2.4, -3.2))
+    assert CubicRamp(0.2, 0.0, 0.5).coefficients == pytest.approx((-2.4, 3.2))
+    assert ramp.acceleration(0.25) == pytest.approx(0.6)
+    assert [ramp.speed(t) for t in (-1.0, 0.0, 0.25, 0.5, 9.0)] == pytest.approx([0.0, 0.0, 0.1, 0.2, 0.2])
+    assert ramp.acceleration(0.6) == 0.0
+    cut = CubicRamp(0.1, -0.2, 0.4, a0=0.6)
+    assert (cut.speed(0.0), cut.acceleration(0.0)) == pytest.approx((0.1, 0.6))
+    assert (cut.speed(0.4), cut.acceleration(0.4)) == pytest.approx((-0.2, 0.0))
+    share = CubicProfile(1.0, 0.2, 0.5)
+    times = np.linspace(0.0, 0.5, 11)
+    np.testing.assert_allclose(share.speed(times), [ramp.speed(float(t)) for t in times], atol=1e-15)
+
+
+def test_moves_beyond_the_robot_are_refused():
+    profile = TrapezoidalProfile(0.5, 0.2, 0.4)
+    with pytest.raises(KinematicsError, match="beyond the drive's limits"):
+        drive_move(FourWheelSteer(), Move.arc(0.2, 0.5), profile)
+    with pytest.raises(KinematicsError, match=r"speed would be 0\.2"):
+        drive_move(FourWheelSteer(max_speed=0.1), Move.straight(0.5), profile)
+    with pytest.raises(KinematicsError, match="vx is 0"):
+        drive_move(FourWheelSteer(), Move.spot(0.5), profile)
+    with pytest.raises(KinematicsError, match=r"profile covers 0\.5: expected the move's 0\.6"):
+        drive_move(Differential(), Move.straight(0.6), profile)
+
+
+def test_bad_moves_and_profiles_are_named():
+    for call, text in (
+        (lambda: Move(1.0, 2.0, 1.0), "length is 2"),
+        (lambda: Move(0.0, 1.0, 1.0), "length is 1"),
+        (lambda: Move(math.inf, 1.0, 0.1), "angle is 0.1"),
+        (lambda: Move(math.nan, 1.0, 0.1), "radius is nan"),
+        (lambda: Move.arc(0.0, 1.0), "radius is 0"),
+        (lambda: Move.straight(math.nan), "length is nan"),
+        (lambda: TrapezoidalProfile(1.0, 0.0, 1.0), "max_speed"),
+        (lambda: TrapezoidalProfile(math.nan, 1.0, 1.0), "distance"),
+        (lambda: CubicProfile(1.0, 1.0, -1.0), "ramp_time"),
+        (lambda: CubicRamp(0.0, math.inf, 1.0), "v1"),
+        (lambda: CubicRamp(0.0, 1.0, 0.0), "duration"),
+    ):
+        with pytest.raises(KinematicsError, match=text):
+            call()
