@@ -268,13 +268,15 @@ class DeviceEnd:
         self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
 
     def _paced(self, free: float, count: int, act: Callable[[], None]) -> float:
+        """Act when ``count`` bytes are through; ``free`` is when those before them are, the result when these are."""
         delay = self.faults.delay
-        if self.baud is None and delay <= 0:
+        loop = asyncio.get_running_loop()
+        if self.baud is None and delay <= 0 and free <= loop.time():
             act()
             return free
-        loop = asyncio.get_running_loop()
-        done = max(free, loop.time()) + (count * 10 / self.baud if self.baud else 0.0)
-        loop.call_at(done + delay, act)
+        # Timers of one instant fire in any order, bytes may not: keep them 0.1 us apart.
+        done = max(free + 1e-7, loop.time() + delay) + (count * 10 / self.baud if self.baud else 0.0)
+        loop.call_at(done, act)
         return done
 
     def _emit(self, data: bytes) -> None:

@@ -46,8 +46,8 @@ class Ramp:
     acceleration: int = 0
 
     def aim(self, target: int) -> None:
-        """Change the target. From or to 0 (no pulses) there is nothing to ramp."""
-        if target == 0 or self.target == 0:
+        """Change the target. Without limits, and from or to 0 (no pulses), there is nothing to ramp."""
+        if target == 0 or self.target == 0 or not (self.speed or self.acceleration):
             self.position, self.velocity = float(target), 0.0
         self.target = target
 

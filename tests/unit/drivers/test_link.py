@@ -207,3 +207,17 @@ async def test_a_pty_nobody_reads_never_blocks_the_emulator(tmp_path: Path):
         pty.device.write(b"fresh")
         assert (await link.until(b"fresh", limit=1 << 20)).endswith(b"fresh")
     pty.unplug()
+
+
+def test_delayed_bytes_keep_their_order_also_when_the_delay_ends():
+    async def main(clock: VirtualClock) -> bytes:
+        port = await plugged()
+        port.device.faults.delay = 0.05
+        port.device.faults.chunk = 1
+        async with await port.open() as link:
+            port.device.write(bytes(range(100)))
+            port.device.faults.delay = 0.0
+            port.device.write(bytes(range(100, 200)))
+            return await link.exactly(200)
+
+    assert run_virtual(main) == bytes(range(200))

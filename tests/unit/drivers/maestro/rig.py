@@ -35,9 +35,10 @@ class Kept(Generic[M]):
     async def count(self, more: int) -> None:
         """Wait for so many messages from now on."""
         wanted = len(self.kept) + more
-        while len(self.kept) < wanted:
-            self._more.clear()
-            await self._more.wait()
+        async with asyncio.timeout(30):
+            while len(self.kept) < wanted:
+                self._more.clear()
+                await self._more.wait()
 
 
 class Commands:

@@ -1,0 +1,504 @@
+"""The driver against the emulator on the virtual clock: commands, deadman, damage, loss."""
+
+import asyncio
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.link import DeviceEnd, MemoryPort, SerialPort
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.driver import MaestroDriver
+from monstertruck_drivers.maestro.emulator import MaestroEmulator
+from monstertruck_drivers.maestro.probe import probe
+from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
+from monstertruck_runtime.errors import (
+    DeviceLostError,
+    DeviceTimeoutError,
+    PortBusyError,
+    ProtocolError,
+    WrongDeviceError,
+)
+from monstertruck_runtime.service import RestartPolicy, supervise
+from monstertruck_schemas.health import ServiceHealth
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import BatteryLevel
+from tests.unit.drivers.maestro.rig import Commands, Events, Gate, Kept, Rig, background, bench
+
+LINE = MaestroConfig(deadman_channel=2)
+
+
+def on_bench(test, config: MaestroConfig | None = None, **options):
+    """Run ``test(rig)`` on the virtual clock."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with bench(clock, config, **options) as rig:
+            await test(rig)
+
+    run_virtual(main)
+
+
+def test_commands_become_pulses_at_once_and_feedback_follows_the_ramp():
+    async def test(rig: Rig) -> None:
+        rig.gate.front, rig.gate.rear = 0.2, -0.1
+        async with rig.driving():
+            await rig.out.count(3)
+            assert rig.pulse(1) == pytest.approx(1439.2 - 10.48 * math.degrees(0.2), abs=0.13)
+            assert rig.pulse(0) == pytest.approx(1439.2 + 10.48 * math.degrees(0.1), abs=0.13)
+            feedback = rig.out.kept[-1]
+            assert feedback.front == pytest.approx(0.2, abs=0.001)
+            assert feedback.rear == pytest.approx(-0.1, abs=0.001)
+            assert feedback.trusted
+            assert feedback.error_word == 0
+            assert feedback.stamp <= feedback.received
+            rig.gate.front = -0.4
+            await rig.settle(0.08)
+            feedback = rig.out.kept[-1]
+            assert -0.39 < feedback.front < 0.15, "speed 100 takes 0.14 s: the pulse is on its way"
+            await rig.settle(0.3)
+            assert rig.out.kept[-1].front == pytest.approx(-0.4, abs=0.001)
+        assert rig.events.kept == []
+
+    on_bench(test)
+
+
+def test_a_command_reaches_the_device_without_waiting_for_the_poll():
+    async def test(rig: Rig) -> None:
+        rig.gate.talking = False
+        async with rig.driving():
+            await rig.settle(1.0)
+            rig.gate.talking = True
+            await rig.settle(0.021)
+            assert rig.pulse(1) is not None
+
+    on_bench(test, MaestroConfig(poll_rate=1.0, command_timeout=1.0))
+
+
+def test_rates_are_those_configured():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(1)
+            feedback, battery = len(rig.out.kept), len(rig.battery.kept)
+            await rig.settle(10)
+            assert len(rig.out.kept) - feedback == pytest.approx(200, abs=2)
+            assert len(rig.battery.kept) - battery == pytest.approx(100, abs=2)
+        assert [m.seq for m in rig.out.kept] == list(range(len(rig.out.kept)))
+
+    on_bench(test)
+
+
+def test_before_the_first_command_nothing_pulses_and_feedback_says_so():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(10)
+            assert rig.pulse(1) is None
+            assert not rig.out.kept[-1].trusted
+            assert rig.outputs == []
+        assert rig.events.kept == []
+
+    on_bench(test, LINE, gate=False, serial_timeout_s=0.5)
+
+
+def test_a_stale_command_from_before_the_session_is_not_obeyed():
+    async def test(rig: Rig) -> None:
+        await rig.settle(0.1)
+        rig.gate.talking = False
+        await rig.settle(1.0)
+        async with rig.driving():
+            await rig.settle(1.0)
+            assert rig.pulse(1) is None
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("feed", ["fresh", "always"])
+def test_when_commands_stop_servos_hold_and_the_line_falls(feed: str):
+    async def test(rig: Rig) -> None:
+        rig.gate.front = 0.3
+        async with rig.driving():
+            await rig.settle(1.0)
+            assert [level for _, level, _ in rig.outputs] == [True]
+            pulse, stopped = rig.pulse(1), rig.clock.now()
+            rig.gate.talking = False
+            await rig.settle(2.0)
+            assert rig.pulse(1) == pulse
+            _, level, when = rig.outputs[-1]
+            assert not level
+            assert when - stopped <= 0.32 * SECOND
+            assert rig.events.reasons() == [Reason.TICK_STALLED]
+            silence = rig.clock.now() - rig.out.kept[-1].received
+            if feed == "always":
+                assert silence < 0.1 * SECOND
+            else:
+                assert silence > 1.5 * SECOND
+            rig.gate.talking = True
+            await rig.settle(0.2)
+            assert rig.outputs[-1][1]
+            assert rig.out.kept[-1].trusted
+        timed_out = any(word.error_word & 0x20 for word in rig.out.kept)
+        assert timed_out == (feed == "fresh"), "silence lets the device's own time-out trip"
+
+    on_bench(test, MaestroConfig(deadman_channel=2, deadman_feed=feed), serial_timeout_s=0.5)
+
+
+def test_a_hung_driver_drops_the_line_by_the_serial_timeout():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(1.0)
+            hung = rig.clock.now()
+            rig.port.device.faults.deaf = True
+            rig.gate.talking = False
+            await rig.settle(0.7)
+            _, level, when = rig.outputs[-1]
+            assert not level
+            assert when - hung <= 0.51 * SECOND
+            rig.port.device.faults.deaf = False
+
+    with pytest.raises(DeviceTimeoutError):  # the driver noticed too
+        on_bench(test, MaestroConfig(deadman_channel=2, deadman_feed="always"), serial_timeout_s=0.5)
+
+
+def test_ending_the_session_releases_the_line():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            assert rig.outputs[-1][1]
+        await rig.settle(0.01)
+        assert not rig.outputs[-1][1]
+
+    on_bench(test, LINE)
+
+
+def test_an_error_word_makes_feedback_untrusted_and_everything_is_sent_again():
+    async def test(rig: Rig) -> None:
+        rig.gate.front = 0.3
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.gate.talking = False  # so that only the driver itself can restore the targets
+            rig.emulator.inject("at_junk")
+            assert rig.pulse(1) is None, "home is off here"
+            assert not rig.outputs[-1][1]
+            await rig.settle(0.06)
+            assert rig.pulse(1) == pytest.approx(1439.2 - 10.48 * math.degrees(0.3), abs=0.13)
+            assert rig.outputs[-1][1]
+            wrong = [m for m in rig.out.kept if m.error_word]
+            assert [(m.error_word, m.trusted) for m in wrong] == [(0x10, False)]
+            assert wrong[0].front == pytest.approx(0.3, abs=0.001), "no pulses: the servo stays where it was"
+            await rig.settle(0.1)
+            assert rig.out.kept[-1].trusted
+        reason, _, text, values = rig.events.kept[0]
+        assert reason is Reason.DEVICE_FAULT
+        assert "protocol" in text
+        assert values == {"error_word": 0x10}
+
+    on_bench(test, LINE, home={0: "off", 1: "off", 2: "off"})
+
+
+def test_lasting_errors_are_reported_once():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            for _ in range(20):
+                await rig.settle(0.05)
+                rig.emulator.inject("error", "1")
+            await rig.settle(0.2)
+        assert rig.events.reasons() == [Reason.DEVICE_FAULT]
+
+    on_bench(test)
+
+
+def test_lost_pulses_are_noticed_without_an_error_word():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.gate.talking = False
+            rig.emulator.power_cycle()
+            rig.port.device.take(b"\xa1")  # somebody else read the error
+            await rig.settle(0.1)
+            assert rig.pulse(1) is not None
+            assert "pulses off" in rig.events.kept[0][2]
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("options", [{"use_crc": True}, {"device_number": 12}, {"device_number": 12, "use_crc": True}])
+def test_every_form_of_the_protocol(options: dict):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+            assert rig.out.kept[-1].trusted
+        assert rig.events.kept == []
+
+    on_bench(test, MaestroConfig(**options), crc=options.get("use_crc", False))
+
+
+def test_pending_power_up_errors_are_no_news():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("at_junk")
+        async with rig.driving():
+            await rig.out.count(3)
+        assert all(m.error_word == 0 for m in rig.out.kept)
+
+    on_bench(test)
+
+
+# Battery
+
+
+def test_the_battery_is_read_judged_and_reported():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("battery", "23.5")
+        async with rig.driving():
+            await rig.settle(3)
+            battery = rig.battery.kept[-1]
+            assert battery.voltage == pytest.approx(23.5, abs=0.1)
+            assert battery.raw_voltage == pytest.approx(23.5, abs=0.2)
+            assert (battery.level, battery.cells) == (BatteryLevel.NORMAL, 6)
+            rig.emulator.inject("battery", "21.5")
+            await rig.settle(11)
+            assert rig.battery.kept[-1].level is BatteryLevel.LOW
+            rig.emulator.inject("battery", "19")
+            await rig.settle(3)
+            assert rig.battery.kept[-1].level is BatteryLevel.CRITICAL
+            rig.emulator.inject("battery", "0")
+            await rig.settle(1)
+            assert rig.battery.kept[-1].level is BatteryLevel.SENSOR_FAULT
+            assert rig.battery.kept[-1].voltage is None
+        assert rig.events.reasons() == [Reason.BATTERY_LOW, Reason.BATTERY_CRITICAL, Reason.DEVICE_FAULT]
+
+    on_bench(test)
+
+
+def test_without_a_battery_input_none_is_read():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+        assert rig.battery.kept == []
+        assert b"\x90\x05" not in bytes(rig.emulator.received)
+
+    on_bench(test, MaestroConfig(battery=None))
+
+
+# Damage and loss
+
+
+def test_one_byte_at_a_time_and_delay():
+    async def test(rig: Rig) -> None:
+        rig.port.device.faults.chunk = 1
+        rig.port.device.faults.delay = 0.01
+        async with rig.driving():
+            await rig.out.count(20)
+            assert rig.out.kept[-1].trusted
+        assert rig.events.kept == []
+
+    on_bench(test)
+
+
+def test_damaged_answers_never_become_wild_angles_for_long():
+    async def test(rig: Rig) -> None:
+        faults = rig.port.device.faults
+        faults.seed(1)
+        rig.gate.front = 0.2
+        async with rig.driving():
+            await rig.out.count(10)
+            faults.drop_rate = 0.01
+            await rig.settle(20)
+            faults.drop_rate = 0.0
+            await rig.settle(0.2)
+            assert rig.out.kept[-1].front == pytest.approx(0.2, abs=0.001)
+            assert rig.out.kept[-1].trusted
+        assert len(rig.out.kept) > 300
+
+    on_bench(test)
+
+
+def test_garbage_before_an_answer_costs_one_poll():
+    async def test(rig: Rig) -> None:
+        rng = np.random.default_rng(3)
+        async with rig.driving():
+            for _ in range(20):
+                await rig.out.count(1)
+                rig.port.device.faults.garbage = rng.bytes(9)
+            await rig.settle(0.3)
+            assert rig.out.kept[-1].trusted
+
+    on_bench(test)
+
+
+def test_garbage_at_the_start_is_survived():
+    async def test(rig: Rig) -> None:
+        rig.port.device.faults.garbage = b"\xff\xfe~~"
+        async with rig.driving():
+            await rig.out.count(2)
+
+    on_bench(test)
+
+
+def test_a_stall_ends_the_session():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+            rig.port.device.faults.stalled = True
+            await rig.settle(0.6)
+
+    with pytest.raises(DeviceTimeoutError, match="/dev/test: no answer"):
+        on_bench(test)
+
+
+def test_a_short_stall_does_not():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+            rig.port.device.faults.stalled = True
+            await rig.settle(0.15)
+            rig.port.device.faults.stalled = False
+            await rig.settle(0.2)
+            assert rig.out.kept[-1].trusted
+
+    on_bench(test)
+
+
+def test_answers_out_of_form_end_the_session():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+            rig.port.device.faults.flip_rate = 1.0
+            await rig.settle(2)
+
+    with pytest.raises(ProtocolError, match="out of form"):
+        on_bench(test)
+
+
+def test_unplugging_is_noticed_even_while_silent():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+            rig.gate.talking = False
+            await rig.settle(1)
+            rig.port.unplug()
+            await rig.settle(0.1)
+
+    with pytest.raises(DeviceLostError):
+        on_bench(test)
+
+
+def test_nothing_plugged_in_and_a_busy_port():
+    async def test(rig: Rig) -> None:
+        async with await rig.port.open():
+            with pytest.raises(PortBusyError):
+                await rig.session()
+        rig.port.unplug()
+        with pytest.raises(DeviceLostError, match="not plugged in"):
+            await rig.session()
+
+    on_bench(test)
+
+
+def test_uart_mode_is_explained():
+    async def test(rig: Rig) -> None:
+        with pytest.raises(DeviceTimeoutError, match="USB Dual Port"):
+            await rig.session()
+        assert rig.ready_at == []
+
+    on_bench(test, mode="uart")
+
+
+async def _chatter(end: DeviceEnd, clock: VirtualClock) -> None:
+    """Another device: a compass that streams."""
+    while True:
+        end.write(b"$C320.5P0.2R-18.3T19.0*3C\r\n")
+        await clock.sleep(0.05)
+
+
+async def _echo(end: DeviceEnd, clock: VirtualClock) -> None:
+    """Another device: repeats what it hears."""
+    while True:
+        end.write(await end.read())
+
+
+async def _words(end: DeviceEnd, clock: VirtualClock) -> None:
+    """Another device: answers every request with a full line."""
+    while True:
+        await end.read()
+        end.write(b"\0\0\0\0\0\0\0\0\n")
+
+
+@pytest.mark.parametrize("device", [_chatter, _echo, _words])
+def test_a_wrong_device_is_refused(device):
+    async def main(clock: VirtualClock) -> None:
+        port = MemoryPort("/dev/test")
+        port.plug()
+        rig = Rig(clock, port, MaestroConfig())
+        async with background(device(port.device, clock)):
+            with pytest.raises(WrongDeviceError, match="/dev/test: no Maestro"):
+                await rig.session()
+        assert rig.ready_at == []
+
+    run_virtual(main)
+
+
+async def _supervised(rig: Rig, health: list[ServiceHealth]) -> None:
+    await supervise(rig.driver, RestartPolicy(), rig.clock, health.append, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("fault", ["unplug", "brown_out"])
+def test_back_within_two_seconds_of_being_plugged_in_again(fault: str):
+    async def test(rig: Rig) -> None:
+        rig.gate.front = 0.25
+        async with background(_supervised(rig, [])):
+            await rig.settle(2)
+            if fault == "unplug":
+                rig.port.unplug()
+                await rig.settle(10)
+                rig.port.plug()
+            else:
+                rig.emulator.inject("brown_out", "0.3")
+                await rig.settle(0.3)
+            back = rig.clock.now()
+            rig.out.kept.clear()
+            await rig.out.count(2)
+            assert rig.clock.now() - back < 2 * SECOND
+            assert rig.out.kept[-1].front == pytest.approx(0.25, abs=0.001)
+            assert rig.out.kept[-1].trusted
+            assert rig.emulator._ramps[1].speed == 100, "the speed limit is set anew"
+
+    on_bench(test)
+
+
+# Probe and wall clock
+
+
+def test_probe_reads_and_moves_nothing():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("noise", "0")
+        rig.gate.talking = False
+        found = await probe(rig.port, rig.clock)
+        assert found["errors"] == ["serial_signal"]
+        assert found["channels"][5] == {"channel": 5, "if_servo_us": 122.75, "if_input_v": 2.4}
+        assert b"\x84" not in bytes(rig.emulator.received)
+
+    on_bench(test)
+
+
+async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
+    clock = WallClock()
+    pty = PtyPort(tmp_path / "servos")
+    emulator = MaestroEmulator(clock)
+    commands, out, battery = Commands(), Kept(), Kept()
+    gate = Gate(clock, commands)
+    gate.front = 0.1
+    driver = MaestroDriver(MaestroConfig(), SerialPort(tmp_path / "servos"), clock, commands, out, battery, Events())
+    pty.plug()
+    try:
+        async with (
+            background(emulator.run(pty.device)),
+            background(gate.run()),
+            background(driver.run(lambda: None)),
+            asyncio.timeout(5),
+        ):
+            await out.count(5)
+        assert out.kept[-1].trusted
+        assert out.kept[-1].front == pytest.approx(0.1, abs=0.001)
+    finally:
+        pty.unplug()
