@@ -185,7 +185,7 @@ class _Session:
                 if self._line.quiet_until > end:
                     return
                 await self._control(Control.QUICK_STOP)
-                while abs(await self._line.read(od.VELOCITY_AVERAGED)) > self._config.standstill_rpm:
+                while abs(await self._line.read(od.VELOCITY)) > self._config.standstill_rpm:
                     if self._clock.now() > end - int(DISABLE_TIME * SECOND):
                         return  # a power stage switched off would let it roll
                 await self._control(Control.DISABLE_VOLTAGE)

@@ -158,6 +158,7 @@ class Rig:
     async def drive(self, rpm: float) -> None:
         """Run until the shaft has this speed (robot's sign)."""
         self.gate.say(DriveAction.RUN, rpm)
+        await self.until(lambda: bool(self.out.kept))
         await self.until(lambda: abs(self.shaft_rpm + rpm) < 1 and self.newest.mode is DriveMode.ENABLED)
         await self.settle(0.2)
 
@@ -176,9 +177,10 @@ async def background(coroutine: Coroutine[Any, Any, Any]) -> AsyncIterator[async
     try:
         yield task
     finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        if not task.done():  # otherwise the test has seen how it ended
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
 
 
 @contextlib.asynccontextmanager

@@ -1,0 +1,326 @@
+"""The host's half of the handshake: time-outs, damage, recovery, cancellation."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.emulator import EposEmulator
+from monstertruck_drivers.epos.exchange import Exchanger, ObjectError
+from monstertruck_drivers.epos.protocol import Segment, answer, segment_request
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
+from tests.unit.drivers.epos.rig import on_line
+
+DISABLED = 0x1340
+O, F = b"O", b"F"  # noqa: E741
+ANSWER = answer(0, DISABLED, 0).body
+
+
+class Peer:
+    """A device that says what a script says: each host write is met by the next reply."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.written: list[tuple[float, bytes]] = []
+        self.replies: list[bytes] = []
+        self._clock = clock
+        self.link = Link("peer", self._take, lambda: None)
+
+    def _take(self, data: bytes) -> None:
+        self.written.append((self._clock.now() / SECOND - 1, data))
+        if self.replies:
+            self.link.feed(self.replies.pop(0))
+
+
+def with_peer(*replies: bytes) -> Callable[[Callable[[Peer, Exchanger], Coroutine[Any, Any, None]]], None]:
+    """Run ``test(peer, line)`` against scripted replies."""
+
+    def run(test: Callable[[Peer, Exchanger], Coroutine[Any, Any, None]]) -> None:
+        async def main(clock: VirtualClock) -> None:
+            peer = Peer(clock)
+            peer.replies = list(replies)
+            line = Exchanger(peer.link, clock, 1)
+            try:
+                await test(peer, line)
+            finally:
+                peer.link.close()
+                await line.close()
+
+        run_virtual(main)
+
+    return run
+
+
+async def time_of(clock: VirtualClock, act: Awaitable[Any]) -> float:
+    start = clock.now()
+    await act
+    return (clock.now() - start) / SECOND
+
+
+def test_the_worked_exchange():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        assert await line.read(od.STATUSWORD) == 0x0337
+        sent = [data.hex(" ").upper() for _, data in peer.written]
+        assert sent == ["10", "01 41 60 00 01 AB F0", "4F", "4F"]
+
+    with_peer(O, O + b"\0", bytes.fromhex("03 00 00 00 00 37 03 00 00 AD F6"))(test)
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_the_acknowledge_and_the_answer_may_come_together_or_apart(step: int):
+    async def main(clock: VirtualClock) -> None:
+        def drip(data: bytes) -> None:
+            link.feed(data)
+
+        def take(data: bytes) -> None:
+            reply = replies.pop(0)
+            for i in range(0, len(reply), step):
+                asyncio.get_running_loop().call_later(0.001 * i, drip, reply[i : i + step])
+
+        replies = [O, O + b"\0", ANSWER, b""]
+        link = Link("peer", take, lambda: None)
+        assert await Exchanger(link, clock, 1).read(od.STATUSWORD) == DISABLED
+
+    run_virtual(main)
+
+
+def test_object_errors_carry_their_code_and_end_the_exchange():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        with pytest.raises(
+            ObjectError, match=r"0x6060/0 \(mode of operation\) = 99: 0x06090031 \(value too high\)"
+        ) as caught:
+            await line.write(od.MODE, 99)
+        assert caught.value.code == od.TOO_HIGH
+        assert await time_of(clock, line.read(od.STATUSWORD)) < 0.01
+
+    on_line(test)
+
+
+@pytest.mark.parametrize("refusals", [1, 3])
+def test_busy_is_asked_again_after_5_to_20_ms(refusals: int):
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("busy", str(refusals))
+        took = await time_of(clock, line.read(od.STATUSWORD))
+        assert refusals * 0.005 < took < refusals * 0.02
+
+    on_line(test)
+
+
+def test_busy_for_ever_is_a_timeout_but_needs_no_silence():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("busy", "4")
+        with pytest.raises(DeviceTimeoutError, match="stays busy"):
+            await line.read(od.STATUSWORD)
+        assert await time_of(clock, line.read(od.STATUSWORD)) < 0.01
+
+    on_line(test)
+
+
+def test_a_refused_frame_is_sent_once_more():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("refuse", "1")
+        assert await time_of(clock, line.read(od.STATUSWORD)) < 0.01
+        emulator.inject("refuse", "2")
+        with pytest.raises(ProtocolError, match="refused twice"):
+            await line.read(od.STATUSWORD)
+
+    on_line(test)
+
+
+@pytest.mark.parametrize("repeats", ["on", "off"])
+def test_a_damaged_answer_is_refused_and_read_again(repeats: str):
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("repeat", repeats)
+        emulator.inject("flip", "1")
+        start = clock.now()
+        assert await line.read(od.STATUSWORD) == DISABLED
+        assert (clock.now() - start) / SECOND < 0.06, "no silence needed"
+        assert len(emulator.frames) == (1 if repeats == "on" else 2)
+
+    on_line(test)
+
+
+def test_damage_that_stays_is_an_error():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("flip", "2")
+        with pytest.raises(ProtocolError, match="damaged twice"):
+            await line.read(od.STATUSWORD)
+
+    on_line(test)
+
+
+def test_an_impossible_length_is_damage():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        assert await line.read(od.STATUSWORD) == DISABLED
+        assert [data for _, data in peer.written][2:4] == [O, F]
+
+    with_peer(O, O + b"\0", b"\x83" + ANSWER[1:], ANSWER)(test)
+
+
+def test_a_repeated_answer_that_is_damaged_too_is_an_error():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(ProtocolError, match="damaged too"):
+            await line.read(od.STATUSWORD)
+
+    with_peer(O, O + b"\0", ANSWER[:-1] + b"\0", ANSWER[:-1] + b"\1")(test)
+
+
+@pytest.mark.parametrize("strays", [1, 2, 3])
+def test_stray_bytes_before_an_acknowledge_are_skipped(strays: int):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        assert await line.read(od.STATUSWORD) == DISABLED
+
+    junk = b"\xa5\x00\xff"[:strays]
+    with_peer(junk + O, junk + O + b"\0", ANSWER)(test)
+
+
+@pytest.mark.parametrize(
+    ("replies", "message"),
+    [
+        ((b"$C12",), "24 43 31 32 instead of an acknowledge"),
+        ((O, O + b"\x55"), "55 instead of an answer"),
+        ((O, O + b"\0", answer().body), "answer of 2 words"),
+        ((O,), "no answer within 0.1 s"),
+        ((O, O), "no answer within 0.25 s"),
+        ((O, O + b"\0", ANSWER[:5]), "no answer within 0.1 s"),
+    ],
+)
+def test_wrong_answers(replies: tuple[bytes, ...], message: str):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises((DeviceTimeoutError, ProtocolError), match=message):
+            await line.read(od.STATUSWORD)
+
+    with_peer(*replies)(test)
+
+
+def test_after_a_timeout_nothing_is_sent_for_550_ms():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(DeviceTimeoutError):
+            await line.read(od.STATUSWORD)
+        failed = peer.written[-1][0] + 0.1
+        peer.replies = [O, O + b"\0", ANSWER]
+        assert await line.read(od.STATUSWORD) == DISABLED
+        assert peer.written[2][0] - failed == pytest.approx(0.55, abs=0.001)
+
+    with_peer(O, b"")(test)
+
+
+def test_late_bytes_prolong_the_silence_and_are_never_taken_for_an_answer():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("delay", "600", "1")
+        with pytest.raises(DeviceTimeoutError):
+            await line.read(od.POSITION)
+        assert 0.85 < await time_of(clock, line.settle()) < 1.0
+        assert await line.read(od.STATUSWORD) == DISABLED
+
+    on_line(test)
+
+
+def test_retries_are_counted():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("delay", "600", "1")
+        assert await line.read(od.STATUSWORD, attempts=2) == DISABLED
+        emulator.inject("silent", "on")
+        with pytest.raises(DeviceTimeoutError):
+            await line.read(od.STATUSWORD, attempts=2)
+        with pytest.raises(ValueError, match="at least one"):
+            await line.read(od.STATUSWORD, attempts=0)
+
+    on_line(test)
+
+
+def test_a_line_that_never_falls_silent_does_not_hang():
+    async def main(clock: VirtualClock) -> None:
+        link = Link("chatter", lambda _: None, lambda: None)
+
+        async def chatter() -> None:
+            while True:
+                link.feed(b"$C320.5P0.2R-18.3T19.0*3C\r\n")
+                await clock.sleep(0.05)
+
+        task = asyncio.create_task(chatter())
+        line = Exchanger(link, clock, 1)
+        start = clock.now()
+        with pytest.raises(ProtocolError):
+            await line.read(od.STATUSWORD, attempts=2)
+        assert (clock.now() - start) / SECOND < 1.5
+        assert line.strange
+        assert not line.acknowledged
+        task.cancel()
+
+    run_virtual(main)
+
+
+def test_a_cancelled_exchange_is_finished_before_the_next():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        emulator.inject("delay", "50", "1")
+        task = asyncio.create_task(line.write(od.TARGET_VELOCITY, 5))
+        await clock.sleep(0.02)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert await line.read(od.STATUSWORD) == DISABLED
+        assert len(emulator.frames) == 2
+        assert line.quiet_until == 0
+
+    on_line(test)
+
+
+def test_a_lost_link_ends_the_exchange_and_leaves_word_when_to_go_on():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        asyncio.get_running_loop().call_later(0.05, peer.link.lose, "unplugged")
+        with pytest.raises(DeviceLostError):
+            await line.read(od.STATUSWORD)
+        assert line.quiet_until == pytest.approx((1.05 + 0.55) * SECOND, abs=0.001 * SECOND)
+
+    with_peer(O)(test)
+
+
+def test_an_exchange_waits_for_the_silence_left_by_an_earlier_link():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        line.quiet_until = clock.now() + SECOND // 4
+        assert await time_of(clock, line.read(od.STATUSWORD)) == pytest.approx(0.253, abs=0.002)
+
+    on_line(test)
+
+
+def test_long_objects_come_in_segments():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        assert (await line.read_long(od.SERIAL_NUMBER)).hex() == "6301602400001234"
+        assert await line.read_long(od.SOFTWARE_VERSION) == b"\x24\x20"
+
+    on_line(test)
+
+
+def segment_replies(*segments: tuple[int, ...]) -> list[bytes]:
+    replies = [O, O + b"\0", answer().body, b""]
+    for words in segments:
+        replies += [O, O + b"\0", answer(0, *words).body, b""]
+    return replies
+
+
+def test_endless_or_short_segments_are_errors():
+    async def endless(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(ProtocolError, match="more than 16 segments"):
+            await line.read_long(od.SERIAL_NUMBER)
+
+    async def short(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(ProtocolError, match="shorter"):
+            await line.read_long(od.SERIAL_NUMBER)
+
+    with_peer(*segment_replies(*[Segment(b"ab", False, True).words] * 16))(endless)
+    with_peer(*segment_replies((0x0005,)))(short)
+
+
+def test_a_wrong_toggle_bit_is_refused():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        await line.read_long(od.SERIAL_NUMBER)
+        await line.read_long(od.SOFTWARE_VERSION)
+        emulator._long = (b"abc", True)
+        with pytest.raises(ObjectError, match="toggle"):
+            await line._answer(segment_request(False), "segment", 1)
+
+    on_line(test)
