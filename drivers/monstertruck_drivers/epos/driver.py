@@ -112,8 +112,8 @@ class EposDriver:
                     if not link.is_lost:
                         await session.make_safe()
                 finally:
-                    self._quiet_until = line.quiet_until
                     await line.close()
+                    self._quiet_until = line.quiet_until
 
 
 class _Session:

@@ -25,7 +25,7 @@ from monstertruck_drivers.epos.protocol import (
 )
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 
 ACKNOWLEDGE_TIMEOUT = 0.1
 ANSWER_TIMEOUT = 0.25
@@ -142,17 +142,14 @@ class Exchanger:
 
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
-        flight, self._flight = self._flight, None
-        if flight is not None:
-            with suppress(DeviceTimeoutError, ProtocolError, DeviceLostError):
-                await flight
+        if self._flight is not None and not self._flight.done():
+            await asyncio.wait([self._flight])
 
     async def close(self) -> None:
         """Give up an exchange that is still under way."""
         if self._flight is not None:
             self._flight.cancel()
-            with suppress(asyncio.CancelledError):
-                await self.finish()
+            await self.finish()
 
     async def _answer(self, request: Frame, subject: str, attempts: int) -> Frame:
         for left in reversed(range(attempts)):
@@ -172,9 +169,8 @@ class Exchanger:
         await self.finish()
         await self.settle()
         self._flight = asyncio.create_task(self._run(request, answered))
-        frame = await asyncio.shield(self._flight)
-        self._flight = None
-        return frame
+        self._flight.add_done_callback(_retrieve)
+        return await asyncio.shield(self._flight)
 
     async def settle(self) -> None:
         """Let the controller forget a half frame: silence on the line, from both sides.
@@ -284,6 +280,12 @@ class Exchanger:
                 return await self._link.exactly(count)
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
+
+
+def _retrieve(flight: "asyncio.Task[Frame | None]") -> None:
+    """Nobody may be left to ask how an exchange ended."""
+    if not flight.cancelled():
+        flight.exception()
 
 
 class _BusyError(Exception):
