@@ -82,3 +82,12 @@ class Reason(StrEnum):
     CLOCK_STEPPED = "clock_stepped", 82, "real time was stepped"
     MESSAGES_DROPPED = "messages_dropped", 83, "a bounded queue overflowed"
     PATH_LOST = "path_lost", 84, "truck is too far from its path"
+
+    # USB
+    HUB_LOST = "hub_lost", 100, "a USB hub vanished with everything behind it"
+    HUB_RETURNED = "hub_returned", 0, "a USB hub is back, its devices start one after the other"
+    OVER_CURRENT = "over_current", 101, "a USB port drew too much current"
+    AUTOSUSPEND = "autosuspend", 102, "the kernel may suspend a USB device in use"
+    PORT_MOVED = "port_moved", 103, "a device was plugged into another port than configured"
+    SLOW_LINK = "slow_link", 104, "the latency of an FTDI adapter cannot be lowered"
+    PORT_CYCLED = "port_cycled", 105, "a USB port was switched off and on"

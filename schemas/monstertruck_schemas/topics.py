@@ -13,6 +13,7 @@ from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, Transforms
+from monstertruck_schemas.usb import UsbTree
 
 M = TypeVar("M", bound=Message)
 
@@ -106,6 +107,7 @@ CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command se
 HEALTH: Final = Topic("health/services", HealthTable, W.DAEMON, "Every service's state", 1, 3.0, retained=True)
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, 3.0)
 RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, 3.0, retained=True)
+USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
 

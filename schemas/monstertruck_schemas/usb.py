@@ -1,0 +1,53 @@
+"""The USB tree as the ``health`` group publishes it: hubs, ports, devices, and why one may not start yet."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Message, Schema
+
+
+class UsbState(StrEnum):
+    """What a port of the tree is good for at the moment."""
+
+    PRESENT = "present"
+    ABSENT = "absent"
+    """Nothing plugged in where a device was, or should be."""
+    WAITING = "waiting"
+    """Gone together with its hub, or back and waiting for its turn to start."""
+    HELD = "held"
+    """The port reported over-current: not started for a while."""
+
+
+class UsbNode(Schema):
+    """One hub or device, named by where it is plugged in."""
+
+    name: str
+    """Kernel's name of the place: ``usb1`` is a root hub, ``1-1.2`` is port 2 of the hub at root port 1."""
+    parent: str | None
+    """Name of the hub; None for a root hub."""
+    title: str = ""
+    """Product as the device calls itself."""
+    usb_id: str | None = None
+    """``vendor:product``, four hex digits each; None if it was never there."""
+    hub: bool = False
+    tty: str | None = None
+    """Serial node at this moment, e.g. ``ttyUSB0``."""
+    role: str | None = None
+    """Place in the configuration's ``devices``."""
+    state: UsbState
+    replugs: Annotated[int, Field(ge=0)] = 0
+    """Times it came back since the daemon started."""
+    over_current: Annotated[int, Field(ge=0)] = 0
+    """Over-current conditions of the port it hangs on, since the hub came."""
+    autosuspend: bool = False
+    """The kernel may suspend it, which costs the first bytes or a reset."""
+    latency_ms: int | None = None
+    """FTDI latency timer; None for other chips."""
+
+
+class UsbTree(Message):
+    """Everything on the USB buses, and the configured devices that are not there; parents before children."""
+
+    nodes: tuple[UsbNode, ...]
