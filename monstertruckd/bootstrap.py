@@ -117,17 +117,18 @@ def run(program: Path, *arguments: str) -> int:
 def check(arguments: list[str]) -> int:
     """All checks, cheapest first; stops at the first that fails. ``arguments`` go to pytest."""
     tools = VENV / "bin"
-    steps = [
-        (tools / "ruff", "check", "."),
-        (tools / "ruff", "format", "--check", "."),
-        (tools / "mypy",),
-        (tools / "lint-imports",),
-        (tools / "pytest", "-n", "2", "-m", "not wall and not virtual", "--cov", "--cov-report=", *arguments),
-        (tools / "coverage", "report", f"--include={','.join(COVERED)}", "--fail-under=95", "--skip-covered"),
-        (tools / "pytest", "-n", "2", "-m", "virtual", *arguments),
-        (tools / "pytest", "-m", "wall", *arguments),
+    pytest = tools / "pytest"
+    steps: list[tuple[Path, list[str]]] = [
+        (tools / "ruff", ["check", "."]),
+        (tools / "ruff", ["format", "--check", "."]),
+        (tools / "mypy", []),
+        (tools / "lint-imports", []),
+        (pytest, ["-n", "2", "-m", "not wall and not virtual", "--cov", "--cov-report=", *arguments]),
+        (tools / "coverage", ["report", f"--include={','.join(COVERED)}", "--fail-under=95", "--skip-covered"]),
+        (pytest, ["-n", "2", "-m", "virtual", *arguments]),
+        (pytest, ["-m", "wall", *arguments]),
     ]
-    for program, *rest in steps:
+    for program, rest in steps:
         print(f"==> {program.name} {' '.join(rest)}", flush=True)
         if code := run(program, *rest):
             return code

@@ -3,9 +3,13 @@
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
+from monstertruck_schemas.health import HealthTable, LoopHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset
+from monstertruck_schemas.topics import LOOP, RECORDER, Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.gate.service import GateService
+from monstertruckd.recorder.recorder import Recorder
 
 PERIOD = 1.0
 STEP = SECOND // 20
@@ -80,3 +84,45 @@ class ClockService:
             self._out.put(ClockOffset(stamp=now, received=now, seq=self._out.next_seq(), offset=offset, stepped=step))
             before = offset
             await self._clock.sleep(PERIOD)
+
+
+class MeterService:
+    """Publishes the control tick's punctuality and the recorder's state once a second."""
+
+    name = "meter"
+
+    def __init__(
+        self,
+        clock: Clock,
+        gate: GateService,
+        recorder: Recorder | None,
+        bus: Bus,
+    ) -> None:
+        self._clock = clock
+        self._gate = gate
+        self._recorder = recorder
+        self._bus = bus
+        self._loop = bus.publisher(LOOP, Writer.DAEMON)
+        self._recording = bus.publisher(RECORDER, Writer.DAEMON)
+
+    async def run(self, ready: Ready) -> None:
+        """Publish until cancelled."""
+        ready()
+        while True:
+            await self._clock.sleep(PERIOD)
+            now = self._clock.now()
+            late = self._gate.lateness()
+            self._loop.put(
+                LoopHealth(
+                    stamp=now,
+                    received=now,
+                    seq=self._loop.next_seq(),
+                    ticks=late.ticks,
+                    lateness_p50=late.p50,
+                    lateness_p99=late.p99,
+                    lateness_max=late.max,
+                    drops=self._bus.drops,
+                )
+            )
+            if self._recorder is not None:
+                self._recording.put(self._recorder.health(self._recording.next_seq()))

@@ -32,6 +32,7 @@ def _options(
 
 
 app.command("demo")(demo.demo)
+app.command("simulate")(demo.simulate)
 app.command("run")(robot.run)
 app.command("check-config")(robot.check_config)
 app.command("topics")(robot.topics)

@@ -14,7 +14,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable outpu
 
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
     """Run the daemon until SIGTERM or Ctrl-C: neutral first, then everything is closed in order."""
-    from monstertruckd.daemon import run_daemon
+    from monstertruckd.run import run_daemon
 
     raise typer.Exit(run_daemon(config, verbose=verbose).exit_code)
 

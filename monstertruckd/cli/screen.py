@@ -5,12 +5,14 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.layout import Layout
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from monstertruck_planners.collision import scan_points
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
@@ -33,6 +35,8 @@ STATE_STYLE = {
     ServiceState.STOPPED: "dim",
 }
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
+LIDAR = (0.14, 0.0, 0.0)
+"""Mount assumed by the picture; the robot's own transforms are not needed for a screen of this grain."""
 VIEW_METRES = 2.4
 """Half the width of the scan view."""
 
@@ -127,9 +131,7 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "path", f"{bar:░<14} {done:4.0%}")
         _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
     if state.loop is not None:
-        _row(
-            table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}"
-        )
+        _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
     return Panel(table, title=f"mt/{state.robot}", border_style="dim")
 
 
@@ -173,7 +175,8 @@ class _Braille:
         height: int = getattr(options, "height", None) or 20
         scale = min(width * 2, height * 4) / (2 * VIEW_METRES)
         cells = np.zeros((height, width), np.uint8)
-        _plot(cells, scan_points(self._state.scan), scale)
+        if self._state.scan is not None:
+            _plot(cells, scan_points(self._state.scan, LIDAR), scale)
         trail_cells = np.zeros_like(cells)
         _plot(trail_cells, _trail_points(self._state), scale)
         lines = [Text() for _ in range(height)]
@@ -189,29 +192,20 @@ def _with_arrow(line: str, at: int) -> str:
     return f"{line[:at]}▲{line[at + 1 :]}"
 
 
-def scan_points(scan: LaserScan | None, mount_x: float = 0.14) -> np.ndarray:
-    """Valid returns as points in the base frame, shape (n, 2), m."""
-    if scan is None:
-        return np.empty((0, 2))
-    angles = np.linspace(scan.start_angle, scan.end_angle, len(scan.ranges))
-    seen = np.isfinite(scan.ranges)
-    ranges = scan.ranges[seen]
-    return np.column_stack([mount_x + ranges * np.cos(angles[seen]), ranges * np.sin(angles[seen])])
-
-
-def _trail_points(state: ScreenState) -> np.ndarray:
+def _trail_points(state: ScreenState) -> NDArray[np.float64]:
     if state.odometry is None or not state.trail:
         return np.empty((0, 2))
     pose = state.odometry.pose
     offset = np.array(state.trail) - (pose.x, pose.y)
     cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
-    return offset @ np.array([[cos, -sin], [sin, cos]])
+    turned: NDArray[np.float64] = offset @ np.array([[cos, -sin], [sin, cos]])
+    return turned
 
 
 _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
 
 
-def _plot(cells: np.ndarray, points: np.ndarray, scale: float) -> None:
+def _plot(cells: NDArray[np.uint8], points: NDArray[np.float64], scale: float) -> None:
     """Set the braille dots of ``points`` (x forward = up, y left = left) around the middle of ``cells``."""
     height, width = cells.shape
     column = np.round(width - points[:, 1] * scale).astype(int)

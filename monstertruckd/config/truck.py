@@ -4,17 +4,17 @@ import math
 from pathlib import Path
 from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar
 
-from monstertruck_drivers.os4000.config import Os4000Config
-from monstertruck_estimation.odometry import OdometryConfig
-from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
-from monstertruckd.bus.config import ZenohConfig
+from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.recorder.config import RecorderConfig
 
@@ -47,6 +47,11 @@ class Mount(Schema):
     """Radians about y"""
     yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
     """Radians about z"""
+
+    @property
+    def planar(self) -> tuple[float, float, float]:
+        """x, y (m) and yaw (rad)."""
+        return self.x, self.y, self.yaw
 
 
 class Device(Schema, Generic[C]):
@@ -132,6 +137,8 @@ class MapRender(Schema):
     """Seconds after which a silent worker is killed"""
     period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
     """Seconds between two scans it is given"""
+    picture: Path | None = None
+    """PNG file drawn when the path is done and when the daemon ends"""
 
 
 class TruckConfig(Schema):

@@ -1,5 +1,6 @@
 """Configuration of a run in the simulated world: the daemon's own, and the world behind the emulators."""
 
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -19,11 +20,13 @@ class SimConfig(Schema):
     servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
     world: WorldConfig = WorldConfig()
+    recording: Path | None = None
+    """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""
 
 
 class SimulatedTruckConfig(TruckConfig):
     """A truck whose devices are emulated."""
 
-    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = TruckConfig.FILE_KEYS
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (*TruckConfig.FILE_KEYS, ("sim", "recording"))
 
     sim: SimConfig

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
+from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, RecordedRanges
 from monstertruck_drivers.link import EmulatedPort
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
@@ -32,7 +33,10 @@ class SimulatedRobot:
         self.ports = ports
         self.emulators: dict[str, Emulator] = {}
         present = devices.present()
-        if "lidar" in present:
+        if "lidar" in present and config.recording is not None:
+            self.recorded = RecordedHokuyoEmulator(clock, RecordedRanges.load(config.recording), seed=config.seed)
+            self.emulators["lidar"] = self.recorded
+        elif "lidar" in present:
             self.emulators["lidar"] = HokuyoEmulator(clock, self.world.lidar, seed=config.seed)
         if "compass" in present:
             self.emulators["compass"] = Os4000Emulator(clock, self.world.compass, seed=config.seed)

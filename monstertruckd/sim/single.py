@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
@@ -27,6 +28,7 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
     """
     world = World(WorldConfig(), seed)
     port = PtyPort(link)
+    emulator: Emulator
     match find_kind(device).role:
         case "lidar":
             emulator = HokuyoEmulator(clock, world.lidar, seed=seed)

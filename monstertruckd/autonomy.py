@@ -1,0 +1,105 @@
+"""Builds what thinks: estimation and planners of a configuration, each with its ends of the bus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+from monstertruck_estimation.odometry import DeadReckoning, OdometryService
+from monstertruck_estimation.transforms import TransformService, mount
+from monstertruck_kinematics.polynomials import SteeringPolynomials
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.track.service import TrackerService
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.service import Service
+from monstertruck_schemas import topics
+from monstertruck_schemas.topics import Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import Geometry, TruckConfig
+from monstertruckd.map_service import MapService
+from monstertruckd.paths import PathService, load_path
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The truck's kinematics, shared by gate, estimation and planners."""
+
+    steering: FourWheelSteering
+    drivetrain: DriveTrain
+    linkage: SteeringPolynomials
+    footprint: Footprint
+
+    @classmethod
+    def of(cls, geometry: Geometry) -> Self:
+        """Kinematics of a configured body."""
+        return cls(
+            FourWheelSteering(geometry.wheelbase, geometry.track),
+            DriveTrain(geometry.drive_ratio, geometry.wheel_radius),
+            SteeringPolynomials.named("corrected"),
+            Footprint(geometry.length, geometry.width),
+        )
+
+
+def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+    """Transforms always; odometry where the truck can drive and steer."""
+    mounts = [
+        mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
+        for role, m in ((role, device.mount) for role, device in config.devices.present().items())
+        if role in ("lidar", "compass")
+    ]
+    yield TransformService(
+        mounts, clock, bus.subscribe(topics.ODOMETRY, latest()), bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION)
+    )
+    if config.devices.drive is None or config.devices.steering is None:
+        return
+    yield OdometryService(
+        DeadReckoning(config.odometry, steering=body.steering, drivetrain=body.drivetrain, linkage=body.linkage),
+        clock,
+        drive=bus.subscribe(topics.DRIVE, latest()),
+        steering=bus.subscribe(topics.STEERING, latest()),
+        compass=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
+        odometry=bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
+        pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+        rate=config.odometry.rate,
+    )
+
+
+def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+    """Path source and tracker where one is configured; the map's picture."""
+    if config.tracker is not None:
+        drawn = load_path(config.path.file, closed=config.path.closed) if config.path is not None else None
+        yield PathService(
+            drawn,
+            clock,
+            bus.subscribe(topics.REQ_PATH, fifo(4)),
+            bus.subscribe(topics.GATE, latest()),
+            bus.publisher(topics.PATH, Writer.PLANNER),
+            bus.event_sink(),
+        )
+        lidar = config.devices.lidar
+        yield TrackerService(
+            config.tracker,
+            clock,
+            steering=body.steering,
+            footprint=body.footprint,
+            lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
+            pose=bus.subscribe(topics.ODOMETRY, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            gate=bus.subscribe(topics.GATE, latest()),
+            scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
+            drive=bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER),
+            tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
+            events=bus.event_sink(),
+        )
+    if config.map is not None and config.devices.lidar is not None:
+        yield MapService(
+            config.map,
+            config.devices.lidar.mount,
+            clock,
+            scan=bus.subscribe(topics.SCAN, latest()),
+            pose=bus.subscribe(topics.POSE, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            tracker=bus.subscribe(topics.TRACKER, latest()),
+            events=bus.event_sink(),
+        )

@@ -1,0 +1,216 @@
+"""The composition root: builds everything from the configuration and runs it in nested scopes.
+
+From the outside in: bus, recorder, actuator links, gate, sensors, estimation, planners. They end in the opposite
+order, so the gate commands neutral while actuators and recorder still listen.
+"""
+
+import asyncio
+import platform
+import secrets
+from collections.abc import AsyncIterator, Collection, Mapping
+from contextlib import asynccontextmanager
+from typing import Any
+
+import numpy as np
+
+from monstertruck_drivers.link import Port
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.scope import Scope, scope
+from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
+from monstertruck_schemas import topics
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.topics import TOPICS, Writer
+from monstertruckd import __version__
+from monstertruckd.autonomy import Body, build_estimation, build_planners
+from monstertruckd.bus.local import Bus
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.bus.zenoh_session import ZenohBridge
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.validate import resolved
+from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.devices import build_drivers, serial_ports
+from monstertruckd.gate.core import Gate
+from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
+from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.health import ClockService, HealthBoard, MeterService
+from monstertruckd.recorder.digest import LogDigest
+from monstertruckd.recorder.recorder import Recorder
+
+ACTUATORS = ("drive", "steering")
+SENSORS = ("lidar", "compass")
+VERSIONS = {"monstertruckd": __version__, "python": platform.python_version(), "machine": platform.machine()}
+
+
+class Daemon:
+    """One robot; ``run`` it once.
+
+    Args:
+        config: what it is.
+        clock: its time.
+        ports: where its devices hang, by role; default: the configured serial ports.
+        tree: origins of the configuration's values, kept with the log.
+        seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
+            nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
+    """
+
+    def __init__(
+        self,
+        config: TruckConfig,
+        clock: Clock,
+        *,
+        ports: Mapping[str, Port] | None = None,
+        tree: Tree | None = None,
+        seed: int | None = None,
+    ) -> None:
+        self.config = config
+        self.clock = clock
+        self.bus = Bus(clock)
+        self.digest = LogDigest()
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
+        self._tree = tree
+        self._events = self.bus.event_sink()
+        self._board = HealthBoard(clock, self.bus.publisher(topics.HEALTH, Writer.DAEMON), self._events)
+        self._drivers = build_drivers(config.devices, ports or serial_ports(config.devices), clock, self.bus)
+        self._body = Body.of(config.geometry)
+        self.gate = self._build_gate()
+        self.recorder = self._build_recorder()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Run until ``stop`` is set, then end everything inside-out, neutral first.
+
+        Raises:
+            BusyError: another daemon runs this robot or holds the endpoint.
+            BaseExceptionGroup: a bug in gate, actuators or bus.
+        """
+        async with (
+            self._outside(),
+            self._recording(),
+            scope("actuators") as actuators,
+            scope("gate") as gate,
+            scope("sensors") as sensors,
+            scope("estimation") as estimation,
+            scope("planners") as planners,
+        ):
+            self._start_devices(actuators, ACTUATORS, OnBug.EXIT)
+            self._start(gate, self.gate, OnBug.EXIT)
+            self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
+            self._start_devices(sensors, SENSORS, OnBug.FAIL)
+            for service in build_estimation(self.config, self.bus, self.clock, self._body):
+                self._start(estimation, service)
+            for service in build_planners(self.config, self.bus, self.clock, self._body):
+                self._start(planners, service)
+            await stop.wait()
+            self.gate.shut_down()
+
+    # The scopes' contents
+
+    @asynccontextmanager
+    async def _outside(self) -> AsyncIterator[None]:
+        async with scope("bus") as bus_scope:
+            if self._seed is None:
+                bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self._rpc())
+                await bridge.open()
+                self._start(bus_scope, bridge, OnBug.EXIT)
+            self._start(
+                bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events)
+            )
+            self._start(bus_scope, self._board)
+            yield
+
+    @asynccontextmanager
+    async def _recording(self) -> AsyncIterator[None]:
+        if self.recorder is None:
+            yield
+            return
+        async with self.recorder as recorder:
+            tap = self.bus.tap(
+                lambda topic, message, data: recorder.record(topic, message.stamp, data),
+                (topic for topic in TOPICS if topic.logged),
+            )
+            try:
+                yield
+            finally:
+                tap.close()
+
+    def _start(
+        self, where: Scope, service: Service, on_bug: OnBug = OnBug.FAIL, policy: RestartPolicy | None = None
+    ) -> None:
+        rng = np.random.default_rng(self._rng.integers(2**63))
+        where.start(
+            service.name,
+            supervise(service, policy or RestartPolicy(), self.clock, self._board.report, rng, on_bug),
+        )
+
+    def _start_devices(self, where: Scope, roles: Collection[str], on_bug: OnBug) -> None:
+        for role, device in self.config.devices.present().items():
+            if role in roles:
+                self._start(where, self._drivers[role], on_bug, device.restart)
+
+    def _rpc(self) -> Rpc:
+        rpc = Rpc(self.clock)
+
+        async def config(_: dict[str, Any]) -> dict[str, Any]:
+            return resolved(self.config)
+
+        async def versions(_: dict[str, Any]) -> dict[str, Any]:
+            return dict(VERSIONS)
+
+        rpc.register("config", config)
+        rpc.register("versions", versions)
+        return rpc
+
+    # Building
+
+    def _build_gate(self) -> GateService:
+        config, bus = self.config, self.bus
+        latch: Latch = EstopLatch(config.state_directory / "estop") if self._seed is None else MemoryLatch()
+        nonce = secrets.token_hex(8) if self._seed is None else self._rng.bytes(8).hex()
+        lidar = config.devices.lidar
+        gate = Gate(
+            config.gate,
+            steering=self._body.steering,
+            drivetrain=self._body.drivetrain,
+            linkage=self._body.linkage,
+            footprint=self._body.footprint,
+            lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
+            nonce=nonce,
+            latched=latch.engaged(),
+        )
+        drive, steering = bus.actuators()
+        return GateService(
+            gate,
+            config.gate.rate,
+            self.clock,
+            GateInputs(
+                requests=(bus.subscribe(topics.REQ_DRIVE, fifo(16)), bus.subscribe(topics.PLAN_DRIVE, fifo(16))),
+                orders=bus.subscribe(topics.REQ_CONTROL, fifo(16)),
+                scan=bus.subscribe(topics.SCAN, latest()),
+                attitude=bus.subscribe(topics.COMPASS, latest()),
+                drive=bus.subscribe(topics.DRIVE, latest()),
+                steering=bus.subscribe(topics.STEERING, latest()),
+                battery=bus.subscribe(topics.BATTERY, latest()),
+                health=bus.subscribe(topics.HEALTH, latest()),
+            ),
+            GateOutputs(drive, steering, bus.publisher(topics.GATE, Writer.GATE)),
+            self._events,
+            latch,
+        )
+
+    def _build_recorder(self) -> Recorder | None:
+        if self.config.recorder is None:
+            return None
+        origins = self._tree.origins if self._tree is not None else {}
+        return Recorder(
+            self.config.recorder,
+            self.clock,
+            lambda reason, text: self._events(reason, Severity.ERROR, "recorder", text),
+            attachments={
+                "config": resolved(self.config),
+                "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
+                "versions": VERSIONS,
+            },
+            digest=self.digest,
+            deterministic=self._seed is not None,
+        )

@@ -1,0 +1,134 @@
+"""Somebody who arms the truck and watches a lap, over Zenoh or beside the bus."""
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NoAnswerError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, Order, Role
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import Topic
+from monstertruckd.bus.local import Bus
+
+M = TypeVar("M", bound=Message)
+
+MOVING = (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
+
+
+class Operator(Protocol):
+    """What ``TruckClient`` and ``LocalOperator`` have in common."""
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Follow a topic."""
+        ...
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        """Arm, disarm, stop."""
+        ...
+
+
+class LocalOperator:
+    """An operator inside the daemon's process: for the virtual clock, where nothing comes over Zenoh."""
+
+    def __init__(self, bus: Bus, clock: Clock, source: str = "operator", role: Role = Role.STATION) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._source = source
+        self._role = role
+        self._seq = 0
+        self._gate = bus.subscribe(topics.GATE, latest())
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Follow a topic of this process."""
+        return self._bus.subscribe(topic, delivery)
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        """Send a control request with the robot's present nonce."""
+        while self._gate.latest is None:
+            await self._gate.next()
+        now = self._clock.now()
+        self._seq += 1
+        request = ControlRequest(
+            stamp=now,
+            received=now,
+            seq=self._seq,
+            source=self._source,
+            role=self._role,
+            lease=lease,
+            nonce=self._gate.latest.nonce,
+            order=order,
+        )
+        self._bus.inject(topics.REQ_CONTROL, request)
+
+
+@dataclass(frozen=True, slots=True)
+class Lap:
+    """What the tracker said about one lap."""
+
+    outcome: Reason
+    start: int
+    """Daemon time at which the truck was armed, ns."""
+    end: int
+    """Daemon time at which the path was done or given up, ns."""
+    cross_track: NDArray[np.float64]
+    """Every reported distance from the path, m."""
+
+    @property
+    def seconds(self) -> float:
+        """Duration."""
+        return (self.end - self.start) / SECOND
+
+    @property
+    def cross_track_rms(self) -> float:
+        """Root mean square distance from the path, m."""
+        return float(np.sqrt(np.mean(self.cross_track**2))) if len(self.cross_track) else 0.0
+
+
+async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0, limit: float = 600.0) -> Lap:
+    """Arm the truck, watch the tracker drive its path to the end, disarm.
+
+    Args:
+        operator: who gives the orders.
+        clock: time.
+        patience: seconds to wait until the truck can be armed.
+        limit: seconds the path may take.
+
+    Raises:
+        NoAnswerError: the truck could not be armed, or the path took too long; the text says what held it.
+    """
+    with operator.subscribe(topics.GATE, latest()) as gate, operator.subscribe(topics.TRACKER, fifo(256)) as tracker:
+        await _arm(operator, clock, gate, patience)
+        start = clock.now()
+        cross_track: list[float] = []
+        try:
+            async with clock.deadline(limit):
+                while True:
+                    report = await tracker.next()
+                    if report.received < start:
+                        continue
+                    cross_track.append(report.cross_track)
+                    if report.outcome is not Reason.DRIVING and report.along > 0:
+                        return Lap(report.outcome, start, report.stamp, np.array(cross_track))
+        except TimeoutError:
+            held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""
+            raise NoAnswerError(f"path not finished within {limit:g} s ({held or 'nothing held the truck'})") from None
+        finally:
+            await operator.order(Order.DISARM)
+
+
+async def _arm(operator: Operator, clock: Clock, gate: Mailbox[GateState], patience: float) -> None:
+    try:
+        async with clock.deadline(patience):
+            while gate.latest is None or gate.latest.mode not in MOVING:
+                await operator.order(Order.ARM)
+                await clock.sleep(0.25)
+    except TimeoutError:
+        held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else "no gate state seen"
+        raise NoAnswerError(f"the truck could not be armed within {patience:g} s: {held}") from None

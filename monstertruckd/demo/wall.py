@@ -1,0 +1,149 @@
+"""The demo on the wall clock: emulators behind ptys in one process, the daemon in another, the operator here."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.live import Live
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+from monstertruckd.cli.screen import draw
+from monstertruckd.cli.watch import PERIOD, Follower
+from monstertruckd.demo.operator import Lap, drive_lap
+from monstertruckd.demo.summary import Summary, log_figures
+
+PATIENCE = 60.0
+"""Seconds for the two processes to come up (the first run compiles the ray caster)."""
+
+
+async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:
+    """Drive a lap over ptys.
+
+    Args:
+        clock: time.
+        config: simulated truck's configuration.
+        folder: where configuration, log, picture and outputs of the processes go.
+        seed: replaces the configuration's own.
+        screen: whether to draw the live screen.
+
+    Raises:
+        NoAnswerError: a process did not come up, or the lap was not finished.
+    """
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    overlay = write_overlay(config, folder, endpoint, seed)
+    truth = folder / "truth.npz"
+    simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
+    async with (
+        program(folder / "simulate.txt", *simulate),
+        program(folder / "daemon.txt", "run", "--config", str(overlay)),
+        await _connect(clock, endpoint) as client,
+    ):
+        follower = Follower(client, clock)
+        watching = asyncio.create_task(_show(follower, clock, screen=screen))
+        try:
+            lap = await drive_lap(client, clock, patience=PATIENCE)
+            await clock.sleep(1.0)
+        finally:
+            watching.cancel()
+            await asyncio.wait([watching])
+        loop = follower.state.loop
+    return _summary(lap, folder, truth, loop.lateness_p99 if loop else 0.0, loop.lateness_max if loop else 0.0)
+
+
+def _summary(lap: Lap, folder: Path, truth: Path, p99: float, worst: float) -> Summary:
+    with np.load(truth) as archive:
+        rows = archive["truth"]
+    return Summary(lap, rows, p99, worst, *log_figures(folder))
+
+
+def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None) -> Path:
+    """A configuration that includes ``config`` and hangs every device on a pty in ``folder``."""
+    roles = ("lidar", "drive", "steering", "compass")
+    overlay: dict[str, object] = {
+        "include": str(config.resolve()),
+        "version": 1,
+        "devices": {role: {"port": {"path": str(folder.resolve() / "dev" / role)}} for role in roles},
+        "zenoh": {"listen": [endpoint]},
+        "recorder": {"directory": str(folder.resolve() / "logs")},
+        "map": {"picture": str(folder.resolve() / "map.png")},
+        "state_directory": str(folder.resolve() / "state"),
+    }
+    if seed is not None:
+        overlay["sim"] = {"seed": seed}
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "config.yaml"
+    file.write_text(yaml.safe_dump(overlay, sort_keys=False), encoding="utf-8")
+    return file
+
+
+@asynccontextmanager
+async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it, its output goes to a file."""
+    with output.open("wb") as stream:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "monstertruckd",
+            *arguments,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+        )
+    ended = asyncio.create_task(process.wait())
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        done, _ = await asyncio.wait([ended], timeout=15)
+        if not done:
+            process.kill()
+            await ended
+
+
+async def _connect(clock: Clock, endpoint: str) -> TruckClient:
+    """A client, as soon as the daemon listens."""
+    try:
+        async with clock.deadline(PATIENCE):
+            while True:
+                try:
+                    async with TruckClient(endpoint=endpoint, clock=clock, timeout=0.5) as client:
+                        if await client.alive():
+                            break
+                except NotFoundError:
+                    await clock.sleep(0.2)
+    except TimeoutError:
+        raise NoAnswerError(f"the daemon did not come up within {PATIENCE:g} s at {endpoint}") from None
+    return TruckClient(endpoint=endpoint, source=f"demo:{os.getpid()}", clock=clock)
+
+
+async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:
+    following = asyncio.create_task(follower.run())
+    try:
+        if not screen:
+            await following
+        with Live(console=Console(), screen=True, auto_refresh=False) as live:
+            while True:
+                live.update(draw(follower.state), refresh=True)
+                await clock.sleep(PERIOD)
+    finally:
+        following.cancel()
+        await asyncio.wait([following])
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,117 @@
+"""The picture of the path over the scan map: feeds the renderer's worker, saves what it draws."""
+
+import asyncio
+import logging
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from monstertruck_planners.collision import scan_points
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import EventSink, Ready, Subscription
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Odometry
+from monstertruckd.config.truck import MapRender, Mount
+from monstertruckd.workers.actor import WorkerActor
+
+log = logging.getLogger(__name__)
+
+TARGET = "monstertruckd.workers.map_render:MapRenderer"
+SPACING = 0.02
+"""Metres between two remembered poses of the driven path."""
+
+
+class MapService:
+    """One scan per period goes to the worker; the picture is saved whenever a path has come to its end.
+
+    Args:
+        config: periods, deadline, file.
+        mount: of the lidar.
+        clock: time.
+        scan: lidar.
+        pose: pose in map.
+        path: path being tracked.
+        tracker: progress on it.
+        events: where the end of a picture is told.
+    """
+
+    name = "map"
+
+    def __init__(
+        self,
+        config: MapRender,
+        mount: Mount,
+        clock: Clock,
+        *,
+        scan: Subscription[LaserScan],
+        pose: Subscription[Odometry],
+        path: Subscription[Path],
+        tracker: Subscription[TrackerState],
+        events: EventSink,
+    ) -> None:
+        self._config = config
+        self._mount = mount.planar
+        self._clock = clock
+        self._scan = scan
+        self._pose = pose
+        self._path = path
+        self._tracker = tracker
+        self._events = events
+        self._driven: list[tuple[float, float, float]] = []
+
+    async def run(self, ready: Ready) -> None:
+        """Feed the worker until cancelled.
+
+        Raises:
+            WorkerError: the worker failed, hung or died; the next session starts an empty map.
+        """
+        worker = WorkerActor("map", TARGET, self._clock, latency=self._config.latency, deadline=self._config.deadline)
+        async with worker:
+            await worker.start()
+            ready()
+            drawn = Reason.DRIVING
+            while True:
+                await self._clock.sleep(self._config.period)
+                scans = self._new_scan()
+                outcome = self._tracker.latest.outcome if self._tracker.latest is not None else Reason.DRIVING
+                if self._config.picture is not None and outcome is not drawn and outcome is not Reason.DRIVING:
+                    outputs = await worker.step({"scans": scans, "render": self._picture(outcome)})
+                    await self._save(self._config.picture, outputs["png"])
+                elif scans:
+                    await worker.step({"scans": scans})
+                drawn = outcome
+
+    def _new_scan(self) -> list[tuple[tuple[float, float, float], Any]]:
+        scan, odometry = self._scan.latest, self._pose.latest
+        if scan is None or odometry is None:
+            return []
+        pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
+        if not self._driven or np.hypot(pose[0] - self._driven[-1][0], pose[1] - self._driven[-1][1]) > SPACING:
+            self._driven.append(pose)
+        return [(pose, scan_points(scan, self._mount))]
+
+    def _picture(self, outcome: Reason) -> dict[str, Any]:
+        path, state = self._path.latest, self._tracker.latest
+        paths = [{"name": "driven (estimated)", "style": "driven", "poses": np.array(self._driven).reshape(-1, 3)}]
+        if path is not None:
+            paths.insert(0, {"name": "planned", "style": "planned", "poses": path.poses.reshape(-1, 3)})
+        along = f"{state.along:.2f} of {state.length:.2f} m" if state is not None else ""
+        title = f"Path {path.name if path else ''} over the scan map"
+        return {"title": title, "subtitle": f"{outcome.text}, {along}", "paths": paths}
+
+    async def _save(self, file: FilePath, png: bytes) -> None:
+        try:
+            await asyncio.to_thread(_write, file, png)
+        except OSError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"picture not saved: {error}")
+
+
+def _write(file: FilePath, data: bytes) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    scratch = file.with_name(file.name + ".new")
+    scratch.write_bytes(data)
+    scratch.replace(file)

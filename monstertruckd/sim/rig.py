@@ -1,0 +1,65 @@
+"""Daemon, emulated devices and world on one virtual loop: for the fast demo, tests and drills."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from monstertruck_drivers.link import MemoryPort
+from monstertruck_runtime.clock import VirtualClock
+from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.daemon import Daemon
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.console import Emulated
+from monstertruckd.sim.host import TruthLog
+from monstertruckd.sim.robot import SimulatedRobot
+
+
+class VirtualRig:
+    """A whole robot in one process; everything random comes from the configuration's seed.
+
+    Args:
+        config: the simulated truck's.
+        clock: of the running virtual loop.
+        tree: origins of the configuration's values.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig, clock: VirtualClock, tree: Tree | None = None) -> None:
+        self.clock = clock
+        self.ports = {role: MemoryPort(role) for role in config.devices.present()}
+        self.robot = SimulatedRobot(config.sim, config.devices, clock, self.ports)
+        self.world = self.robot.world
+        self.truth = TruthLog(self.world, clock)
+        self.daemon = Daemon(config, clock, ports=self.ports, tree=tree, seed=config.sim.seed)
+        self.bus = self.daemon.bus
+        self._stop = asyncio.Event()
+        self._daemon_task: asyncio.Task[None] | None = None
+
+    def device(self, role: str) -> Emulated:
+        """Emulator and port of one role, to make it fail."""
+        return Emulated(self.robot.emulators[role], self.ports[role])
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator["VirtualRig"]:
+        """World, devices and daemon run while the context lasts; the daemon ends first, in order.
+
+        Raises:
+            BaseException: what ended the daemon early.
+        """
+        around = [
+            asyncio.create_task(self.robot.run(), name="robot"),
+            asyncio.create_task(self.truth.run(), name="truth"),
+        ]
+        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
+        try:
+            yield self
+        finally:
+            await self.end_daemon()
+            for task in around:
+                task.cancel()
+            await asyncio.wait(around)
+
+    async def end_daemon(self) -> None:
+        """Ask the daemon to end, as SIGTERM does, and wait until it has."""
+        self._stop.set()
+        assert self._daemon_task is not None
+        await self._daemon_task
