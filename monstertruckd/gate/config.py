@@ -86,10 +86,10 @@ class GateConfig(Schema):
     """Greatest axle angle, rad."""
     acceleration: Positive = 0.5
     """Growth of the commanded speed, m/s^2."""
-    deceleration: Positive = 1.2
-    """Profile deceleration the drive controller is set to: stops by itself once it is told speed 0, m/s^2."""
-    quick_deceleration: Positive = 2.0
-    """Quick-stop deceleration the drive controller is set to, m/s^2."""
+    deceleration: Positive = 1.0
+    """Deceleration the drive controller's profile reaches at least, once it is told speed 0, m/s^2."""
+    quick_deceleration: Positive = 1.2
+    """The same for its quick stop, m/s^2."""
     steering_rate: Positive = 1.0
     """Greatest change of an axle angle, rad/s."""
     reaction: Share = 0.08

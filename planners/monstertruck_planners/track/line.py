@@ -1,0 +1,197 @@
+"""A path prepared for tracking: runs of one driving direction, measured by arc length.
+
+Progress along it only grows and is looked for near the present one, so a path may cross or repeat itself.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.plan import Path
+
+Array = NDArray[np.float64]
+
+NEAREST: Final = 0.1
+"""Vertices this much further than the nearest one count as equally near when a start is chosen, m."""
+
+SAME_HEADING: Final = 0.3
+"""Headings this close count as equal when a start is chosen, rad."""
+
+LEAST_STEP: Final = 1e-6
+"""Shorter steps between two poses are left out, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Place on a line."""
+
+    run: int = 0
+    """Index of the run."""
+    s: float = 0.0
+    """Metres from the run's beginning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Foot:
+    """Point of a run nearest to the truck."""
+
+    s: float
+    point: tuple[float, float]
+    tangent: float
+    """Direction of travel there, rad."""
+
+
+class Run:
+    """Part of a path driven in one direction, with a straight or given way on beyond its end.
+
+    Args:
+        points: shape (n, 2), n >= 2, m; from index ``last`` on they are the way beyond.
+        last: index of the run's own last point.
+        direction: +1 forward, -1 backward.
+        before: metres of the runs before this one.
+    """
+
+    def __init__(self, points: Array, last: int, direction: float, before: float) -> None:
+        steps = np.diff(points, axis=0)
+        self._points = points
+        self._lengths = np.hypot(steps[:, 0], steps[:, 1])
+        self._tangents = np.arctan2(steps[:, 1], steps[:, 0])
+        self._s = np.concatenate(([0.0], np.cumsum(self._lengths)))
+        self.direction = direction
+        self.before = before
+        self.length = float(self._s[last])
+
+    def at(self, s: float) -> Foot:
+        """Point at ``s`` metres."""
+        i = min(int(np.searchsorted(self._s, s, side="right")) - 1, len(self._lengths) - 1)
+        share = (s - self._s[i]) / self._lengths[i]
+        x, y = self._points[i] + share * (self._points[i + 1] - self._points[i])
+        return Foot(s, (float(x), float(y)), float(self._tangents[i]))
+
+    def project(self, x: float, y: float, low: float, high: float) -> Foot:
+        """Nearest point between ``low`` and ``high`` metres."""
+        first = max(int(np.searchsorted(self._s, low, side="right")) - 1, 0)
+        end = max(int(np.searchsorted(self._s, high, side="left")), first + 1)
+        start, step = self._points[first:end], np.diff(self._points[first : end + 1], axis=0)
+        length = self._lengths[first:end]
+        start = start[: len(length)]
+        along = ((x - start[:, 0]) * step[:, 0] + (y - start[:, 1]) * step[:, 1]) / length
+        s0 = self._s[first : first + len(length)]
+        s = np.clip(s0 + np.clip(along, 0.0, length), low, high)
+        share = ((s - s0) / length)[:, None]
+        feet = start + share * step
+        best = int(np.argmin(np.hypot(feet[:, 0] - x, feet[:, 1] - y)))
+        px, py = feet[best]
+        return Foot(float(s[best]), (float(px), float(py)), float(self._tangents[first + best]))
+
+
+class Line:
+    """A whole path, to be driven from its vertex nearest to the start pose.
+
+    A closed path is driven once around from there; an open one from there to its end.
+
+    Args:
+        path: poses and directions.
+        start: pose (x, y, yaw) of the truck in the path's frame.
+        beyond: metres the way goes on behind each end, at least the look-ahead.
+
+    Raises:
+        InputError: fewer than two different poses, or directions that do not fit.
+    """
+
+    def __init__(self, path: Path, start: tuple[float, float, float], beyond: float) -> None:
+        points, directions = _steps(path)
+        first = _nearest(points, directions, start, closed=path.closed)
+        if path.closed:
+            points = np.concatenate((points[first:-1], points[: first + 1]))
+            directions = np.roll(directions, -first)
+            first = 0
+        self.name = path.name
+        self.frame = path.frame
+        self.closed = path.closed
+        self.runs = _runs(points, directions, beyond, closed=path.closed)
+        self.length = sum(run.length for run in self.runs)
+        self.start = self._progress_of(points, first)
+
+    def along(self, progress: Progress) -> float:
+        """Metres from the line's beginning."""
+        return self.runs[progress.run].before + progress.s
+
+    def ahead(self, progress: Progress, horizon: float, count: int) -> Array:
+        """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
+        run = self.runs[progress.run]
+        turned = 0.0 if run.direction > 0 else math.pi
+        feet = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
+        return np.array([(*foot.point, foot.tangent + turned) for foot in feet])
+
+    def _progress_of(self, points: Array, vertex: int) -> Progress:
+        steps = np.diff(points[: vertex + 1], axis=0)
+        along = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        i = max(i for i, run in enumerate(self.runs) if run.before <= along)
+        return Progress(i, along - self.runs[i].before)
+
+
+def _steps(path: Path) -> tuple[Array, Array]:
+    """Distinct points (n, 2) and the direction of each of the n - 1 steps; a closed path ends on its beginning."""
+    if len(path.poses) % 3 or len(path.poses) < 6:
+        msg = f"path {path.name!r} of {len(path.poses)} numbers: expected at least two rows of x, y, yaw"
+        raise InputError(msg)
+    points = path.poses.reshape(-1, 3)[:, :2]
+    directions = path.directions if len(path.directions) else np.ones(len(points))
+    if len(directions) != len(points) or not (np.abs(directions) == 1.0).all() or not np.isfinite(points).all():
+        msg = f"path {path.name!r}: expected finite poses and a direction of +1 or -1 for each of the {len(points)}"
+        raise InputError(msg)
+    arriving = directions[1:]
+    if path.closed:
+        points = np.concatenate((points, points[:1]))
+        arriving = np.concatenate((arriving, directions[:1]))
+    step = np.diff(points, axis=0)
+    real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
+    if not real.any():
+        msg = f"path {path.name!r}: expected at least two different poses"
+        raise InputError(msg)
+    return np.concatenate((points[:1], points[1:][real])), arriving[real]
+
+
+def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
+    """Vertex to start from: near, and if several are, the first one that is also headed like the truck."""
+    step = np.diff(points, axis=0)
+    tangents = np.arctan2(step[:, 1], step[:, 0]) + np.where(directions > 0, 0.0, math.pi)
+    distance = np.hypot(points[:, 0] - start[0], points[:, 1] - start[1])
+    headings = tangents if closed else np.append(tangents, tangents[-1])
+    distance = distance[: len(headings)]
+    near = np.flatnonzero(distance <= distance.min() + NEAREST)
+    turned = np.abs(np.remainder(headings[near] - start[2] + math.pi, math.tau) - math.pi)
+    headed = near[turned <= turned.min() + SAME_HEADING]
+    # Neighbours of the nearest vertex are near, too: of each such group the nearest one counts.
+    groups = np.split(headed, np.flatnonzero(np.diff(headed) > 1) + 1)
+    return int(groups[0][np.argmin(distance[groups[0]])])
+
+
+def _runs(points: Array, directions: Array, beyond: float, *, closed: bool) -> tuple[Run, ...]:
+    cuts = [0, *(np.flatnonzero(np.diff(directions)) + 1).tolist(), len(directions)]
+    runs: list[Run] = []
+    before = 0.0
+    for begin, end in pairwise(cuts):
+        own = points[begin : end + 1]
+        if closed and len(cuts) == 2:
+            extension = points[1 : 1 + _reach(points, beyond)]
+        else:
+            way = own[-1] - own[-2]
+            extension = own[-1:] + beyond * way / np.hypot(*way)
+        run = Run(np.concatenate((own, extension)), end - begin, float(directions[begin]), before)
+        runs.append(run)
+        before += run.length
+    return tuple(runs)
+
+
+def _reach(points: Array, beyond: float) -> int:
+    """Number of steps from the beginning that cover ``beyond`` metres, or all."""
+    step = np.diff(points, axis=0)
+    travelled = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
+    return int(np.searchsorted(travelled, beyond)) + 1

@@ -1,0 +1,184 @@
+"""The tracker as a service: poses and a path in, wishes to the gate out."""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, clearance_to_points, scan_points
+from monstertruck_planners.track.line import Line, Progress
+from monstertruck_planners.track.pure_pursuit import Command, PurePursuit, PurePursuitConfig, TruckState
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+
+ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
+"""Modes of the gate in which the tracker asks for motion."""
+
+POSE_STALE: Final = 0.2
+"""Seconds after which a pose no longer counts: the tracker falls silent, and its lease runs out."""
+
+SCAN_STALE: Final = 0.35
+"""Seconds after which a scan no longer slows the truck."""
+
+LOOKS: Final = 8
+"""Poses ahead whose clearance counts."""
+
+AT_REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+
+
+class TrackerService:
+    """Follows ``plan/path`` by pure pursuit.
+
+    Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
+    Once the path has ended or is lost it asks for standstill, then falls silent.
+
+    Args:
+        config: of the tracker.
+        clock: time.
+        steering: the truck's geometry.
+        footprint: its outline.
+        lidar: pose (x, y, yaw) of the lidar in base.
+        pose: pose of base in the paths' frame.
+        path: what to follow.
+        gate: state of the gate, with the nonce.
+        scan: slows down in narrow places; None = does not.
+        drive: ``plan/drive``.
+        tracker: ``plan/tracker``.
+        events: where events go.
+    """
+
+    name = "tracker"
+
+    def __init__(
+        self,
+        config: PurePursuitConfig,
+        clock: Clock,
+        *,
+        steering: FourWheelSteering,
+        footprint: Footprint,
+        lidar: tuple[float, float, float],
+        pose: Subscription[Odometry],
+        path: Subscription[Path],
+        gate: Subscription[GateState],
+        scan: Subscription[LaserScan] | None,
+        drive: Publisher[DriveRequest],
+        tracker: Publisher[TrackerState],
+        events: EventSink,
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._law = PurePursuit(config, steering)
+        self._footprint = footprint
+        self._lidar = lidar
+        self._pose = pose
+        self._path = path
+        self._gate = gate
+        self._scan = scan
+        self._drive = drive
+        self._tracker = tracker
+        self._events = events
+        self._followed: Path | None = None
+        self._line: Line | None = None
+        self._progress = Progress()
+        self._outcome = Reason.DRIVING
+        self._active = False
+
+    async def run(self, ready: Ready) -> None:
+        """Track until cancelled."""
+        ready()
+        schedule = Schedule(self._clock, self._config.rate)
+        while True:
+            await schedule.next()
+            self._step(self._clock.now())
+
+    def _step(self, now: int) -> None:
+        pose, path, gate = self._pose.latest, self._path.latest, self._gate.latest
+        if pose is None or path is None or gate is None or now - pose.received > POSE_STALE * SECOND:
+            return
+        self._choose_line(path, pose, armed=gate.mode in ACTIVE)
+        if self._line is None:
+            return
+        state = TruckState((pose.pose.x, pose.pose.y, pose.pose.yaw), pose.twist.vx, self._clearance(pose, now))
+        command = self._law.control(state, self._line, self._progress)
+        if gate.mode in ACTIVE:
+            self._progress = command.progress
+            if command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST:
+                self._ask(command, gate.nonce, now)
+        self._tell(command, self._line, now)
+
+    def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
+        """Take a new path, or start the present one over: until armed it may still begin anywhere."""
+        restart = not self._active and (self._outcome is not Reason.DRIVING or self._at_start())
+        self._active = armed
+        if path is self._followed and not (restart and self._line is not None):
+            return
+        self._followed, self._line, self._outcome = path, None, Reason.DRIVING
+        try:
+            if path.frame != pose.frame:
+                msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
+                raise InputError(msg)
+            start = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+            self._line = Line(path, start, beyond=2 * self._config.lookahead)
+            self._progress = self._line.start
+        except InputError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
+
+    def _at_start(self) -> bool:
+        return self._line is not None and self._progress == self._line.start
+
+    def _clearance(self, pose: Odometry, now: int) -> float:
+        """Least clearance of the poses ahead on the path, in the newest scan."""
+        scan = None if self._scan is None else self._scan.latest
+        if scan is None or self._line is None or now - scan.received > SCAN_STALE * SECOND:
+            return math.inf
+        ahead = self._line.ahead(self._progress, self._config.lookahead, LOOKS)
+        c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
+        dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
+        poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
+        return float(clearance_to_points(self._footprint, poses, scan_points(scan, self._lidar)).min())
+
+    def _ask(self, command: Command, nonce: str, now: int) -> None:
+        self._drive.put(
+            DriveRequest(
+                stamp=now,
+                received=now,
+                seq=self._drive.next_seq(),
+                source=self.name,
+                role=Role.TRACKER,
+                lease=self._config.lease,
+                nonce=nonce,
+                speed=command.speed,
+                front=command.front,
+                rear=command.rear,
+            )
+        )
+
+    def _tell(self, command: Command, line: Line, now: int) -> None:
+        if command.outcome is not self._outcome:
+            self._outcome = command.outcome
+            severity = Severity.WARNING if command.outcome is Reason.PATH_LOST else Severity.INFO
+            self._events(command.outcome, severity, self.name, path=line.name, cross_track=command.cross_track)
+        self._tracker.put(
+            TrackerState(
+                stamp=now,
+                received=now,
+                seq=self._tracker.next_seq(),
+                frame=line.frame,
+                path=line.name,
+                cross_track=command.cross_track,
+                heading_error=command.heading_error,
+                along=line.along(command.progress),
+                length=line.length,
+                outcome=command.outcome,
+            )
+        )

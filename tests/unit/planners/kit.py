@@ -1,0 +1,83 @@
+"""Paths, and a truck that obeys with the rates of the real one."""
+
+import math
+
+import numpy as np
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.line import Line
+from monstertruck_planners.track.pure_pursuit import PurePursuit, PurePursuitConfig, TruckState
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.reasons import Reason
+
+STEERING = FourWheelSteering()
+
+
+def path(points, directions=(), *, closed=False, frame="odom"):
+    points = np.asarray(points, dtype=float)
+    poses = np.column_stack((points, np.zeros(len(points))))
+    return Path(
+        stamp=0,
+        received=0,
+        seq=0,
+        frame=frame,
+        poses=poses.ravel(),
+        directions=list(directions),
+        closed=closed,
+        name="test",
+    )
+
+
+def straight(length=2.0, step=0.05):
+    x = np.arange(0.0, length + step / 2, step)
+    return np.column_stack((x, np.zeros_like(x)))
+
+
+def circle(radius=1.0, turns=1.0, step=0.05):
+    angle = np.linspace(0, math.tau * turns, round(math.tau * turns * radius / step), endpoint=False)
+    return np.column_stack((radius * np.sin(angle), radius * (1 - np.cos(angle))))
+
+
+def figure_eight(size=1.5, count=240):
+    t = np.linspace(0, math.tau, count, endpoint=False)
+    return np.column_stack((size * np.sin(t), size * np.sin(t) * np.cos(t)))
+
+
+class Follower:
+    """A truck driven by pure pursuit at 20 Hz."""
+
+    def __init__(self, route, pose=(0.0, 0.0, 0.0), **config):
+        self.config = PurePursuitConfig(**config)
+        self.law = PurePursuit(self.config, STEERING)
+        self.pose = pose
+        self.speed, self.front, self.rear = 0.0, 0.0, 0.0
+        self.line = Line(route, pose, 2 * self.config.lookahead)
+        self.progress = self.line.start
+        self.log = []
+        self.clearance = math.inf
+
+    def step(self):
+        twist = STEERING.body_twist(self.speed, self.front, self.rear)
+        command = self.law.control(TruckState(self.pose, twist[0], self.clearance), self.line, self.progress)
+        self.progress = command.progress
+        self.log.append(command)
+        for _ in range(5):
+            self.front += float(np.clip(command.front - self.front, -0.01, 0.01))
+            self.rear += float(np.clip(command.rear - self.rear, -0.01, 0.01))
+            self.speed += float(np.clip(command.speed - self.speed, -0.01, 0.01))
+            self.pose = STEERING.integrate(self.pose, *STEERING.body_twist(self.speed, self.front, self.rear), 0.01)
+        return command
+
+    def run(self, seconds=200.0):
+        """Until the path ends; the outcome."""
+        for _ in range(round(seconds * 20)):
+            if self.step().outcome is not Reason.DRIVING:
+                break
+        return self.log[-1].outcome
+
+    def cross_track(self, after=0.0):
+        """Absolute cross-track errors once ``after`` metres are driven."""
+        return np.abs([c.cross_track for c in self.log if self.line.along(c.progress) >= after])
+
+    def along(self):
+        return np.array([self.line.along(c.progress) for c in self.log])

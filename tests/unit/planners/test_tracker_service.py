@@ -1,0 +1,287 @@
+import asyncio
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
+from monstertruck_planners.track.service import TrackerService
+from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+from tests.unit.planners.kit import STEERING, circle, path, straight
+
+
+class Inbox:
+    latest = None
+    drops = 0
+
+
+class Outbox(list):
+    def next_seq(self):
+        return len(self)
+
+    put = list.append
+
+
+class Bench:
+    """A tracker, a gate that lets it drive, and a truck that obeys at once."""
+
+    def __init__(self, clock, route, *, with_scan=False, **config):
+        self.clock = clock
+        self.pose_in, self.path_in, self.gate_in, self.scan_in = Inbox(), Inbox(), Inbox(), Inbox()
+        self.path_in.latest = route
+        self.asked, self.told, self.events = Outbox(), Outbox(), []
+        self.pose, self.speed = (0.0, 0.0, 0.0), 0.0
+        self.silent = False
+        self.heard = 0
+        self.service = TrackerService(
+            PurePursuitConfig(**config),
+            clock,
+            steering=FourWheelSteering(),
+            footprint=Footprint(),
+            lidar=(0.14, 0.0, 0.0),
+            pose=self.pose_in,
+            path=self.path_in,
+            gate=self.gate_in,
+            scan=self.scan_in if with_scan else None,
+            drive=self.asked,
+            tracker=self.told,
+            events=lambda reason, severity, source, text="", **values: self.events.append((reason, text)),
+        )
+        self.gate(GateMode.DISARMED)
+
+    def gate(self, mode):
+        now = self.clock.now()
+        self.gate_in.latest = GateState(stamp=now, received=now, seq=0, mode=mode, nonce="n1", speed_limit=0.2)
+
+    def _sense(self):
+        now = self.clock.now()
+        x, y, yaw = self.pose
+        self.pose_in.latest = Odometry(
+            stamp=now,
+            received=now,
+            seq=0,
+            frame="odom",
+            pose=Pose2D(x=x, y=y, yaw=yaw),
+            twist=Twist2D(vx=self.speed, vy=0.0, wz=0.0),
+            pose_covariance=np.zeros(9),
+            twist_covariance=np.zeros(9),
+            age=0.0,
+        )
+
+    async def world(self):
+        while True:
+            if not self.silent:
+                self._sense()
+            await self.clock.sleep(0.02)
+            fresh = len(self.asked) > self.heard
+            gate = self.gate_in.latest
+            driving = gate is not None and gate.mode in (GateMode.ARMED, GateMode.DRIVING)
+            if self.asked and driving and (fresh or self.clock.now() - self.asked[-1].stamp < SECOND // 4):
+                self.heard = len(self.asked)
+                wish = self.asked[-1]
+                self.speed = wish.speed
+                self.pose = STEERING.integrate(self.pose, *STEERING.body_twist(wish.speed, wish.front, wish.rear), 0.02)
+            else:
+                self.speed = 0.0
+
+
+def on_bench(scenario, route, **more):
+    async def main(clock):
+        bench = Bench(clock, route, **more)
+        tasks = [asyncio.create_task(bench.world()), asyncio.create_task(bench.service.run(lambda: None))]
+        await clock.sleep(0.2)
+        try:
+            await scenario(bench)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        return bench
+
+    return run_virtual(main)
+
+
+async def until_ended(bench, seconds=60.0):
+    for _ in range(round(seconds / 0.1)):
+        if bench.told[-1].outcome is not Reason.DRIVING:
+            return
+        await bench.clock.sleep(0.1)
+
+
+def test_a_lap_from_arming_to_the_goal():
+    async def scenario(bench):
+        assert bench.asked == []
+        bench.gate(GateMode.ARMED)
+        await until_ended(bench)
+        await bench.clock.sleep(1.0)
+
+    bench = on_bench(scenario, path(circle(1.0), closed=True))
+    wish = bench.asked[5]
+    assert (wish.source, wish.role, wish.nonce, wish.lease) == ("tracker", Role.TRACKER, "n1", 0.25)
+    assert [w.seq for w in bench.asked] == list(range(len(bench.asked)))
+    assert np.diff([w.stamp for w in bench.asked]) == pytest.approx(SECOND // 20, abs=1000)
+    last = bench.told[-1]
+    assert last.outcome is Reason.GOAL_REACHED
+    assert last.along == pytest.approx(last.length, abs=0.03)
+    assert last.path == "test"
+    assert max(abs(t.cross_track) for t in bench.told) < 0.06
+    assert math.hypot(*bench.pose[:2]) < 0.06
+    assert [reason for reason, _ in bench.events] == [Reason.GOAL_REACHED]
+    assert bench.asked[-1].speed == 0.0
+    assert bench.told[-1].stamp - bench.asked[-1].stamp > SECOND // 2  # silent once at rest
+
+
+def test_it_asks_for_nothing_while_disarmed_and_goes_on_after_a_stop():
+    async def scenario(bench):
+        assert bench.told[-1].along == 0.0
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(3.0)
+        driven = bench.told[-1].along
+        assert driven > 0.3
+        bench.gate(GateMode.ESTOPPED)
+        await bench.clock.sleep(1.0)
+        asked = len(bench.asked)
+        await bench.clock.sleep(1.0)
+        assert len(bench.asked) == asked
+        bench.gate(GateMode.ARMED)
+        await bench.clock.sleep(1.0)
+        assert len(bench.asked) > asked
+        assert bench.told[-1].along > driven
+
+    on_bench(scenario, path(straight(4.0)))
+
+
+def test_arming_after_the_end_starts_the_lap_over():
+    async def scenario(bench):
+        bench.gate(GateMode.ARMED)
+        await until_ended(bench)
+        bench.gate(GateMode.DISARMED)
+        await bench.clock.sleep(0.5)
+        bench.gate(GateMode.ARMED)
+        await bench.clock.sleep(2.0)
+        assert bench.told[-1].outcome is Reason.DRIVING
+        assert 0.1 < bench.told[-1].along < 1.0
+
+    on_bench(scenario, path(circle(0.6), closed=True))
+
+
+def test_a_truck_put_elsewhere_before_arming_starts_there():
+    async def scenario(bench):
+        bench.pose = (1.0, 1.0, math.pi / 2)
+        await bench.clock.sleep(0.2)
+        bench.gate(GateMode.ARMED)
+        await bench.clock.sleep(0.5)
+        assert abs(bench.told[-1].cross_track) < 0.05
+        assert bench.told[-1].along < 0.2
+
+    on_bench(scenario, path(circle(1.0), closed=True))
+
+
+def test_a_stale_pose_silences_it():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(1.0)
+        bench.silent = True
+        await bench.clock.sleep(0.3)
+        asked = len(bench.asked)
+        await bench.clock.sleep(1.0)
+        assert len(bench.asked) == asked
+
+    on_bench(scenario, path(straight(4.0)))
+
+
+def test_a_lost_path_is_told_and_the_truck_left_standing():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(2.0)
+        bench.pose = (bench.pose[0], 2.0, 0.0)
+        await bench.clock.sleep(1.0)
+        assert bench.told[-1].outcome is Reason.PATH_LOST
+        assert bench.told[-1].stamp - bench.asked[-1].stamp > SECOND // 2
+
+    bench = on_bench(scenario, path(straight(4.0)))
+    assert [reason for reason, _ in bench.events] == [Reason.PATH_LOST]
+
+
+def test_a_new_path_replaces_the_old_one():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(2.0)
+        bench.path_in.latest = path(straight(1.0) + bench.pose[:2])
+        await bench.clock.sleep(0.2)
+        assert bench.told[-1].length == pytest.approx(1.0)
+        assert bench.told[-1].along < 0.2
+
+    on_bench(scenario, path(straight(4.0)))
+
+
+def test_impossible_paths_are_told_once_and_ignored():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(1.0)
+        assert bench.asked == []
+        bench.path_in.latest = path([[0.0, 0.0]])
+        await bench.clock.sleep(1.0)
+        bench.gate(GateMode.DISARMED)
+        await bench.clock.sleep(0.2)
+        bench.path_in.latest = path(straight(1.0))
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(0.2)
+        assert bench.asked
+
+    bench = on_bench(scenario, path(straight(1.0), frame="map"))
+    assert [reason for reason, _ in bench.events] == [Reason.BAD_INPUT, Reason.BAD_INPUT]
+    assert "frame 'map': expected 'odom'" in bench.events[0][1]
+
+
+def test_nothing_happens_without_gate_or_path():
+    async def scenario(bench):
+        gate, bench.gate_in.latest = bench.gate_in.latest, None
+        told = len(bench.told)
+        await bench.clock.sleep(0.3)
+        assert len(bench.told) == told
+        bench.gate_in.latest = gate
+        await bench.clock.sleep(0.1)
+        assert len(bench.told) > told
+
+    on_bench(scenario, path(straight(1.0)))
+
+
+def scan(now, x, y):
+    """One return at (x, y) in base."""
+    bearing, distance = math.atan2(y, x - 0.14), math.hypot(x - 0.14, y)
+    return LaserScan(
+        stamp=now,
+        received=now,
+        seq=0,
+        frame="lidar",
+        start_angle=bearing,
+        end_angle=bearing,
+        time_increment=0.0,
+        scan_time=0.1,
+        range_min=0.06,
+        range_max=4.0,
+        ranges=[distance],
+        codes=[255],
+    )
+
+
+def test_a_narrow_place_ahead_slows_it_down_while_the_scan_is_fresh():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(0.5)
+        assert bench.asked[-1].speed == pytest.approx(0.18)
+        bench.scan_in.latest = scan(bench.clock.now(), 0.6, 0.24)
+        await bench.clock.sleep(0.1)
+        assert bench.asked[-1].speed == pytest.approx(0.18 * 0.06 / 0.12, rel=0.05)
+        await bench.clock.sleep(0.5)
+        assert bench.asked[-1].speed == pytest.approx(0.18)
+
+    on_bench(scenario, path(straight(4.0)), with_scan=True)
