@@ -34,3 +34,12 @@ class TrackerState(Message):
     """Metres of the whole path."""
     outcome: Reason
     """DRIVING, GOAL_REACHED, PATH_LOST ..."""
+
+
+class StabiliserCommand(Message):
+    """Joint angles the lidar's mount has to take, see ``sensor.StabiliserFeedback`` for order and signs."""
+
+    pitch: float
+    """Rad, nose down positive."""
+    roll: float
+    """Rad, right side down positive."""

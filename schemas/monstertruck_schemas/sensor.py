@@ -127,3 +127,44 @@ class Battery(Message):
     """Newest single sample, V."""
     cells: int
     level: BatteryLevel
+
+
+class TorqueState(StrEnum):
+    """Whether a joint of the stabiliser can hold the lidar."""
+
+    HOLDING = "holding"
+    LIMP = "limp"
+    """The unit answers, but gives no torque: after an alarm, or until it is set up."""
+    ABSENT = "absent"
+    """The unit does not answer."""
+
+
+class StabiliserJoint(Schema):
+    """One servo of the lidar's mount; signs are those of the joint angle. Absent unit: measurements are None."""
+
+    torque: TorqueState
+    error: Annotated[int, Field(ge=0, le=255)] = 0
+    """Error bits of the unit's newest answer (its own bits)."""
+    velocity: float | None = None
+    """Rad/s."""
+    load: float | None = None
+    """Torque the unit gives, share of its greatest (-1..1): an estimate from its control error, not a measurement."""
+    voltage: float | None = None
+    """Supply at the unit, V."""
+    temperature: float | None = None
+    """Degree Celsius."""
+
+
+class StabiliserFeedback(Message):
+    """Joints of the lidar's mount as its servos report them.
+
+    The pitch joint sits on the body, the roll joint on the pitch joint, the lidar on the roll joint: the lidar's
+    axes are Ry(pitch) Rx(roll) in ``frame``, that is roll, pitch, yaw = (roll, pitch, 0) of REP 103.
+    """
+
+    pitch: float | None = None
+    """Joint angle about y, rad, REP 103: nose DOWN positive; None = unknown."""
+    roll: float | None = None
+    """Joint angle about x of the pitched part, rad, REP 103: right side down positive; None = unknown."""
+    pitch_joint: StabiliserJoint
+    roll_joint: StabiliserJoint

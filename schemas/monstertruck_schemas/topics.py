@@ -9,9 +9,16 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth
-from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
-from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.sensor import (
+    Attitude,
+    Battery,
+    DriveFeedback,
+    LaserScan,
+    StabiliserFeedback,
+    SteeringFeedback,
+)
 from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, Transforms
 from monstertruck_schemas.usb import UsbTree
 
@@ -71,6 +78,7 @@ COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt",
 DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.25)
 STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.3)
 BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
+STABILISER: Final = Topic("sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 50, 0.2)
 
 ODOMETRY: Final = Topic(
     "state/odometry",
@@ -100,6 +108,14 @@ CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daem
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
 TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 10, 0.5)
 PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The tracker's wish to the gate", 20, 0.3)
+PLAN_STABILISER: Final = Topic(
+    "plan/stabiliser",
+    StabiliserCommand,
+    W.PLANNER,
+    "Joint goals of the lidar's mount; they move no wheel, so they pass no gate",
+    50,
+    0.5,
+)
 
 CMD_DRIVE: Final = Topic("cmd/drive", DriveCommand, W.GATE, "Command sent to the drive controller", 50, 0.1)
 CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command sent to the servos", 50, 0.1)

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
-from monstertruck_schemas.sensor import LaserScan, Vector3
+from monstertruck_schemas.sensor import LaserScan, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
 
 ns = st.integers(-(2**63), 2**63 - 1)
@@ -19,6 +19,16 @@ frame = st.from_regex(r"\A[a-z][a-z0-9_]{0,10}\Z")
 header: dict[str, Any] = {"stamp": ns, "received": ns, "seq": st.integers(0, 2**63 - 1), "frame": frame}
 poses = st.builds(Pose2D, x=number, y=number, yaw=number)
 vectors = st.builds(Vector3, x=number, y=number, z=number)
+
+joints = st.builds(
+    StabiliserJoint,
+    torque=st.sampled_from(TorqueState),
+    error=st.integers(0, 255),
+    velocity=st.none() | number,
+    load=st.none() | number,
+    voltage=st.none() | number,
+    temperature=st.none() | number,
+)
 
 
 def doubles(n: int | st.SearchStrategy[int]) -> st.SearchStrategy[Any]:
@@ -112,6 +122,8 @@ def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
         special["goal"] = poses
     if topic is t.COMPASS:
         special["magnetic_field"] = special["acceleration"] = st.none() | vectors
+    if topic is t.STABILISER:
+        special["pitch_joint"] = special["roll_joint"] = joints
     if topic is t.EVENT:
         special["values"] = st.dictionaries(
             st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
