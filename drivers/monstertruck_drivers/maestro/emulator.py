@@ -1,6 +1,7 @@
 """The device side of a Micro Maestro, byte for byte."""
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -54,14 +55,14 @@ class Ramp:
     def step(self) -> None:
         """10 ms pass."""
         left = self.target - self.position
-        top = float(self.speed or np.inf)
+        top = self.speed or math.inf
         if not self.acceleration:
-            self.position += float(np.clip(left, -top, top))
+            self.position += min(max(left, -top), top)
             return
         gain = self.acceleration / 8  # its unit is per 80 ms
         braking = (2 * gain * abs(left)) ** 0.5
-        wanted = float(np.copysign(min(top, braking), left))
-        self.velocity += float(np.clip(wanted - self.velocity, -gain, gain))
+        wanted = math.copysign(min(top, braking), left)
+        self.velocity += min(max(wanted - self.velocity, -gain), gain)
         if abs(left) <= max(gain, abs(self.velocity)) and abs(self.velocity) <= 2 * gain:
             self.position, self.velocity = float(self.target), 0.0
         else:
@@ -291,9 +292,9 @@ class MaestroEmulator:
             return round(self._ramps[channel].position)
         now = self._clock.now()
         volts = self.analog_v[channel] if self._servos is None else self._servos.analog_volts(channel, now)
-        rail = self.rail_v + self._drift * float(np.sin(2 * np.pi * now / (60 * SECOND)))
+        rail = self.rail_v + self._drift * math.sin(2 * math.pi * now / (60 * SECOND))
         counts = volts / rail * ADC_MAX + self._noise * float(self._rng.standard_normal())
-        return int(np.clip(round(counts), 0, ADC_MAX))
+        return min(max(round(counts), 0), ADC_MAX)
 
     def _fail(self, error: Error) -> None:
         self._advance()

@@ -13,6 +13,8 @@ LISTEN: Final = 1.2
 """Seconds to hear a streaming unit; also longer than it pauses after a setting."""
 PROMPT: Final = 0.3
 """Seconds to wait for the prompt of a command."""
+LEAVE: Final = b"\x1b\r"
+"""ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
 SAMPLES: Final = 6
 """Sentences that tell rate and fields."""
 
@@ -72,7 +74,7 @@ class Session:
         """
         remedies = [
             b"\r",  # ends a command that waits for its value
-            bytes((protocol.ESC,)),
+            LEAVE,
             protocol.key(Key.RATE) + protocol.value(rate),
         ]
         heard = await self.listen(LISTEN)
@@ -105,7 +107,7 @@ class Session:
         """
         self._link.write(protocol.key(command))
         await self.listen(PROMPT, count=1000)
-        for end in (protocol.value(number), b"\r", bytes((protocol.ESC,))):
+        for end in (protocol.value(number), b"\r", LEAVE):
             self._link.write(end)
             if await self.listen(LISTEN, count=1):
                 return
