@@ -154,7 +154,9 @@ class DeadReckoning:
         self._driven += way
         config = self._config
         noise = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2 * way / dt**2
-        self._covariance = self._propagated(twist, dt, noise)
+        by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
+        moved = by_pose @ self._covariance @ by_pose.T + by_twist @ np.diag(noise) @ by_twist.T
+        self._covariance = (moved + moved.T) / 2
         self._pose = integrate(self._pose, *twist, dt)
 
     def observe_attitude(self, attitude: Attitude) -> None:
@@ -192,7 +194,9 @@ class DeadReckoning:
         age = max((now - self._drive.stamp) / SECOND, 0.0)
         twist = self._twist()
         x, y, yaw = integrate(self._pose, *twist, min(age, config.max_prediction))
-        noise = np.array((config.speed_noise, config.speed_noise, config.turn_noise)) ** 2
+        noise = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
+        # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
+        swing = np.array(((1.0, 0.0, self._pose[1] - y), (0.0, 1.0, x - self._pose[0]), (0.0, 0.0, 1.0)))
         sources = ["drive"]
         if self._steered:
             sources.append("steering")
@@ -201,20 +205,14 @@ class DeadReckoning:
         return Estimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
-            pose_covariance=self._propagated(twist, age, noise),
-            twist_covariance=np.diag(noise),
+            pose_covariance=swing @ self._covariance @ swing.T + noise * age**2,
+            twist_covariance=noise,
             age=age,
             sources=tuple(sources),
         )
 
     def _twist(self) -> Vector:
         return self._steering.body_twist(self._speed, *self._angles)
-
-    def _propagated(self, twist: Vector, dt: float, noise: Array) -> Array:
-        """Pose covariance after holding ``twist``, whose components have the variances ``noise``, for dt."""
-        by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
-        moved = by_pose @ self._covariance @ by_pose.T + by_twist @ np.diag(noise) @ by_twist.T
-        return np.asarray((moved + moved.T) / 2)
 
     def _lose(self, dt: float) -> None:
         """The drive counts from a new origin: what it did in between is not known."""

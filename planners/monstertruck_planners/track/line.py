@@ -73,6 +73,15 @@ class Run:
         x, y = self._points[i] + share * (self._points[i + 1] - self._points[i])
         return Foot(s, (float(x), float(y)), float(self._tangents[i]))
 
+    def poses(self, s: Array) -> Array:
+        """Poses of the truck at ``s`` metres, shape (m, 3)."""
+        i = np.clip(np.searchsorted(self._s, s, side="right") - 1, 0, len(self._lengths) - 1)
+        share = ((s - self._s[i]) / self._lengths[i])[:, None]
+        turned = 0.0 if self.direction > 0 else math.pi
+        return np.column_stack(
+            (self._points[i] + share * (self._points[i + 1] - self._points[i]), self._tangents[i] + turned)
+        )
+
     def project(self, x: float, y: float, low: float, high: float) -> Foot:
         """Nearest point between ``low`` and ``high`` metres."""
         first = max(int(np.searchsorted(self._s, low, side="right")) - 1, 0)
@@ -124,10 +133,7 @@ class Line:
 
     def ahead(self, progress: Progress, horizon: float, count: int) -> Array:
         """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
-        run = self.runs[progress.run]
-        turned = 0.0 if run.direction > 0 else math.pi
-        feet = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
-        return np.array([(*foot.point, foot.tangent + turned) for foot in feet])
+        return self.runs[progress.run].poses(np.linspace(progress.s, progress.s + horizon, count))
 
     def _progress_of(self, points: Array, vertex: int) -> Progress:
         steps = np.diff(points[: vertex + 1], axis=0)

@@ -87,6 +87,8 @@ class TrackerService:
         self._drive = drive
         self._tracker = tracker
         self._events = events
+        self._scanned: LaserScan | None = None
+        self._points = np.empty((0, 2))
         self._followed: Path | None = None
         self._line: Line | None = None
         self._progress = Progress()
@@ -145,7 +147,9 @@ class TrackerService:
         c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
         dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
         poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
-        return float(clearance_to_points(self._footprint, poses, scan_points(scan, self._lidar)).min())
+        if scan is not self._scanned:
+            self._scanned, self._points = scan, scan_points(scan, self._lidar)
+        return float(clearance_to_points(self._footprint, poses, self._points).min())
 
     def _ask(self, command: Command, nonce: str, now: int) -> None:
         self._drive.put(
