@@ -242,11 +242,14 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
     for number, row in enumerate(rows, start=1):
         if not isinstance(row, dict) or row.get("kind") not in kinds:
             raise InputError(f"{path}: wheel {number}: expected a mapping with kind {', '.join(kinds)}")
-        fields = {name: value for name, value in row.items() if name != "kind"}
+        fields = {"name": str(number)} | {name: value for name, value in row.items() if name != "kind"}
+        for name, value in fields.items():
+            if name not in ("name", "group") and not isinstance(value, int | float):
+                raise InputError(f"{path}: wheel {number}: {name} is {value!r}: expected a number")
         try:
-            wheels.append(kinds[row["kind"]](**({"name": f"{number}"} | fields)))
+            wheels.append(kinds[row["kind"]](**fields))
         except TypeError as error:
-            raise InputError(f"{path}: wheel {number}: {error}") from error
+            raise InputError(f"{path}: wheel {number}: {str(error).partition('__init__() ')[2]}") from error
     return checked(wheels)
 
 

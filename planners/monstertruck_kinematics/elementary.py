@@ -72,6 +72,11 @@ def hypot(x: Real, y: Real) -> Real:
     return math.hypot(x, y)
 
 
+def secant(tangent: Real) -> Real:
+    """1/cos of the angle in (-90, 90) deg that has this tangent."""
+    return sqrt(1.0 + tangent * tangent)
+
+
 def sign(x: Real) -> Real:
     """+1 for x >= 0 (and +0.0), -1 otherwise: never 0, so that a product keeps its size."""
     if isinstance(x, np.ndarray):
@@ -120,7 +125,7 @@ def require_finite(name: str, x: Real) -> None:
         KinematicsError: naming the argument, and the first bad element of an array.
     """
     if isinstance(x, np.ndarray):
-        if not np.isfinite(x).all():
+        if x.size and not (-np.inf < x.min() and x.max() < np.inf):
             first = int(np.flatnonzero(~np.isfinite(x))[0])
             raise KinematicsError(f"{name}[{first}] is {x.flat[first]}: expected a finite number")
     elif not math.isfinite(x):
@@ -134,9 +139,8 @@ def require_within(name: str, x: Real, low: float, high: float) -> None:
         KinematicsError: naming the argument, the value and the range.
     """
     if isinstance(x, np.ndarray):
-        bad = ~((x >= low) & (x <= high))
-        if bad.any():
-            first = int(np.flatnonzero(bad)[0])
+        if x.size and not (low <= x.min() and x.max() <= high):
+            first = int(np.flatnonzero(~((x >= low) & (x <= high)))[0])
             raise KinematicsError(f"{name}[{first}] is {x.flat[first]}: expected {low:.6g} to {high:.6g}")
     elif not low <= x <= high:
         raise KinematicsError(f"{name} is {x}: expected {low:.6g} to {high:.6g}")

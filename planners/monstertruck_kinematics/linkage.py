@@ -13,7 +13,6 @@ import numpy as np
 
 from monstertruck_kinematics.elementary import (
     Real,
-    any_zero,
     asin,
     atan,
     atan2,
@@ -173,8 +172,8 @@ def common_motion(
         bb, bk, kk = bb + side * side, bk + side * turn, kk + turn * turn
         bs, ks = bs + side * drive, ks + turn * drive
     determinant = bb * kk - bk * bk
-    if any_zero(determinant):
-        raise KinematicsError("angles: the wheels leave the turning rate undetermined")
+    if np.any(determinant <= 1e-12 * (bb * geometry.wheelbase) ** 2):
+        raise KinematicsError("angles: all wheels roll towards one point, the turning rate is undetermined")
     slide = (bs * kk - ks * bk) / determinant
     turn_rate = (bb * ks - bk * bs) / determinant
     errors = [

@@ -25,6 +25,7 @@ from monstertruck_kinematics.elementary import (
     require_finite,
     require_positive,
     require_within,
+    secant,
     sign,
     smaller,
     tan,
@@ -137,16 +138,20 @@ class FourWheelSteering:
         require_within("rear", rear, -STEEPEST, STEEPEST)
         return tan(front), tan(rear)
 
+    def tan_sideslip(self, tan_f: Real, tan_r: Real) -> Real:
+        """(l_r tan d_f + l_f tan d_r)/L from the two axles' tangents (eq. 2.34)."""
+        return (1.0 - self.cg_split) * tan_f + self.cg_split * tan_r
+
     def sideslip(self, front: Real, rear: Real) -> Real:
         """Angle from the body's x axis to C's direction of travel (eq. 2.34)."""
         tan_f, tan_r = self._tangents(front, rear)
-        return atan((self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase)
+        return atan(self.tan_sideslip(tan_f, tan_r))
 
     def curvature(self, front: Real, rear: Real) -> Real:
         """Curvature of C's path, 1/m, left positive: cos(beta) (tan d_f - tan d_r) / L (eqs. 2.38, 2.56)."""
         tan_f, tan_r = self._tangents(front, rear)
-        tan_b = (self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase
-        return (tan_f - tan_r) / (self.wheelbase * hypot(1.0 + 0.0 * tan_b, tan_b))
+        tan_b = self.tan_sideslip(tan_f, tan_r)
+        return (tan_f - tan_r) / (self.wheelbase * secant(tan_b))
 
     def body_twist(self, speed: Real, front: Real, rear: Real) -> tuple[Real, Real, Real]:
         """Velocity (vx, vy, wz) of C in the body frame (eqs. 2.34, 2.54-2.56).
@@ -161,8 +166,8 @@ class FourWheelSteering:
         """
         require_finite("speed", speed)
         tan_f, tan_r = self._tangents(front, rear)
-        tan_b = (self.l_r * tan_f + self.l_f * tan_r) / self.wheelbase
-        vx = speed / hypot(1.0 + 0.0 * tan_b, tan_b)
+        tan_b = self.tan_sideslip(tan_f, tan_r)
+        vx = speed / secant(tan_b)
         return vx, vx * tan_b, vx * (tan_f - tan_r) / self.wheelbase
 
     def steer_for(self, curvature: Real, sideslip: Real) -> tuple[Real, Real]:
@@ -229,7 +234,7 @@ class FourWheelSteering:
         """
         vx, _, _ = self.body_twist(speed, front, rear)
         tan_f, tan_r = tan(front), tan(rear)
-        return vx * (0.5 * (hypot(1.0 + 0.0 * tan_f, tan_f) + hypot(1.0 + 0.0 * tan_r, tan_r)))
+        return vx * (0.5 * (secant(tan_f) + secant(tan_r)))
 
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
         """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37."""

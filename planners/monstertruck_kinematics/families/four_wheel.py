@@ -14,6 +14,7 @@ from monstertruck_kinematics.elementary import (
     cos,
     hypot,
     require_positive,
+    secant,
     sign,
     sin,
     tan,
@@ -74,8 +75,8 @@ class FourWheelSteer:
         vx, vy, wz = self.geometry.body_twist(speed, front, rear)
         length = self.geometry.wheelbase
         tan_f, tan_r = tan(front), tan(rear)
-        tan_b = (self.geometry.l_r * tan_f + self.geometry.l_f * tan_r) / length
-        cos_b = 1.0 / hypot(1.0 + 0.0 * tan_b, tan_b)
+        tan_b = self.geometry.tan_sideslip(tan_f, tan_r)
+        cos_b = 1.0 / secant(tan_b)
         columns = [(cos_b, cos_b * tan_b, cos_b * (tan_f - tan_r) / length)]
         for tangent, share, side in ((tan_f, self.geometry.l_r, 1.0), (tan_r, self.geometry.l_f, -1.0)):
             slope = 1.0 + tangent * tangent

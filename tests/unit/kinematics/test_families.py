@@ -226,6 +226,26 @@ def test_car_like_constraints_hold_at_both_axles(rng):
             np.testing.assert_allclose(x_rate, speed * np.cos(heading) * np.cos(steer), atol=1e-15)
 
 
+def test_steering_modes_are_their_own_turning_centres():
+    truck = FourWheelSteer()
+    expected = {"front": (0.3, 0.0), "rear": (0.0, 0.3), "counter": (0.3, -0.3), "crab": (0.3, 0.3)}
+    for mode, angles in expected.items():
+        assert truck.steering(mode, 0.3) == angles
+    x, y = turning_centre(truck.forward((0.2, *truck.steering("front", 0.3))))
+    assert (x, y) == pytest.approx((-0.16, 0.32 / math.tan(0.3)))
+    x, y = turning_centre(truck.forward((0.2, *truck.steering("rear", 0.3))))
+    assert (x, y) == pytest.approx((0.16, -0.32 / math.tan(0.3)))
+    with pytest.raises(KinematicsError, match="mode 'spot'"):
+        truck.steering("spot", 0.3)
+
+
+@pytest.mark.parametrize(("drive", "command"), [(FourWheelSteer(), (0.2, 0.3, -0.2)), (Ackermann(), (0.2, 0.3))])
+def test_wheel_rates_are_what_the_wheels_roll(drive, command):
+    twist = drive.forward(command)
+    rates = [float(w.rolling_row @ twist) / w.radius for w in drive.wheels(command)]
+    assert drive.wheel_rates(command) == pytest.approx(rates)
+
+
 def test_synchro_platform_keeps_its_heading():
     drive = Synchro(wheel_radius=0.1)
     twist = drive.platform_twist((5.0, 0.7), math.pi / 6)

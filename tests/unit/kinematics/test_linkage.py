@@ -84,7 +84,7 @@ def test_inverse_is_exact(linkage):
 def test_reach_is_where_it_locks():
     right, left = reachable_servo(REARWARD)
     assert right < math.radians(-45.0)
-    assert left > math.radians(45.0)
+    assert left > math.radians(-45.0)
     REARWARD.wheels_from_servo(left)
     with pytest.raises(KinematicsError, match="servo: sine of the wheel arm"):
         REARWARD.wheels_from_servo(left + math.radians(0.2))
@@ -153,5 +153,8 @@ def test_best_common_motion_is_a_minimum(rng):
 
     for db, dk in ((1e-3, 0), (-1e-3, 0), (0, 1e-3), (0, -1e-3)):
         assert slip(slide + db, turn + dk) > slip(slide, turn)
+    square, inward = FourWheelSteering(2.0, 2.0), math.radians(-45.0)
+    with pytest.raises(KinematicsError, match="towards one point"):
+        common_motion(square, (inward, -inward, -inward, inward))
     with pytest.raises(KinematicsError, match="wheel rear left: angle is nan"):
         common_motion(geometry, (0.0, 0.0, math.nan, 0.0))

@@ -161,6 +161,21 @@ def test_bad_input_is_named():
             call()
 
 
+def test_nothing_is_a_valid_number_of_states():
+    empty = np.zeros(0)
+    assert all(part.size == 0 for part in FourWheelSteering().body_twist(empty, empty, empty))
+
+
+def test_motor_sees_the_mean_of_both_axles():
+    geometry = FourWheelSteering()
+    assert geometry.drive_speed(0.2, 0.0, 0.0) == 0.2
+    assert geometry.drive_speed(0.2, 0.3, 0.3) == pytest.approx(0.2)
+    assert geometry.drive_speed(-0.2, 0.4, -0.4) == pytest.approx(-0.2 / math.cos(0.4))
+    vx, vy, wz = geometry.body_twist(0.2, 0.3, 0.0)
+    axles = (math.hypot(vx, vy + 0.16 * wz), math.hypot(vx, vy - 0.16 * wz))
+    assert geometry.drive_speed(0.2, 0.3, 0.0) == pytest.approx(sum(axles) / 2)
+
+
 def test_integrate_is_the_shared_one():
     pose = FourWheelSteering().integrate((0.0, 0.0, 0.0), 0.2, 0.0, math.pi, 1.0)
     assert pose == pytest.approx((0.0, 0.4 / math.pi, math.pi))
