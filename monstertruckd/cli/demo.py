@@ -53,10 +53,8 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
     from rich.table import Table
 
     console = Console()
-    table = Table.grid(padding=(0, 2))
     for name, value in rows:
-        table.add_row(f"[bold]{name}[/bold]", value)
-    console.print(table)
+        console.print(f"[bold]{name:20}[/bold] {value}", soft_wrap=True, highlight=False)
     counts = Table(box=None, header_style="bold", title="messages per topic", title_justify="left")
     counts.add_column("topic")
     counts.add_column("messages", justify="right")

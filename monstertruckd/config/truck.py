@@ -138,7 +138,7 @@ class MapRender(Schema):
     period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
     """Seconds between two scans it is given"""
     picture: Path | None = None
-    """PNG file drawn when the path is done and when the daemon ends"""
+    """PNG file drawn whenever a path has come to its end"""
 
 
 class TruckConfig(Schema):

@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -54,6 +54,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         try:
             lap = await drive_lap(client, clock, patience=PATIENCE)
             await clock.sleep(1.0)
+            await _appear((folder / "map.png").exists, clock)
         finally:
             watching.cancel()
             await asyncio.wait([watching])
@@ -126,6 +127,14 @@ async def _connect(clock: Clock, endpoint: str) -> TruckClient:
     except TimeoutError:
         raise NoAnswerError(f"the daemon did not come up within {PATIENCE:g} s at {endpoint}") from None
     return TruckClient(endpoint=endpoint, source=f"demo:{os.getpid()}", clock=clock)
+
+
+async def _appear(exists: Callable[[], bool], clock: Clock) -> None:
+    """Wait for a picture that a niced worker draws; without one the summary just does not list it."""
+    with contextlib.suppress(TimeoutError):
+        async with clock.deadline(15.0):
+            while not exists():
+                await clock.sleep(0.1)
 
 
 async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:

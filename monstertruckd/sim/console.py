@@ -1,6 +1,8 @@
 """Faults by typed words: from standard input of an emulator process, from tests, from drills."""
 
 import asyncio
+import os
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TextIO
@@ -75,13 +77,11 @@ class FaultConsole:
 
     async def run(self) -> None:
         """Obey lines until cancelled; the end of the input ends the commands, not the devices."""
+        if not _can_be_awaited(self._source):
+            await asyncio.Event().wait()
         reader = asyncio.StreamReader()
         loop = asyncio.get_running_loop()
-        try:
-            transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), self._source)
-        except (ValueError, OSError):  # standard input is a file or closed: no commands
-            await asyncio.Event().wait()
-            return
+        transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), self._source)
         try:
             while line := await reader.readline():
                 self.obey(line.decode(errors="replace"))
@@ -107,3 +107,12 @@ class FaultConsole:
         if len(self._devices) == 1:
             return next(iter(self._devices.values()))
         raise InputError(f"name a device first: {', '.join(self._devices)}")
+
+
+def _can_be_awaited(source: TextIO) -> bool:
+    """Pipes, sockets and terminals can; files, /dev/null and a closed input cannot."""
+    try:
+        mode = os.fstat(source.fileno()).st_mode
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode) or source.isatty()

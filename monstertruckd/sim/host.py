@@ -1,6 +1,7 @@
 """The emulated robot as a process of its own: devices behind ptys, world truth kept for the judges."""
 
 import asyncio
+import gc
 import signal
 import sys
 from pathlib import Path
@@ -66,6 +67,8 @@ async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
     waiting = asyncio.create_task(stop.wait())
+    gc.collect()
+    gc.freeze()
     _say("ready")
     await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
     for task in (waiting, *tasks):

@@ -1,0 +1,178 @@
+"""The daemon as a process on the wall clock: signals, crashes, second starts. Real ptys, Zenoh and MCAP."""
+
+import asyncio
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.logs import info, open_log, recover
+from tests.daemon.wall_kit import ROOT, end, free_endpoint, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
+
+DEADMAN = {
+    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
+    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
+}
+
+
+def speed_after(truth: np.ndarray, instant: float, seconds: float) -> float:
+    """Greatest true speed from ``seconds`` after ``instant`` on."""
+    return float(np.abs(truth[truth[:, 0] > instant + seconds, 4]).max())
+
+
+def metres_after(truth: np.ndarray, instant: float) -> float:
+    later = truth[truth[:, 0] >= instant]
+    return float(np.hypot(*np.diff(later[:, 1:3], axis=0).T).sum())
+
+
+async def test_sigterm_stops_the_truck_first_and_closes_the_log(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            await truck.drive(client)
+        asked = truck.clock.now() / SECOND
+        assert await end(truck.daemon) == 0
+        took = truck.clock.now() / SECOND - asked
+        await asyncio.sleep(0.5)
+        truth = await truck.truth()
+    assert took < 5
+    assert speed_after(truth, asked, 0.6) < 0.01
+    (log,) = truck.logs()
+    assert info(log)["damage"] is None
+    last = [m for m in open_log(log) if m.topic == "cmd/drive"][-1].decode()
+    assert isinstance(last, DriveCommand)
+    assert last.action is not DriveAction.RUN
+    assert last.motor_velocity == 0.0
+
+
+async def test_kill_9_loses_at_most_a_second_of_log_and_the_next_start_stops_the_truck(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            await truck.drive(client)
+            await asyncio.sleep(1.0)
+        killed = truck.clock.now()
+        await end(truck.daemon, signal.SIGKILL)
+        (log,) = truck.logs()
+        damaged = tmp_path / "damaged.mcap"
+        damaged.write_bytes(log.read_bytes())
+        restarted = truck.clock.now()
+        await truck.start_daemon()
+        async with truck.client():
+            await asyncio.sleep(2.0)
+        assert await end(truck.daemon) == 0
+        truth = await truck.truth()
+    recovery = recover(damaged, tmp_path / "repaired.mcap")
+    assert recovery.damage is not None
+    with (tmp_path / "repaired.mcap").open("rb") as file:
+        newest = max(message.log_time for _, _, message in make_reader(file).iter_messages())
+    assert killed - newest < SECOND
+    assert info(log)["damage"] is None, "the next start repairs it in place"
+    # The drive controller keeps its last speed while nobody talks to it; the first thing it then hears is a stop.
+    before = truth[(truth[:, 0] > killed / SECOND + 0.1) & (truth[:, 0] < restarted / SECOND)]
+    assert np.all(before[:, 4] > 0.1)
+    assert np.abs(truth[-20:, 4]).max() < 0.01
+
+
+async def test_sigstop_is_caught_by_the_deadman_line_where_wired(tmp_path: Path):
+    async with robot(tmp_path, DEADMAN) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            await truck.drive(client)
+        assert truck.daemon is not None
+        stopped = truck.clock.now() / SECOND
+        truck.daemon.send_signal(signal.SIGSTOP)
+        await asyncio.sleep(1.5)
+        truck.daemon.send_signal(signal.SIGCONT)
+        truth = await truck.truth()
+        await end(truck.daemon)
+    assert speed_after(truth, stopped, 0.75) < 0.01
+    assert metres_after(truth, stopped) < 0.15
+
+
+async def test_sigstop_without_the_line_lets_the_truck_drive_on_and_going_on_stops_it(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            await truck.drive(client)
+            assert truck.daemon is not None
+            stopped = truck.clock.now() / SECOND
+            truck.daemon.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(1.5)
+            continued = truck.clock.now() / SECOND
+            truck.daemon.send_signal(signal.SIGCONT)
+            await asyncio.sleep(1.0)
+        truth = await truck.truth()
+        await end(truck.daemon)
+    frozen = truth[(truth[:, 0] > stopped + 0.2) & (truth[:, 0] < continued)]
+    assert np.all(frozen[:, 4] > 0.1), "documented: without the deadman line nothing stops it"
+    waking = truth[(truth[:, 0] > continued) & (truth[:, 0] < continued + 1.0)]
+    assert np.abs(waking[:, 4]).min() < 0.01, "the stalled tick stops the truck as soon as it runs again"
+
+
+async def test_a_second_daemon_is_refused_clearly(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            second = await asyncio.to_thread(
+                subprocess.run,
+                [sys.executable, "-m", "monstertruckd", "run", "--config", str(truck.config)],
+                cwd=ROOT,
+                capture_output=True,
+                text=True,
+                timeout=30,
+                check=False,
+            )
+            assert second.returncode == Reason.BUSY.exit_code
+            assert truck.endpoint.removeprefix("tcp/") in second.stderr
+            assert "another daemon" in second.stderr
+            assert "Traceback" not in second.stderr
+            # Another robot name and endpoint, but the same ports: every device is refused, nothing is disturbed.
+            other = tmp_path / "other.yaml"
+            endpoint = free_endpoint()
+            text = truck.config.read_text().replace(truck.endpoint, endpoint)
+            other.write_text(text.replace(str(tmp_path / "logs"), str(tmp_path / "logs2")) + "robot: intruder\n")
+            first, truck.daemon = truck.daemon, await truck.spawn("run", "--config", str(other))
+            try:
+                await _all_devices_busy(endpoint)
+            finally:
+                await end(truck.daemon)
+                truck.daemon = first
+            health = await client.get_retained(topics.HEALTH)
+            assert health is not None
+            assert all(row.restarts == 0 for row in health.services), health
+
+
+async def _all_devices_busy(endpoint: str) -> None:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.errors import NotFoundError
+
+    roles = {"lidar", "drive", "steering", "compass"}
+    async with asyncio.timeout(30):
+        while True:
+            try:
+                async with TruckClient("intruder", endpoint, timeout=0.5) as client:
+                    with client.subscribe(topics.HEALTH, latest()) as tables:
+                        while True:
+                            table = await tables.next()
+                            busy = {row.name for row in table.services if row.reason is Reason.DEVICE_BUSY}
+                            if busy >= roles:
+                                return
+            except NotFoundError:
+                await asyncio.sleep(0.1)

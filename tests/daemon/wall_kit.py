@@ -1,0 +1,155 @@
+"""A whole robot over ptys for tests: emulators in one process, the daemon in another, a client here."""
+
+import asyncio
+import contextlib
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ROOT / "configs" / "demo.yaml"
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def merged(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
+    both = {
+        k: merged(base[k], v) if isinstance(v, dict) and isinstance(base.get(k), dict) else v for k, v in top.items()
+    }
+    return base | both
+
+
+@dataclass
+class Robot:
+    """Processes and files of one emulated robot."""
+
+    folder: Path
+    endpoint: str
+    config: Path
+    clock: WallClock = field(default_factory=WallClock)
+    simulator: asyncio.subprocess.Process | None = None
+    daemon: asyncio.subprocess.Process | None = None
+
+    async def start_simulator(self) -> None:
+        self.simulator = await self.spawn(
+            "simulate", "--config", str(self.config), "--truth", str(self.folder / "t.npz")
+        )
+        async with asyncio.timeout(40):
+            while "ready" not in await self.said():
+                pass
+
+    async def said(self) -> str:
+        assert self.simulator is not None
+        assert self.simulator.stdout is not None
+        line = (await self.simulator.stdout.readline()).decode()
+        assert line, "the simulator ended"
+        return line
+
+    async def fault(self, words: str) -> None:
+        assert self.simulator is not None
+        assert self.simulator.stdin is not None
+        self.simulator.stdin.write(words.encode() + b"\n")
+        await self.simulator.stdin.drain()
+        assert (await self.said()).strip() == "ok"
+
+    async def start_daemon(self) -> None:
+        self.daemon = await self.spawn("run", "--config", str(self.config))
+
+    async def spawn(self, *arguments: str) -> asyncio.subprocess.Process:
+        pipe = asyncio.subprocess.PIPE
+        with (self.folder / f"{arguments[0]}.txt").open("ab") as errors:
+            return await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "monstertruckd", *arguments, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=errors
+            )
+
+    @asynccontextmanager
+    async def client(self) -> AsyncIterator[TruckClient]:
+        async with asyncio.timeout(40):
+            while True:
+                with contextlib.suppress(NotFoundError):
+                    async with TruckClient(endpoint=self.endpoint, clock=self.clock, timeout=0.5) as probe:
+                        if await probe.alive():
+                            break
+                await asyncio.sleep(0.1)
+        async with TruckClient(endpoint=self.endpoint, clock=self.clock) as client:
+            yield client
+
+    async def drive(self, client: TruckClient, speed: float = 0.15) -> None:
+        """Arm, and wait until the tracker drives at ``speed``."""
+        with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.ODOMETRY, latest()) as odometry:
+            async with asyncio.timeout(30):
+                while gate.latest is None or gate.latest.mode is not GateMode.DRIVING:
+                    if gate.latest is None or gate.latest.mode is GateMode.DISARMED:
+                        await client.order(Order.ARM)
+                    await asyncio.sleep(0.1)
+                while odometry.latest is None or odometry.latest.twist.vx < speed:
+                    await asyncio.sleep(0.05)
+
+    async def truth(self) -> np.ndarray:
+        """End the simulator; what happened: rows of time, x, y, yaw, speed, stuck."""
+        await end(self.simulator)
+        with np.load(self.folder / "t.npz") as archive:
+            return archive["truth"]
+
+    def logs(self) -> list[Path]:
+        return sorted((self.folder / "logs").glob("*.mcap"))
+
+
+async def end(process: asyncio.subprocess.Process | None, number: int = signal.SIGTERM) -> int | None:
+    """Signal a process and wait for it; its exit code."""
+    if process is None:
+        return None
+    if process.returncode is None:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(number)
+    if process.stdin is not None:
+        process.stdin.close()
+    async with asyncio.timeout(20):
+        await process.communicate()
+    return process.returncode
+
+
+@asynccontextmanager
+async def robot(folder: Path, overlay: dict[str, Any] | None = None, base: Path = DEMO) -> AsyncIterator[Robot]:
+    """Configuration files and, at the end, no process left."""
+    endpoint = free_endpoint()
+    roles = ("lidar", "drive", "steering", "compass") if base == DEMO else ("lidar",)
+    config: dict[str, Any] = {
+        "include": str(base),
+        "version": 1,
+        "devices": {role: {"port": {"path": str(folder / "dev" / role)}} for role in roles},
+        "zenoh": {"listen": [endpoint]},
+        "recorder": {"directory": str(folder / "logs")},
+        "state_directory": str(folder / "state"),
+    }
+    file = folder / "robot.yaml"
+    file.write_text(yaml.safe_dump(merged(config, overlay or {})))
+    made = Robot(folder, endpoint, file)
+    try:
+        yield made
+    finally:
+        for process in (made.daemon, made.simulator):
+            if process is not None and process.returncode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+                await end(process)
