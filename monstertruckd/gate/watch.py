@@ -21,7 +21,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruckd.gate.config import GateConfig, SensorLimit, TiltLimits
 
-MEASURED: Final = frozenset({BatteryLevel.NORMAL, BatteryLevel.LOW, BatteryLevel.CRITICAL})
+MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
 @dataclass(frozen=True, slots=True)

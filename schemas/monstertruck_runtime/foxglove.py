@@ -32,7 +32,7 @@ from monstertruck_runtime.protobuf import (
 )
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
 
 FIRST_OWN_FIELD: Final = 1000
@@ -112,6 +112,15 @@ GRID: Final = Layout(
     Field(9, "data", BYTES),
     *_OWN_HEADER,
     Field(1002, "origin2d", DOUBLES),
+)
+COMPRESSED_IMAGE: Final = Layout(
+    "foxglove.CompressedImage",
+    Field(1, "timestamp", message(TIMESTAMP)),
+    Field(2, "data", BYTES),
+    Field(3, "format", STRING),
+    Field(4, "frame_id", STRING),
+    *_OWN_HEADER,
+    Field(1002, "sequence", UINT64),
 )
 FRAME_TRANSFORMS: Final = Layout(
     "foxglove.FrameTransforms",
@@ -211,6 +220,16 @@ def _scan_model(values: Mapping[str, Any]) -> LaserScan:
         range_max=values["range_max"],
         ranges=values["ranges"],
         codes=np.frombuffer(values["codes"], np.uint8),
+    )
+
+
+def _image_values(image: CompressedImage) -> dict[str, Any]:
+    return _header(image) | {"data": image.data, "format": image.format, "sequence": image.sequence}
+
+
+def _image_model(values: Mapping[str, Any]) -> CompressedImage:
+    return CompressedImage(
+        **_own_header(values), data=values["data"], format=values["format"], sequence=values["sequence"]
     )
 
 
@@ -361,6 +380,7 @@ class Binding:
 
 BINDINGS: Final[Mapping[type[Message], Binding]] = {
     LaserScan: Binding(LASER_SCAN, _scan_values, _scan_model),
+    CompressedImage: Binding(COMPRESSED_IMAGE, _image_values, _image_model),
     Odometry: Binding(POSE_IN_FRAME, _odometry_values, _odometry_model),
     Path: Binding(POSES_IN_FRAME, _path_values, _path_model),
     Grid: Binding(GRID, _grid_values, _grid_model),

@@ -3,8 +3,8 @@
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from collections.abc import Awaitable, Callable
+from typing import Generic, Protocol, TypeVar
 
 T = TypeVar("T")
 
@@ -66,3 +66,16 @@ async def in_thread(function: Callable[[], T]) -> T:
     except asyncio.CancelledError:
         await asyncio.wait([work])
         raise
+
+
+async def inline(function: Callable[[], T]) -> T:
+    """Run ``function`` on the loop: for the virtual clock, whose time would run on beside a thread."""
+    return function()
+
+
+class Offload(Protocol):
+    """Where blocking work is done: ``in_thread``, or ``inline`` on the virtual clock."""
+
+    def __call__(self, function: Callable[[], T], /) -> Awaitable[T]:
+        """Run ``function`` and wait for its result."""
+        ...

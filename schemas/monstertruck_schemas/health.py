@@ -58,3 +58,74 @@ class RecorderHealth(Message):
     messages: int = 0
     drops: int = 0
     reason: Reason = Reason.OK
+
+
+class LinkMedium(StrEnum):
+    """What a network interface is."""
+
+    WIFI = "wifi"
+    ETHERNET = "ethernet"
+
+
+class LinkLevel(StrEnum):
+    """Judgement of a network link, with hysteresis; a connected cable is excellent."""
+
+    EXCELLENT = "excellent"
+    GOOD = "good"
+    FAIR = "fair"
+    POOR = "poor"
+    UNUSABLE = "unusable"
+    DOWN = "down"
+
+
+class LinkHealth(Message):
+    """Quality of the network link; that a station is lost shows by its silence, never here."""
+
+    interface: str | None = None
+    """Interface that was judged; None = there is none."""
+    medium: LinkMedium | None = None
+    level: LinkLevel
+    signal: float | None = None
+    """Smoothed signal level, dBm; None on a cable or while disconnected."""
+    raw_signal: float | None = None
+    """Newest sample, dBm."""
+    noise: float | None = None
+    """Noise level, dBm, where the driver knows it."""
+    bit_rate: float | None = None
+    """Negotiated rate of a cable, bit/s."""
+    receive_rate: float | None = None
+    """Payload since the last message, byte/s."""
+    send_rate: float | None = None
+    """As ``receive_rate``."""
+    errors: Annotated[int, Field(ge=0)] = 0
+    """Damaged or dropped packets of both directions since the interface came up."""
+
+
+class HostHealth(Message):
+    """State of the computer the daemon runs on; None = the computer does not tell."""
+
+    load: float
+    """Mean number of runnable processes over the last minute."""
+    cores: Annotated[int, Field(ge=1)]
+    cpu: float | None = None
+    """Busy share of all cores since the last message, 0..1."""
+    temperature: float | None = None
+    """Hottest thermal zone, degree Celsius."""
+    frequency: float | None = None
+    """Present clock of the fastest core, Hz."""
+    frequency_share: float | None = None
+    """Greatest clock the cores may take now, as a share of the greatest they can, 0..1."""
+    throttled: bool = False
+    """Slowed down because of heat or supply voltage, now."""
+    memory_total: Annotated[int, Field(ge=0)]
+    """Bytes."""
+    memory_available: Annotated[int, Field(ge=0)]
+    """Bytes that can be had without swapping."""
+    disk_total: Annotated[int, Field(ge=0)]
+    """Bytes of the file system logs are written to."""
+    disk_free: Annotated[int, Field(ge=0)]
+    """Bytes of it that are free for the daemon."""
+    daemon_memory: Annotated[int, Field(ge=0)]
+    """Resident bytes of the daemon itself."""
+    daemon_files: Annotated[int, Field(ge=0)]
+    """File descriptors the daemon has open."""

@@ -91,3 +91,13 @@ class Reason(StrEnum):
     PORT_MOVED = "port_moved", 103, "a device was plugged into another port than configured"
     SLOW_LINK = "slow_link", 104, "the latency of an FTDI adapter cannot be lowered"
     PORT_CYCLED = "port_cycled", 105, "a USB port was switched off and on"
+
+    # The truck's supply, host and network
+    BATTERY_OVERCHARGED = "battery_overcharged", 110, "battery voltage above that of a full pack"
+    HOST_HOT = "host_hot", 111, "the computer is hot"
+    HOST_THROTTLED = "host_throttled", 112, "the computer runs slower than it could"
+    DISK_LOW = "disk_low", 113, "little disk space left"
+    MEMORY_LOW = "memory_low", 114, "little memory left"
+    HOST_BUSY = "host_busy", 115, "the processor has little time left"
+    LINK_WEAK = "link_weak", 116, "network link is weak"
+    LINK_DOWN = "link_down", 117, "no network link"

@@ -1,9 +1,9 @@
 """Messages of the ``sensor`` group: what the devices measured, in SI units, before any estimation."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from monstertruck_schemas.base import Float64Array, Message, Schema, UInt8Array
 
@@ -115,6 +115,7 @@ class BatteryLevel(StrEnum):
     NORMAL = "normal"
     LOW = "low"
     CRITICAL = "critical"
+    OVERCHARGED = "overcharged"
     SENSOR_FAULT = "sensor_fault"
 
 
@@ -127,6 +128,26 @@ class Battery(Message):
     """Newest single sample, V."""
     cells: int
     level: BatteryLevel
+    rest_voltage: float | None = None
+    """Filtered voltage the pack would show without the motor's current, V; None while the sensor is at fault."""
+    cell_voltage: float | None = None
+    """Mean of the cells at rest, V. One weak cell does not show in it."""
+    charge: float | None = None
+    """Share of the capacity that is left, 0..1, from the resting voltage: right to 0.1 at best."""
+    capacity_ah: float | None = None
+    """Capacity of the pack as configured, Ah."""
+
+
+class CompressedImage(Message):
+    """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera tells."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
+
+    data: bytes
+    """The whole file, for ``jpeg`` from its FF D8 to its FF D9."""
+    format: Literal["jpeg"] = "jpeg"
+    sequence: Annotated[int, Field(ge=0, lt=2**32)]
+    """The camera's own count of pictures; a gap is a picture that was lost before the daemon had it."""
 
 
 class TorqueState(StrEnum):

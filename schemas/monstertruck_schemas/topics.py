@@ -8,12 +8,13 @@ from typing import Final, Generic, TypeVar
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event
-from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth
+from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth
 from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
+    CompressedImage,
     DriveFeedback,
     LaserScan,
     StabiliserFeedback,
@@ -78,6 +79,15 @@ COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt",
 DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.25)
 STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.3)
 BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
+CAMERA: Final = Topic(
+    "sensor/camera",
+    CompressedImage,
+    W.DRIVER,
+    "Pictures of the supervision camera",
+    15,
+    2.0,
+    foxglove="foxglove.CompressedImage",
+)
 STABILISER: Final = Topic("sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 50, 0.2)
 
 ODOMETRY: Final = Topic(
@@ -123,6 +133,8 @@ CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command se
 HEALTH: Final = Topic("health/services", HealthTable, W.DAEMON, "Every service's state", 1, 3.0, retained=True)
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, 3.0)
 RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, 3.0, retained=True)
+LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, 3.0)
+HOST: Final = Topic("health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, 3.0)
 USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")

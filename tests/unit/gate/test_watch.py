@@ -329,3 +329,10 @@ def test_a_silent_drive_does_not_hide_a_wall():
     rig.tick()
     assert rig.out.reasons == (Reason.OBSTACLE_STOP,)
     assert rig.out.speed == 0.0
+
+
+def test_an_overcharged_battery_does_not_hinder_driving():
+    rig = Rig(battery={"stale_after": 0.5, "critical": True}).driving()
+    rig.level = BatteryLevel.OVERCHARGED
+    rig.tick(60)
+    assert rig.out.reasons == ()

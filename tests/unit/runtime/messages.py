@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
-from monstertruck_schemas.sensor import LaserScan, StabiliserJoint, TorqueState, Vector3
+from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
 
 ns = st.integers(-(2**63), 2**63 - 1)
@@ -49,6 +49,7 @@ scans = st.integers(0, 20).flatmap(
         codes=hnp.arrays(np.uint8, n),
     )
 )
+images = st.builds(CompressedImage, **header, data=st.binary(max_size=300), sequence=st.integers(0, 2**32 - 1))
 odometries = st.builds(
     Odometry,
     **header,
@@ -97,6 +98,7 @@ trees = st.builds(
 
 PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.SCAN: scans,
+    t.CAMERA: images,
     t.ODOMETRY: odometries,
     t.POSE: odometries,
     t.PATH: paths,

@@ -22,7 +22,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan
+from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid
 from tests.unit.runtime import messages
 
@@ -324,3 +324,18 @@ def test_json_schema_tells_what_nested_and_optional_values_are():
     assert set(properties["acceleration"]["properties"]) == {"x", "y", "z"}
     assert "degree" in properties["temperature"]["description"]
     assert issubclass(Attitude, BaseModel)
+
+
+def test_stock_reader_sees_the_standard_picture():
+    picture = CompressedImage(
+        stamp=2_000_000_003, received=5, seq=6, frame="camera", data=b"\xff\xd8\xff\xd9", sequence=7
+    )
+    message = stock(t.CAMERA, wire.encode(t.CAMERA, picture))
+    assert (message.timestamp.seconds, message.timestamp.nanos) == (2, 3)
+    assert (message.frame_id, message.format, message.data) == ("camera", "jpeg", b"\xff\xd8\xff\xd9")
+    assert message.sequence == 7
+
+
+def test_a_picture_survives_json_too():
+    picture = CompressedImage(stamp=1, received=1, seq=1, data=bytes(range(256)), sequence=7)
+    assert CompressedImage.model_validate_json(picture.model_dump_json()) == picture
