@@ -181,9 +181,6 @@ class _Session:
         end = self._clock.now() + int(SAFE_DEADLINE * SECOND)
         with suppress(DeviceError, TimeoutError):
             async with self._clock.deadline(SAFE_DEADLINE):
-                await self._line.finish()
-                if self._line.quiet_until > end:
-                    return
                 await self._control(Control.QUICK_STOP)
                 while abs(await self._line.read(od.VELOCITY)) > self._config.standstill_rpm:
                     if self._clock.now() > end - int(DISABLE_TIME * SECOND):
@@ -207,8 +204,6 @@ class _Session:
                 failures += 1
                 if failures >= FAILURE_LIMIT:
                     raise
-                self._sent_rpm = None  # whether the last write arrived is not known
-                self._stopping = False
                 self._prepared = False  # it may have restarted
                 await self._line.settle()
             else:
@@ -278,12 +273,11 @@ class _Session:
         elif not self._stopping:
             await self._control(Control.QUICK_STOP)
             self._stopping = True
-            self._status_due = 0
             if self._state in POWERED:
                 self._state = State.QUICK_STOP
         rpm = want.rpm if self._state is State.ENABLED else 0
         if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
-            self._sent_rpm = None
+            self._sent_rpm = None  # if this fails, whether it arrived is not known
             await self._line.write(od.TARGET_VELOCITY, rpm)
             self._sent_rpm = rpm
 

@@ -99,6 +99,7 @@ class EposEmulator:
             "supply_limit": ("VOLTS", self._inject_supply_limit),
             "strict": ("on|off", self._inject_strict),
             "repeat": ("on|off", self._inject_repeat),
+            "latch": ("on|off", self._inject_latch),
         }
 
     # Faults and switches
@@ -118,7 +119,8 @@ class EposEmulator:
         ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing. ``busy``,
         ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit, bytes
         before acknowledges. ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
-        ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again): ``on|off``.
+        ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
+        is left through power stage off only): ``on|off``.
         ``supply_limit VOLTS``: over-voltage above that.
 
         Raises:
@@ -163,6 +165,9 @@ class EposEmulator:
 
     def _inject_repeat(self, word: str) -> None:
         self.repeat_refused = _flag(word)
+
+    def _inject_latch(self, word: str) -> None:
+        self.firmware.latched_quick_stop = _flag(word)
 
     def _switch_power(self, on: bool) -> None:
         if self._power and not on:

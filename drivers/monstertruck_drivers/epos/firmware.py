@@ -130,6 +130,8 @@ class Firmware:
         self._rng = rng
         self.strict_transitions = False
         """Answer an impossible controlword with "wrong device state" instead of ignoring it."""
+        self.latched_quick_stop = False
+        """Quick stop is left through power stage off only (what the real one does is not sure)."""
         self.over_voltage_above = OVER_VOLTAGE_ABOVE
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
@@ -298,6 +300,8 @@ class Firmware:
             return None if self.state is State.QUICK_STOP else State.READY
         if not word & 0x08:
             return State.SWITCHED_ON if self.state in (State.READY, State.ENABLED) else None
+        if self.state is State.QUICK_STOP and self.latched_quick_stop:
+            return None
         return State.ENABLED if self.state in (State.SWITCHED_ON, *POWERED) else None
 
     def set_quick_stop_input(self, active: bool) -> None:

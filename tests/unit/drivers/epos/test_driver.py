@@ -245,6 +245,7 @@ def test_a_motor_that_brakes_too_slowly_is_left_braking_not_rolling():
         async with rig.driving():
             await rig.drive(18_000)
         assert rig.emulator.state is State.QUICK_STOP
+        assert rig.driver._quiet_until == 0, "no exchange was cut"
         await rig.settle(0.7)
         assert rig.shaft_rpm == 0
 
@@ -261,6 +262,52 @@ def test_cancelling_a_silent_line_takes_no_longer_than_the_deadline():
             task.cancel()
             await asyncio.wait([task])
             assert (rig.clock.now() - start) / SECOND <= SAFE_DEADLINE + 0.001
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("phase", range(0, 50, 7))
+def test_running_again_right_after_a_quick_stop_starts_from_0(phase: int):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(6_000)
+            await rig.settle(phase / 1000)
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(0.021)
+            rig.gate.say(DriveAction.RUN, 6_000)
+            await rig.settle(0.5)
+            assert rig.shaft_rpm == -6_000
+        stopped = next(at for at, word in rig.writes(od.CONTROLWORD)[1:] if word == Control.QUICK_STOP)
+        enabled = next(at for at, word in rig.writes(od.CONTROLWORD) if word == Control.ENABLE and at > stopped)
+        assert {value for at, value in rig.writes(od.TARGET_VELOCITY) if stopped < at < enabled} == {0}
+
+    on_bench(test)
+
+
+def test_a_target_whose_write_was_not_confirmed_is_written_again():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(6_000)
+            await rig.until(lambda: targets(rig)[-1] == -6_000)
+            rig.emulator.inject("delay", "600", "1")
+            rig.gate.say(DriveAction.RUN, 2_000)
+            await rig.until(lambda: targets(rig)[-1] == -2_000)
+            rig.gate.say(DriveAction.RUN, 6_000)
+            await rig.settle(2.0)
+            assert rig.shaft_rpm == -6_000
+
+    on_bench(test)
+
+
+def test_a_quick_stop_that_latches_is_left_the_long_way():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("latch", "on")
+        async with rig.driving():
+            await rig.drive(6_000)
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(0.5)
+            await rig.drive(6_000)
+        assert controls(rig).count(Control.SHUTDOWN) >= 2
 
     on_bench(test)
 
@@ -467,13 +514,13 @@ def test_silence_ends_the_session():
     on_bench(test)
 
 
-@pytest.mark.parametrize("moving", [True, False])
-def test_a_power_cycle_is_noticed_and_brings_it_back_prepared(moving: bool):
+@pytest.mark.parametrize("action", [DriveAction.RUN, DriveAction.QUICK_STOP, DriveAction.DISABLE])
+def test_a_power_cycle_is_noticed_and_brings_it_back_prepared(action: DriveAction):
     async def test(rig: Rig) -> None:
         async with rig.supervised():
             await rig.drive(6_000)
-            if not moving:
-                rig.gate.say(DriveAction.QUICK_STOP)
+            if action is not DriveAction.RUN:
+                rig.gate.say(action)
                 await rig.settle(1.0)
             position = rig.newest.position
             rig.emulator.power_cycle()
@@ -486,6 +533,56 @@ def test_a_power_cycle_is_noticed_and_brings_it_back_prepared(moving: bool):
             assert rig.newest.position >= position - lost, "the counter began at 0, the odometer did not"
             jumps = [b.position - a.position for a, b in itertools.pairwise(rig.out.kept)]
             assert min(jumps) > -lost
+
+    on_bench(test)
+
+
+def test_a_power_cycle_while_idle_is_no_secret_either():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.emulator.power_cycle()
+            await rig.settle(1.5)
+            await rig.drive(6_000)
+        assert len(rig.ready_at) == 1
+
+    on_bench(test)
+
+
+def test_a_counter_that_restarted_while_unplugged_is_no_motion():
+    async def test(rig: Rig) -> None:
+        async with rig.supervised():
+            await rig.drive(6_000)
+            await rig.settle(3.0)
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(1.0)
+            position = rig.newest.position
+            assert position > 1_000
+            rig.port.unplug()
+            rig.emulator.power_cycle()
+            await rig.settle(60.0)
+            rig.port.plug()
+            await rig.settle(1.5)
+            assert rig.newest.received > rig.clock.now() - SECOND // 10
+            assert rig.newest.position == position
+
+    on_bench(test)
+
+
+def test_after_a_loss_in_the_middle_of_an_exchange_nothing_is_sent_before_the_controller_listens():
+    async def test(rig: Rig) -> None:
+        async with rig.supervised():
+            await rig.drive(6_000)
+            rig.emulator.inject("delay", "200", "1")
+            await rig.settle(0.05)
+            lost = rig.clock.now()
+            rig.port.unplug()
+            await rig.settle(0.01)
+            rig.port.plug()
+            heard = len(rig.emulator.received)
+            await rig.until(lambda: rig.shaft_rpm == 0)
+            assert rig.emulator.received[heard][0] - lost > 0.5 * SECOND
+            assert (rig.clock.now() - lost) / SECOND < 0.85, "the late byte of the old answer prolongs the silence"
 
     on_bench(test)
 
