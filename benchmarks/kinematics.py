@@ -4,6 +4,7 @@ Last line: one JSON object with the figures, the goals and whether all are met.
 """
 
 import json
+import statistics
 import sys
 import timeit
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering
 
 STATES = 1_000_000
-ROUNDS = 15
+ROUNDS = 31
 LENGTH, FRONT_ARM, REAR_ARM = 0.32, 0.16, 0.16
 
 
@@ -32,10 +33,10 @@ def script_inverse(vx: Array, vy: Array, wz: Array) -> tuple[Array, Array, Array
 
 
 def ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float, float]:
-    """Best times of both, s, run in turns so that the machine's mood hits both alike, and their ratio."""
+    """Median times of both, s, run in turns so that the machine's mood hits both alike, and their median ratio."""
     pairs = [(timeit.timeit(ours, number=1), timeit.timeit(theirs, number=1)) for _ in range(ROUNDS)]
-    mine, script = (min(column) for column in zip(*pairs, strict=True))
-    return mine, script, mine / script
+    mine, script = (statistics.median(column) for column in zip(*pairs, strict=True))
+    return mine, script, statistics.median(a / b for a, b in pairs)
 
 
 def microseconds(call: Callable[[], object]) -> float:

@@ -74,7 +74,19 @@ def hypot(x: Real, y: Real) -> Real:
 
 def secant(tangent: Real) -> Real:
     """1/cos of the angle in (-90, 90) deg that has this tangent."""
-    return sqrt(1.0 + tangent * tangent)
+    square = tangent * tangent
+    square += 1.0
+    if isinstance(square, np.ndarray):
+        return np.sqrt(square, out=square)
+    return math.sqrt(square)
+
+
+def signed_hypot(x: Real, y: Real) -> Real:
+    """Length of (x, y) with the sign of x."""
+    length = hypot(x, y)
+    if isinstance(length, np.ndarray):
+        return np.copysign(length, x, out=length)
+    return math.copysign(length, x)
 
 
 def sign(x: Real) -> Real:

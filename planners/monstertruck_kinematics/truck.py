@@ -27,6 +27,7 @@ from monstertruck_kinematics.elementary import (
     require_within,
     secant,
     sign,
+    signed_hypot,
     smaller,
     tan,
 )
@@ -194,7 +195,7 @@ class FourWheelSteering:
             if np.any((np.asarray(vx) == 0.0) & (np.abs(vy) + np.abs(wz) > 0.0)):
                 raise KinematicsError("vx is 0 while vy or wz is not: two steered axles need a forward speed")
             ahead = nonzero(vx)
-        return sign(vx) * hypot(vx, vy), atan((vy + self.l_f * wz) / ahead), atan((vy - self.l_r * wz) / ahead)
+        return signed_hypot(vx, vy), atan((vy + self.l_f * wz) / ahead), atan((vy - self.l_r * wz) / ahead)
 
     def wheel_angles(self, front: Real, rear: Real) -> tuple[Real, Real, Real, Real]:
         """Angles of the four wheels through the common ICR (eqs. 2.27-2.30), within +-90 deg."""
