@@ -1,0 +1,346 @@
+"""An emulated machine with USB hubs: a sysfs tree in a folder, announcements, cables that can be pulled.
+
+The folder looks like ``/sys`` and ``/dev`` of a real machine as far as this package reads and writes them. Serial
+nodes lead to emulated ports; so everything above runs as on a robot, on either clock.
+"""
+
+import errno
+import shutil
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Final, TypeVar
+
+from monstertruck_drivers.link import EmulatedPort, MemoryPort, Port, SerialPort
+from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.usb.sysfs import Machine, Sysfs
+from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, sort_key
+from monstertruck_runtime.clock import Clock
+
+T = TypeVar("T")
+
+FTDI_LATENCY: Final = 16
+ENUMERATION: Final = 0.12
+"""Seconds between two devices of a hub that comes back."""
+
+
+@dataclass(slots=True)
+class _Thing:
+    """A hub or device that exists, plugged in or not."""
+
+    name: str
+    usb_id: str
+    title: str
+    serial: str | None
+    ports: int = 0
+    """Of a hub; 0 = a device."""
+    node: str | None = None
+    """``ttyUSB``, ``ttyACM`` or ``video``."""
+    interface: int = 0
+    cable: EmulatedPort | None = None
+    plugged: bool = False
+    autosuspend: bool = False
+    node_name: str | None = None
+
+
+@dataclass(slots=True)
+class EmulatedWatcher:
+    """Announces what the emulated machine does; ``deaf`` = no udev, nothing is announced."""
+
+    deaf: bool = False
+    _hint: Callable[[], None] | None = field(default=None)
+
+    def start(self, hint: Callable[[], None]) -> None:
+        """Listen."""
+        self._hint = hint
+
+    def stop(self) -> None:
+        """Listen no more."""
+        self._hint = None
+
+    def announce(self) -> None:
+        """Something changed."""
+        if self._hint is not None and not self.deaf:
+            self._hint()
+
+
+class EmulatedUsb:
+    """Hubs and devices in a folder.
+
+    Args:
+        folder: gets ``sys`` and ``dev``; must exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.watcher = EmulatedWatcher()
+        self.sysfs = _EmulatedSysfs(folder / "sys", self)
+        self.dev = folder / "dev"
+        self.refused: set[str] = set()
+        """Attributes that may not be written, as for a user without rights: ``latency_timer`` ..."""
+        self.busy_numbers: set[int] = set()
+        """Node numbers still taken by somebody who has a vanished node open."""
+        self.commands: list[Sequence[str]] = []
+        """Programs that were run."""
+        self._things: dict[str, _Thing] = {}
+        self._devnums = count(2)
+        (folder / "sys" / DEVICES).mkdir(parents=True)
+        self.dev.mkdir()
+
+    def machine(self, clock: Clock) -> Machine:
+        """What the code under test takes for its computer."""
+        return Machine(clock, self.sysfs, self.dev, _inline, self._run, self._serial)
+
+    # What there is
+
+    def add_hub(self, name: str, *, ports: int = 4, usb_id: str = "05e3:0608", title: str = "USB2.0 Hub") -> None:
+        """Create a hub and plug it in; root hubs come by themselves."""
+        hub = parent_of(name)
+        if hub is not None and hub.startswith("usb") and hub not in self._things:
+            self._things[hub] = _Thing(hub, "1d6b:0002", "xHCI Host Controller", None, ports=8)
+            self.plug(hub)
+        self._things[name] = _Thing(name, usb_id, title, None, ports=ports)
+        self.plug(name)
+
+    def add_device(
+        self,
+        name: str,
+        usb_id: str,
+        title: str = "",
+        *,
+        node: str | None = None,
+        interface: int = 0,
+        serial: str | None = None,
+        cable: EmulatedPort | None = None,
+    ) -> None:
+        """Create a device and plug it in.
+
+        Args:
+            name: place, e.g. ``1-1.2``; its hub must exist.
+            usb_id: ``vendor:product``.
+            title: product.
+            node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None = no node.
+            interface: USB interface of the node.
+            serial: serial number.
+            cable: what a serial node leads to.
+        """
+        self._things[name] = _Thing(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
+        self.plug(name)
+
+    def present(self, name: str) -> bool:
+        """Whether it shows in the tree."""
+        return (self.sysfs.root / DEVICES / name).exists()
+
+    # What happens to it
+
+    def plug(self, name: str, *, number: int | None = None) -> None:
+        """Plug one hub or device in; nothing happens while its hub is not there.
+
+        Args:
+            name: place.
+            number: of its node; None = lowest that is free.
+        """
+        thing = self._things[name]
+        thing.plugged = True
+        if self.present(name) or any(not self.present(hub) for hub in ancestors(name)):
+            return
+        vendor, product = thing.usb_id.split(":")
+        values = {
+            "devnum": str(next(self._devnums)),
+            "idVendor": vendor,
+            "idProduct": product,
+            "bDeviceClass": "09" if thing.ports else "00",
+            "product": thing.title,
+            "authorized": "1",
+            "power/control": "auto" if thing.ports or thing.autosuspend else "on",
+        }
+        if thing.serial is not None:
+            values["serial"] = thing.serial
+        self._write(f"{DEVICES}/{name}", values)
+        if thing.ports:
+            for port in range(1, thing.ports + 1):
+                child = f"{name[3:]}-{port}" if name.startswith("usb") else f"{name}.{port}"
+                self._write(port_directory(child), {"over_current_count": "0", "disable": "0"})
+        self._bind(thing, number)
+        self.watcher.announce()
+
+    def unplug(self, name: str) -> None:
+        """Pull one hub or device out, and whatever hangs on it."""
+        self._things[name].plugged = False
+        self._vanish(name)
+
+    def lose_hub(self, name: str) -> None:
+        """The hub drops off the bus: its devices vanish, then itself, though every cable is in."""
+        self._vanish(name)
+
+    def lose_power(self, hub: str) -> None:
+        """Everything behind a hub vanishes, the hub stays."""
+        for name in self._behind(hub):
+            self._vanish(name)
+
+    async def return_hub(self, name: str, clock: Clock, *, first: float = 0.2, between: float = ENUMERATION) -> None:
+        """The hub is enumerated again, then, one after the other, what is plugged into it.
+
+        Args:
+            name: the hub.
+            clock: time.
+            first: seconds until the hub itself is there.
+            between: seconds until each of its devices is.
+        """
+        await clock.sleep(first)
+        self.plug(name)
+        for child in self._behind(name):
+            if self._things[child].plugged:
+                await clock.sleep(between)
+                self.plug(child)
+
+    def move(self, name: str, to: str) -> None:
+        """Plug a device into another port."""
+        self.unplug(name)
+        thing = self._things.pop(name)
+        thing.name = to
+        self._things[to] = thing
+        self.plug(to)
+
+    def over_current(self, name: str) -> None:
+        """The port ``name`` hangs on draws too much and says so."""
+        attribute = f"{port_directory(name)}/over_current_count"
+        seen = self.sysfs.number(attribute) or 0
+        self._write(port_directory(name), {"over_current_count": str(seen + 1)})
+        self.watcher.announce()
+
+    def suspend_when_idle(self, name: str) -> None:
+        """Some power saver lets the kernel suspend the device, now and after every replug."""
+        self._things[name].autosuspend = True
+        self._write(f"{DEVICES}/{name}", {"power/control": "auto"})
+        self.watcher.announce()
+
+    def written(self, path: str, value: str) -> None:
+        """The code under test set an attribute: do what the kernel does.
+
+        Raises:
+            PermissionError: it is among ``refused``.
+        """
+        attribute = Path(path).name
+        if attribute in self.refused:
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        folder = Path(path).parent.name
+        if attribute == "disable":
+            self._switch(self._at_port(folder), on=value == "0")
+        elif attribute == "authorized":
+            thing = self._things[folder]
+            self._unbind(thing) if value == "0" else self._bind(thing, None)
+            self.watcher.announce()
+
+    # How it is done
+
+    def _behind(self, hub: str) -> list[str]:
+        return sorted((name for name in self._things if hub in ancestors(name)), key=sort_key)
+
+    def _vanish(self, name: str) -> None:
+        """Children first, as the kernel does."""
+        for child in [*reversed(self._behind(name)), name]:
+            if not self.present(child):
+                continue
+            self._unbind(self._things[child])
+            for interface in self.sysfs.root.joinpath(DEVICES).glob(f"{_interface_prefix(child)}:*"):
+                shutil.rmtree(interface)
+            shutil.rmtree(self.sysfs.root / DEVICES / child)
+            self.watcher.announce()
+
+    def _bind(self, thing: _Thing, number: int | None) -> None:
+        """Drivers take the device: interface and node appear."""
+        if thing.node is None:
+            return
+        taken = {other.node_name for other in self._things.values()} | {
+            f"{thing.node}{busy}" for busy in self.busy_numbers
+        }
+        free = next(n for n in count() if f"{thing.node}{n}" not in taken) if number is None else number
+        thing.node_name = f"{thing.node}{free}"
+        interface = f"{DEVICES}/{thing.name}:1.{thing.interface}"
+        link = self.sysfs.root / DEVICES / thing.name / f"{thing.name}:1.{thing.interface}"
+        if thing.node == "ttyUSB":
+            self._write(f"{interface}/{thing.node_name}", {"latency_timer": str(FTDI_LATENCY)})
+        else:
+            kind = "video4linux" if thing.node == "video" else "tty"
+            self._write(f"{interface}/{kind}/{thing.node_name}", {})
+        link.symlink_to(Path("..") / link.name)
+        if thing.cable is not None:
+            thing.cable.plug()
+            if isinstance(thing.cable, PtyPort):
+                (self.dev / thing.node_name).symlink_to(thing.cable.name)
+
+    def _unbind(self, thing: _Thing) -> None:
+        if thing.node_name is None:
+            return
+        if thing.cable is not None:
+            thing.cable.unplug()
+        (self.dev / thing.node_name).unlink(missing_ok=True)
+        link = self.sysfs.root / DEVICES / thing.name / f"{thing.name}:1.{thing.interface}"
+        link.unlink(missing_ok=True)
+        shutil.rmtree(self.sysfs.root / DEVICES / link.name)
+        thing.node_name = None
+
+    def _at_port(self, folder: str) -> _Thing | None:
+        things = (thing for thing in self._things.values() if parent_of(thing.name) is not None)
+        return next((thing for thing in things if Path(port_directory(thing.name)).name == folder), None)
+
+    def _switch(self, thing: _Thing | None, *, on: bool) -> None:
+        """A port's power; what hangs there follows it."""
+        if thing is not None and not on:
+            self._vanish(thing.name)
+        elif thing is not None and thing.plugged:
+            self.plug(thing.name)
+
+    def _write(self, path: str, values: dict[str, str]) -> None:
+        folder = self.sysfs.root / path
+        folder.mkdir(parents=True, exist_ok=True)
+        for attribute, value in values.items():
+            (folder / attribute).parent.mkdir(exist_ok=True)
+            (folder / attribute).write_text(f"{value}\n")
+
+    def _serial(self, path: Path, baud: int) -> Port:
+        for thing in self._things.values():
+            if thing.node_name == path.name and isinstance(thing.cable, MemoryPort):
+                return thing.cable
+        return SerialPort(path, baud)
+
+    async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
+        """The only program there is: a uhubctl that cycles one port."""
+        self.commands.append(arguments)
+        if list(arguments[:1]) != ["uhubctl"] or "uhubctl" in self.refused:
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", arguments[0])
+        options = dict(zip(arguments[1::2], arguments[2::2], strict=True))
+        for thing in self._things.values():
+            hub = parent_of(thing.name) or ""
+            if (hub.removeprefix("usb"), str(port_of(thing.name))) == (options["-l"], options["-p"]):
+                self._switch(thing, on=False)
+                self._switch(thing, on=True)
+                return 0, ""
+        return 1, "No compatible devices detected!"
+
+
+class _EmulatedSysfs(Sysfs):
+    """Attributes that act when written."""
+
+    def __init__(self, root: Path, usb: EmulatedUsb) -> None:
+        super().__init__(root)
+        self._usb = usb
+
+    def write(self, path: str, text: str) -> None:
+        if not (self.root / path).exists():
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", path)
+        self._usb.written(path, text)
+        if (self.root / path).exists():  # unless the device went with it
+            (self.root / path).write_text(f"{text}\n")
+
+
+def _interface_prefix(name: str) -> str:
+    return f"{name[3:]}-0" if name.startswith("usb") else name
+
+
+def _inline(function: Callable[[], T]) -> Awaitable[T]:
+    async def call() -> T:
+        return function()
+
+    return call()

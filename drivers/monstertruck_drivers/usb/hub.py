@@ -1,0 +1,330 @@
+"""Makes one event of everything a hub loses at once, and lets its devices start one after the other.
+
+A ``HubCoordinator`` compares snapshots. Losses are judged together after a short while: where a hub is gone, or all
+of its several devices are, the topmost such hub is the event, and whatever was behind it waits for the hub. Once the
+tree behind the returned hub keeps still, its devices may start in order of safety, spaced apart. A device may also
+have to wait because its port reported over-current.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
+from monstertruck_drivers.usb.tree import Device, Snapshot, ancestors, parent_of, place, sort_key
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import EventSink
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.usb import UsbNode, UsbState
+
+NAME: Final = "usb"
+
+
+@dataclass(slots=True)
+class _Slot:
+    """What is known of one place of the tree."""
+
+    device: Device | None = None
+    """As last seen."""
+    present: bool = False
+    replugs: int = 0
+    free_at: int | None = 0
+    """Instant from which its device may start; None = not before its hub says so."""
+    held_until: int = 0
+    over_current: int = 0
+
+
+@dataclass(slots=True)
+class _Outage:
+    """A hub that is gone, or whose devices are; ends when they may start."""
+
+    hub: str
+    since: int
+    changed: int
+    members: set[str]
+    announced: bool
+
+
+class HubCoordinator:
+    """Knows who must wait for a hub.
+
+    Args:
+        config: times and order.
+        ports: configured place of every role.
+        clock: time.
+        events: hubs lost and returned, devices moved, over-current.
+    """
+
+    def __init__(self, config: UsbConfig, ports: Mapping[str, UsbPortConfig], clock: Clock, events: EventSink) -> None:
+        self._config = config
+        self._ports = ports
+        self._roles = {port.device: role for role, port in ports.items()}
+        self._clock = clock
+        self._events = events
+        self._slots: dict[str, _Slot] = {}
+        self._judging: dict[str, int] = {}
+        self._outages: dict[str, _Outage] = {}
+        self._looked = False
+        self._turn = asyncio.Event()
+        self.on_miss: Callable[[], None] = _nothing
+        """Called when a port found nothing plugged in: the tree is worth a look."""
+
+    # What a port asks
+
+    async def wait_to_start(self, role: str) -> None:
+        """Wait until the device of ``role`` may start; returns at once for roles without a USB port."""
+        port = self._ports.get(role)
+        slot = self._slots.get(port.device) if port is not None else None
+        while slot is not None and self._waits(slot):
+            if slot.free_at is None:
+                await self._turn.wait()
+            else:
+                await self._clock.sleep_until(max(slot.free_at, slot.held_until))
+
+    @property
+    def waiting(self) -> frozenset[str]:
+        """Roles that may not start at this moment."""
+        slots = ((role, self._slots.get(device)) for device, role in self._roles.items())
+        return frozenset(role for role, slot in slots if slot is not None and self._waits(slot))
+
+    def _waits(self, slot: _Slot) -> bool:
+        return slot.free_at is None or max(slot.free_at, slot.held_until) > self._clock.now()
+
+    # What the watching service tells
+
+    def update(self, snapshot: Snapshot) -> None:
+        """Take a new look at the tree into account, and whatever has come due since the last one."""
+        now = self._clock.now()
+        for name in sorted(self._slots.keys() | snapshot.devices.keys(), key=sort_key):
+            slot = self._slots.setdefault(name, _Slot())
+            seen = snapshot.devices.get(name)
+            if slot.present and slot.device is not None and (seen is None or seen.devnum != slot.device.devnum):
+                self._depart(name, slot, now)
+            if seen is not None:
+                before, slot.device = slot.device, seen
+                if not slot.present:
+                    self._arrive(name, slot, before, now)
+        self._count_over_current(snapshot.over_current, now)
+        self._judge(now)
+        self._release(now)
+        self._looked = True
+        self._call_turn()
+
+    def next_due(self) -> int | None:
+        """Instant at which ``update`` has something to decide although nothing changes; None = never."""
+        dues = [max(self._judging.values()) + _ns(self._config.together)] if self._judging else []
+        dues += [
+            outage.changed + self._pause(outage) for outage in self._outages.values() if self._slots[outage.hub].present
+        ]
+        return min(dues, default=None)
+
+    def stop_watching(self) -> None:
+        """Nobody looks at the tree any more: nobody shall wait for it."""
+        self._judging.clear()
+        self._outages.clear()
+        self._looked = False
+        for slot in self._slots.values():
+            slot.free_at, slot.held_until = 0, 0
+        self._call_turn()
+
+    def tree(self) -> tuple[UsbNode, ...]:
+        """Everything there, and every configured device that is not; parents before children."""
+        names = sorted(self._slots.keys() | self._roles.keys(), key=sort_key)
+        return tuple(node for name in names if (node := self._node(name)) is not None)
+
+    # Arrivals and losses
+
+    def _depart(self, name: str, slot: _Slot, now: int) -> None:
+        slot.present, slot.free_at = False, None
+        outage = self._outage_of(name)
+        if outage is None:
+            self._judging[name] = now
+        else:
+            outage.members.add(name)
+            outage.changed = now
+
+    def _arrive(self, name: str, slot: _Slot, before: Device | None, now: int) -> None:
+        assert slot.device is not None
+        slot.present = True
+        slot.replugs += before is not None
+        outage = self._outage_of(name)
+        if outage is not None:
+            slot.free_at = None
+            outage.members.add(name)
+            outage.changed = now
+        elif name not in self._judging:
+            slot.free_at = now
+            if self._looked:
+                self._tell_if_moved(name, slot.device)
+                if slot.device.hub:  # a new hub's devices start one after the other, too
+                    self._outages[name] = _Outage(name, now, now, {name}, announced=False)
+
+    def _outage_of(self, name: str) -> _Outage | None:
+        return next((self._outages[hub] for hub in (name, *ancestors(name)) if hub in self._outages), None)
+
+    def _judge(self, now: int) -> None:
+        """Decide what the losses of the last moment were, once all that belong together have come."""
+        if not self._judging or now - max(self._judging.values()) < _ns(self._config.together):
+            return
+        lost, self._judging = self._judging, {}
+        groups: dict[str, set[str]] = {}
+        for name in lost:
+            hub = self._lost_hub(name, lost)
+            if hub is None:
+                self._slots[name].free_at = now
+            else:
+                groups.setdefault(hub, set()).add(name)
+        for hub, group in groups.items():
+            inner = [self._outages.pop(name) for name in list(self._outages) if hub in ancestors(name)]
+            members = group.union(*(outage.members for outage in inner))
+            since = min(lost[name] for name in group)
+            self._outages[hub] = _Outage(hub, since, now, members, announced=True)
+            self._tell_lost(hub, members)
+
+    def _lost_hub(self, name: str, lost: Mapping[str, int]) -> str | None:
+        """Topmost hub whose loss explains that of ``name``; None if it vanished alone."""
+        device = self._slots[name].device
+        top = name if device is not None and device.hub else None
+        for hub in ancestors(name):
+            children = [n for n, slot in self._slots.items() if parent_of(n) == hub and (slot.present or n in lost)]
+            if hub in lost or (len(children) > 1 and all(child in lost for child in children)):
+                top = hub
+        return top
+
+    def _back(self, outage: _Outage) -> list[str]:
+        """Devices behind the hub that are there again, in the order they shall start."""
+        back = [name for name in outage.members if self._slots[name].present and not self._is_hub(name)]
+        return sorted(back, key=self._start_rank)
+
+    def _pause(self, outage: _Outage) -> int:
+        """Nanoseconds without change after which a returned hub's devices may start."""
+        return _ns(self._config.settle if self._back(outage) else self._config.patience)
+
+    def _release(self, now: int) -> None:
+        for outage in list(self._outages.values()):
+            if not self._slots[outage.hub].present or now - outage.changed < self._pause(outage):
+                continue
+            back = self._back(outage)
+            del self._outages[outage.hub]
+            for name in outage.members:
+                self._slots[name].free_at = now
+            starting = [name for name in back if name in self._roles]
+            for turn, name in enumerate(starting):
+                self._slots[name].free_at = now + turn * _ns(self._config.stagger)
+            if outage.announced or starting:
+                self._tell_returned(outage, back, now)
+
+    def _start_rank(self, name: str) -> tuple[int, tuple[int, ...]]:
+        order = self._config.start_order
+        role = self._roles.get(name)
+        return order.index(role) if role in order else len(order), sort_key(name)
+
+    def _count_over_current(self, counts: Mapping[str, int], now: int) -> None:
+        hit = []
+        for name in sorted(counts, key=sort_key):
+            slot = self._slots.setdefault(name, _Slot())
+            if self._looked and counts[name] > slot.over_current:
+                slot.held_until = now + _ns(self._config.over_current_hold)
+                hit.append(name)
+            slot.over_current = counts[name]
+        if hit:
+            ports = ", ".join(self._describe(name) for name in hit)
+            text = f"over-current at {ports}: not started for {self._config.over_current_hold:g} s, check the cables"
+            self._events(Reason.OVER_CURRENT, Severity.ERROR, NAME, text, ports=",".join(hit))
+
+    # Telling
+
+    def _tell_lost(self, hub: str, members: Iterable[str]) -> None:
+        devices = sorted((name for name in members if not self._is_hub(name)), key=sort_key)
+        what = "vanished" if not self._slots[hub].present else "is there, but all behind it vanished"
+        self._events(
+            Reason.HUB_LOST,
+            Severity.WARNING,
+            NAME,
+            f"hub {hub} {what}: {self._names(devices) or 'no devices'}",
+            hub=hub,
+            devices=len(devices),
+        )
+
+    def _tell_returned(self, outage: _Outage, back: list[str], now: int) -> None:
+        missing = sorted((m for m in outage.members if not self._slots[m].present), key=sort_key)
+        text = f"hub {outage.hub} is back with {self._names(back) or 'no devices'}"
+        if missing:
+            text += f"; missing: {self._names(missing)}"
+        self._events(
+            Reason.HUB_RETURNED,
+            Severity.WARNING if missing else Severity.INFO,
+            NAME,
+            text,
+            hub=outage.hub,
+            devices=len(back),
+            missing=len(missing),
+            seconds=(now - outage.since) / SECOND,
+        )
+
+    def _tell_if_moved(self, name: str, device: Device) -> None:
+        """A device that looks like a missing one came at another place. It is told, never used there."""
+        if name in self._roles:
+            return
+        for other, slot in self._slots.items():
+            known = slot.device
+            wanted = other in self._roles or other in self._outages
+            if not slot.present and wanted and known is not None and _alike(known, device):
+                text = f"{self._describe(other)} seems to be at {place(name)} now: plug it back, or run find-port"
+                self._events(Reason.PORT_MOVED, Severity.WARNING, NAME, text, configured=other, found=name)
+
+    def _describe(self, name: str) -> str:
+        role = self._roles.get(name)
+        return f"{place(name)} ({role})" if role else place(name)
+
+    def _names(self, devices: Iterable[str]) -> str:
+        return ", ".join(self._roles.get(name, name) for name in devices)
+
+    def _is_hub(self, name: str) -> bool:
+        device = self._slots[name].device
+        return device is not None and device.hub
+
+    def _node(self, name: str) -> UsbNode | None:
+        slot = self._slots.get(name, _Slot())
+        role = self._roles.get(name)
+        waits = self._waits(slot)
+        if not (slot.present or role or (waits and slot.device is not None)):
+            return None
+        held = slot.held_until > self._clock.now()
+        there = UsbState.PRESENT if slot.present else UsbState.ABSENT
+        device = slot.device
+        # Before the first look nothing is known of a configured device.
+        now_there = device if slot.present else None
+        tty = now_there.tty if now_there is not None else None
+        return UsbNode(
+            name=name,
+            parent=parent_of(name),
+            title=device.title if device is not None else "",
+            usb_id=device.usb_id if device is not None else None,
+            hub=device is not None and device.hub,
+            tty=tty.name if tty is not None else None,
+            role=role,
+            state=UsbState.HELD if held else UsbState.WAITING if waits else there,
+            replugs=slot.replugs,
+            over_current=slot.over_current,
+            autosuspend=now_there is not None and now_there.autosuspend,
+            latency_ms=tty.latency_ms if tty is not None else None,
+        )
+
+    def _call_turn(self) -> None:
+        self._turn.set()
+        self._turn = asyncio.Event()
+
+
+def _alike(a: Device, b: Device) -> bool:
+    return (a.usb_id, a.serial) == (b.usb_id, b.serial)
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * SECOND)
+
+
+def _nothing() -> None:
+    return None

@@ -1,0 +1,192 @@
+"""Reads the USB tree from sysfs: names, parents, identities, nodes. Pure: one look, no state.
+
+Names are the kernel's: ``usb1`` is the root hub of bus 1, ``1-2`` hangs on its port 2, ``1-2.3`` on port 3 of the
+hub there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` the port itself.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from monstertruck_drivers.usb.sysfs import Sysfs
+
+DEVICES = "bus/usb/devices"
+HUB_CLASS = 0x09
+
+_ROOT = re.compile(r"usb(\d+)")
+_DEVICE = re.compile(r"(\d+)-(\d+(?:\.\d+)*)")
+_INTERFACE = re.compile(r"(?P<device>\d+-\d+(?:\.\d+)*):\d+\.(?P<number>\d+)")
+_USB_SERIAL = re.compile(r"ttyUSB\d+")
+_PORT = re.compile(r".+-port(\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A device node of one interface."""
+
+    name: str
+    """``ttyUSB0``, ``ttyACM0``, ``video0``: never an identity, it changes with every replug."""
+    kind: str
+    """Class it belongs to: ``tty`` or ``video4linux``."""
+    interface: int
+    path: str
+    """Its driver's folder in sysfs."""
+    latency_ms: int | None = None
+    """FTDI latency timer; None for other chips."""
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A hub or device at one look."""
+
+    name: str
+    devnum: int
+    """Address; a new one is given at every enumeration, so it tells a replug from no change."""
+    usb_id: str
+    hub: bool
+    title: str
+    serial: str | None
+    autosuspend: bool
+    nodes: tuple[Node, ...]
+
+    def find(self, kind: str, interface: int = 0) -> Node | None:
+        """First node of ``kind`` on ``interface``."""
+        return next((node for node in self.nodes if (node.kind, node.interface) == (kind, interface)), None)
+
+    @property
+    def tty(self) -> Node | None:
+        """First serial node of any interface."""
+        return next((node for node in self.nodes if node.kind == "tty"), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The whole tree at one look."""
+
+    devices: dict[str, Device]
+    over_current: dict[str, int]
+    """Over-current conditions a port has counted since its hub came, by the name a device there has."""
+
+
+def device_name(hub: str, port: int) -> str:
+    """Name of whatever hangs on ``port`` of ``hub``."""
+    root = _ROOT.fullmatch(hub)
+    return f"{root[1]}-{port}" if root else f"{hub}.{port}"
+
+
+def parent_of(name: str) -> str | None:
+    """Name of the hub ``name`` hangs on; None for a root hub."""
+    bus, dash, ports = name.partition("-")
+    if not dash:
+        return None
+    upstream, dot, _ = ports.rpartition(".")
+    return f"{bus}-{upstream}" if dot else f"usb{bus}"
+
+
+def ancestors(name: str) -> Iterator[str]:
+    """Hubs above ``name``, nearest first."""
+    while (parent := parent_of(name)) is not None:
+        yield parent
+        name = parent
+
+
+def port_of(name: str) -> int:
+    """Port of the parent that ``name`` hangs on; 0 for a root hub."""
+    return int(re.split(r"[.-]", name)[-1]) if "-" in name else 0
+
+
+def place(name: str) -> str:
+    """Where ``name`` is, in words."""
+    hub = parent_of(name)
+    return name if hub is None else f"hub {hub} port {port_of(name)}"
+
+
+def port_directory(name: str) -> str:
+    """Sysfs folder of the port ``name`` hangs on.
+
+    Raises:
+        ValueError: a root hub hangs on no port.
+    """
+    hub = parent_of(name)
+    if hub is None:
+        raise ValueError(f"{name}: a root hub hangs on no port")
+    return f"{DEVICES}/{_hub_interface(hub)}/{hub}-port{port_of(name)}"
+
+
+def sort_key(name: str) -> tuple[int, ...]:
+    """Orders names by bus and ports, parents before children."""
+    return tuple(int(number) for number in re.findall(r"\d+", name))
+
+
+def read_tree(sysfs: Sysfs) -> Snapshot:
+    """Look at every hub and device. Devices that vanish while being read are left out."""
+    entries = sysfs.names(DEVICES)
+    interfaces: dict[str, list[Node]] = {}
+    for entry in entries:
+        if match := _INTERFACE.fullmatch(entry):
+            interfaces.setdefault(match["device"], []).extend(_nodes(sysfs, entry, int(match["number"])))
+    names = [entry for entry in entries if _ROOT.fullmatch(entry) or _DEVICE.fullmatch(entry)]
+    devices = {}
+    over_current: dict[str, int] = {}
+    for name in sorted(names, key=sort_key):
+        device = _read_device(sysfs, name, tuple(interfaces.get(name, ())))
+        if device is not None:
+            devices[name] = device
+            if device.hub:
+                over_current |= _over_current(sysfs, name)
+    return Snapshot(devices, over_current)
+
+
+def read_device(sysfs: Sysfs, name: str) -> Device | None:
+    """Look at one device; None if nothing hangs there."""
+    nodes: list[Node] = []
+    for entry in sysfs.names(f"{DEVICES}/{name}"):
+        if match := _INTERFACE.fullmatch(entry):
+            nodes += _nodes(sysfs, entry, int(match["number"]))
+    return _read_device(sysfs, name, tuple(nodes))
+
+
+def _read_device(sysfs: Sysfs, name: str, nodes: tuple[Node, ...]) -> Device | None:
+    path = f"{DEVICES}/{name}"
+    devnum = sysfs.number(f"{path}/devnum")
+    vendor, product = sysfs.text(f"{path}/idVendor"), sysfs.text(f"{path}/idProduct")
+    if devnum is None or vendor is None or product is None:
+        return None
+    return Device(
+        name=name,
+        devnum=devnum,
+        usb_id=f"{vendor}:{product}",
+        hub=sysfs.number(f"{path}/bDeviceClass", 16) == HUB_CLASS,
+        title=sysfs.text(f"{path}/product") or "",
+        serial=sysfs.text(f"{path}/serial"),
+        autosuspend=sysfs.text(f"{path}/power/control") == "auto",
+        nodes=nodes,
+    )
+
+
+def _nodes(sysfs: Sysfs, entry: str, interface: int) -> Iterator[Node]:
+    """Nodes of one interface: below ``tty`` for CDC, one folder deeper for USB serial adapters."""
+    path = f"{DEVICES}/{entry}"
+    for kind in ("tty", "video4linux"):
+        for name in sysfs.names(f"{path}/{kind}"):
+            yield Node(name, kind, interface, path)
+    for name in sysfs.names(path):
+        if _USB_SERIAL.fullmatch(name):
+            adapter = f"{path}/{name}"
+            yield Node(name, "tty", interface, adapter, sysfs.number(f"{adapter}/latency_timer"))
+
+
+def _over_current(sysfs: Sysfs, hub: str) -> dict[str, int]:
+    path = f"{DEVICES}/{_hub_interface(hub)}"
+    counts = {}
+    for entry in sysfs.names(path):
+        if match := _PORT.fullmatch(entry):
+            count = sysfs.number(f"{path}/{entry}/over_current_count")
+            if count is not None:
+                counts[device_name(hub, int(match[1]))] = count
+    return counts
+
+
+def _hub_interface(hub: str) -> str:
+    root = _ROOT.fullmatch(hub)
+    return f"{root[1]}-0:1.0" if root else f"{hub}:1.0"
