@@ -169,13 +169,15 @@ def linkage_command(
     import numpy as np
 
     from monstertruck_kinematics.families import Ackermann
-    from monstertruck_kinematics.linkage import SteeringLinkage
+    from monstertruck_kinematics.linkage import SteeringLinkage, reachable_servo
     from monstertruck_kinematics.polynomials import SteeringPolynomials
 
     with refusals():
         linkage = SteeringLinkage(pitman, drag_link, arm, math.radians(arm_angle), king_pins, arms)  # type: ignore[arg-type]
         axle = SteeringPolynomials.named(polynomials).front  # type: ignore[arg-type]
-        servo = np.radians(np.arange(-40.0, 40.1, 5.0))
+        right_end, left_end = reachable_servo(linkage)
+        servo = np.radians(np.arange(-45.0, 45.1, 5.0))
+        servo = servo[(servo >= right_end) & (servo <= left_end)]
         left, right = linkage.wheels_from_servo(servo)
         fitted_left, fitted_right = axle.wheels_from_servo(servo)
     car = Ackermann()
@@ -192,7 +194,9 @@ def linkage_command(
         print_json({name: values.tolist() for name, values in columns.items()})
     else:
         rows = [
-            tuple(f"{v:.4f}" if "defect" in n else f"{math.degrees(v):.2f}" for n, v in zip(columns, row, strict=True))
+            tuple(
+                f"{v:z.4f}" if "defect" in n else f"{math.degrees(v):z.2f}" for n, v in zip(columns, row, strict=True)
+            )
             for row in zip(*columns.values(), strict=True)
         ]
         print_table(tuple(n.replace("_", " ") for n in columns), rows)

@@ -55,12 +55,12 @@ class FourWheelSteer:
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist from (speed, front, rear): see ``FourWheelSteering.body_twist``."""
-        speed, front, rear = command
+        speed, front, rear = unpacked(command, self.inputs)
         return self.geometry.body_twist(speed, front, rear)
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
         """(speed, front, rear) through the common turning centre."""
-        vx, vy, wz = twist
+        vx, vy, wz = unpacked(twist, TWIST)
         return self.geometry.steer_for_twist(vx, vy, wz)
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from monstertruck_kinematics.elementary import Array, Real, clip, require_positive
+from monstertruck_kinematics.elementary import Array, Real, require_positive
 from monstertruck_kinematics.families.base import TWIST, Twist, refuse, require_limit, scaled_to, stacked, unpacked
 from monstertruck_kinematics.motion import to_world
 from monstertruck_kinematics.wheels import SteeredWheel, Wheel
@@ -55,7 +55,7 @@ class Synchro:
         """Both rates scaled alike: same path, slower."""
         roll, turn = unpacked(command, self.inputs)
         factor = scaled_to((roll / self.max_rate, turn / self.max_turn), 1.0)
-        return roll * factor, clip(turn * factor, -self.max_turn, self.max_turn)
+        return roll * factor, turn * factor
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """Constant."""

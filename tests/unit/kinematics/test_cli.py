@@ -84,6 +84,9 @@ def test_linkage():
     table = run_json("linkage", "--arms", "forward")
     at = table["servo"].index(pytest.approx(np.radians(20.0)))
     assert round(np.degrees(table["linkage_left"][at]), 2) == 15.82
+    assert np.degrees(table["servo"][0]) == pytest.approx(-45.0)
+    tight = run_json("linkage", "--pitman", "0.03")
+    assert np.degrees(tight["servo"][0]) > -45.0  # only as far as the linkage moves
     assert "-26.26" in run("linkage")
     assert "-26.26" not in run("linkage", "--polynomials", "2016")
 
