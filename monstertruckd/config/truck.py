@@ -59,7 +59,7 @@ class Device(Schema, Generic[C]):
 
     port: PortConfig
     mount: Mount = Mount()
-    restart: RestartPolicy = RestartPolicy()
+    restart: RestartPolicy = RestartPolicy(max_delay=0.5)
     driver: C
 
 
@@ -100,8 +100,6 @@ class Geometry(Schema):
     """Metres, bumper to bumper"""
     width: Metres = 0.34
     """Metres, over the wheels"""
-    max_axle_angle: Annotated[float, Field(gt=0, le=0.7)] = 0.4
-    """Radians, greatest angle of either axle"""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -166,4 +164,19 @@ class TruckConfig(Schema):
     def _complete(self) -> Self:
         if self.tracker is not None and (self.devices.drive is None or self.devices.steering is None):
             raise ValueError("a tracker needs the devices drive and steering")
+        if self.devices.drive is not None:
+            self._check_braking(self.devices.drive.driver)
         return self
+
+    def _check_braking(self, drive: EposConfig) -> None:
+        """The gate promises stopping distances; the drive controller must brake at least as hard."""
+        metres = 2 * math.pi * self.geometry.wheel_radius / (60 * self.geometry.drive_ratio)
+        for name, promised, rpm_s in (
+            ("deceleration", self.gate.deceleration, drive.deceleration_rpm_s),
+            ("quick_deceleration", self.gate.quick_deceleration, drive.quick_stop_deceleration_rpm_s),
+        ):
+            if promised > rpm_s * metres:
+                raise ValueError(
+                    f"gate.{name} {promised} m/s^2: the drive is configured to brake with {rpm_s} rpm/s, "
+                    f"which is {rpm_s * metres:.2f} m/s^2"
+                )

@@ -9,6 +9,7 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,6 +21,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruckd.cli.screen import draw
 from monstertruckd.cli.watch import PERIOD, Follower
+from monstertruckd.config.yaml_tree import load_tree
 from monstertruckd.demo.operator import Lap, drive_lap
 from monstertruckd.demo.summary import Summary, log_figures
 
@@ -40,14 +42,14 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
     Raises:
         NoAnswerError: a process did not come up, or the lap was not finished.
     """
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = free_endpoint()
     overlay = write_overlay(config, folder, endpoint, seed)
     truth = folder / "truth.npz"
     simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
     async with (
         program(folder / "simulate.txt", *simulate),
         program(folder / "daemon.txt", "run", "--config", str(overlay)),
-        await _connect(clock, endpoint) as client,
+        await connect(clock, endpoint) as client,
     ):
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
@@ -68,24 +70,33 @@ def _summary(lap: Lap, folder: Path, truth: Path, p99: float, worst: float) -> S
     return Summary(lap, rows, p99, worst, *log_figures(folder))
 
 
-def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None) -> Path:
-    """A configuration that includes ``config`` and hangs every device on a pty in ``folder``."""
-    roles = ("lidar", "drive", "steering", "compass")
-    overlay: dict[str, object] = {
+def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
+    """A configuration that includes ``config``, hangs its devices on ptys and puts all output into ``folder``."""
+    given = load_tree(config).data
+    here = folder.resolve()
+    overlay: dict[str, Any] = {
         "include": str(config.resolve()),
         "version": 1,
-        "devices": {role: {"port": {"path": str(folder.resolve() / "dev" / role)}} for role in roles},
+        "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in given.get("devices", {})},
         "zenoh": {"listen": [endpoint]},
-        "recorder": {"directory": str(folder.resolve() / "logs")},
-        "map": {"picture": str(folder.resolve() / "map.png")},
-        "state_directory": str(folder.resolve() / "state"),
+        "recorder": {"directory": str(here / "logs")},
+        "state_directory": str(here / "state"),
     }
+    if "map" in given:
+        overlay["map"] = {"picture": str(here / "map.png")}
     if seed is not None:
         overlay["sim"] = {"seed": seed}
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "config.yaml"
     file.write_text(yaml.safe_dump(overlay, sort_keys=False), encoding="utf-8")
     return file
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @asynccontextmanager
@@ -113,7 +124,7 @@ async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subpro
             await ended
 
 
-async def _connect(clock: Clock, endpoint: str) -> TruckClient:
+async def connect(clock: Clock, endpoint: str) -> TruckClient:
     """A client, as soon as the daemon listens."""
     try:
         async with clock.deadline(PATIENCE):
@@ -149,10 +160,3 @@ async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:
     finally:
         following.cancel()
         await asyncio.wait([following])
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

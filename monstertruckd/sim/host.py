@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND, Clock
@@ -66,6 +67,8 @@ async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
         asyncio.create_task(log.run(), name="truth"),
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
+    if robot.recorded is not None:
+        tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
     waiting = asyncio.create_task(stop.wait())
     gc.collect()
     gc.freeze()
@@ -79,6 +82,12 @@ async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
     for result in results:
         if isinstance(result, Exception):
             raise result
+
+
+async def _tell_end(recorded: RecordedHokuyoEmulator) -> None:
+    await recorded.finished.wait()
+    _say(f"recording sent, began {recorded.began}")
+    await asyncio.Event().wait()
 
 
 def _say(line: str) -> None:

@@ -32,6 +32,7 @@ class SimulatedRobot:
         self.world = World(config.world, config.seed)
         self.ports = ports
         self.emulators: dict[str, Emulator] = {}
+        self.recorded: RecordedHokuyoEmulator | None = None
         present = devices.present()
         if "lidar" in present and config.recording is not None:
             self.recorded = RecordedHokuyoEmulator(clock, RecordedRanges.load(config.recording), seed=config.seed)

@@ -15,8 +15,9 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.demo.wall import free_endpoint
 from monstertruckd.logs import info, open_log, recover
-from tests.daemon.wall_kit import ROOT, end, free_endpoint, robot
+from tests.daemon.wall_kit import ROOT, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
 

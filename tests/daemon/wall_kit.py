@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import signal
-import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -21,15 +20,10 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
+from monstertruckd.demo.wall import free_endpoint, write_overlay
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "configs" / "demo.yaml"
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def merged(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
@@ -133,17 +127,9 @@ async def end(process: asyncio.subprocess.Process | None, number: int = signal.S
 async def robot(folder: Path, overlay: dict[str, Any] | None = None, base: Path = DEMO) -> AsyncIterator[Robot]:
     """Configuration files and, at the end, no process left."""
     endpoint = free_endpoint()
-    roles = ("lidar", "drive", "steering", "compass") if base == DEMO else ("lidar",)
-    config: dict[str, Any] = {
-        "include": str(base),
-        "version": 1,
-        "devices": {role: {"port": {"path": str(folder / "dev" / role)}} for role in roles},
-        "zenoh": {"listen": [endpoint]},
-        "recorder": {"directory": str(folder / "logs")},
-        "state_directory": str(folder / "state"),
-    }
-    file = folder / "robot.yaml"
-    file.write_text(yaml.safe_dump(merged(config, overlay or {})))
+    file = write_overlay(base, folder, endpoint)
+    if overlay is not None:
+        file.write_text(yaml.safe_dump(merged(yaml.safe_load(file.read_text()), overlay)))
     made = Robot(folder, endpoint, file)
     try:
         yield made
