@@ -1,0 +1,106 @@
+"""Configuration of the stabiliser's two joints: calibration, times and what to do after an alarm."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.ax12.protocol import BAUD, POSITION_MAX, SPEED_UNIT, STEP
+from monstertruck_schemas.base import Schema
+
+Steps = Annotated[int, Field(ge=0, le=POSITION_MAX)]
+Positive = Annotated[float, Field(gt=0)]
+Seconds = Annotated[float, Field(ge=0)]
+
+TIMEOUT_MIN = 0.005
+"""Seconds; below that a busy host misses answers that came in time."""
+SCHEDULING = 0.002
+"""Seconds a host may take beside the line and the adapter."""
+
+
+class JointConfig(Schema):
+    """One unit: ``position = zero + direction * angle / step``."""
+
+    id: Annotated[int, Field(ge=0, le=252)]
+    zero: Steps
+    """Position at joint angle 0."""
+    min_position: Steps
+    max_position: Steps
+    direction: Literal[-1, 1] = 1
+    """+1 where a rising position (shaft counter-clockwise) turns the joint positively (REP 103)."""
+
+    @model_validator(mode="after")
+    def _zero_within_limits(self) -> Self:
+        if not self.min_position < self.zero < self.max_position:
+            raise ValueError(
+                f"min_position {self.min_position} < zero {self.zero} < max_position {self.max_position} does not hold"
+            )
+        return self
+
+    def position(self, angle: float) -> int:
+        """Goal for a joint angle, rad, held within the limits."""
+        steps = round(self.zero + self.direction * angle / STEP)
+        return min(max(steps, self.min_position), self.max_position)
+
+    def angle(self, position: float) -> float:
+        """Joint angle, rad, of a position in steps."""
+        return (position - self.zero) * STEP * self.direction
+
+
+class AlarmConfig(Schema):
+    """When a joint that went limp is given torque again."""
+
+    rest: Seconds = 3.0
+    """Seconds a joint rests after an alarm; doubled while it trips again."""
+    rest_max: Positive = 60.0
+    settled_after: Positive = 30.0
+    """Seconds of holding after which the rest starts from ``rest`` again."""
+    cool_below: Annotated[int, Field(ge=0, le=100)] = 60
+    """Degrees Celsius a joint must have reached."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.rest > self.rest_max:
+            raise ValueError(f"rest {self.rest} <= rest_max {self.rest_max} does not hold")
+        return self
+
+
+class Ax12Config(Schema):
+    """Two Dynamixel AX-12A: pitch and roll of the lidar's mount."""
+
+    kind: Literal["ax12"] = "ax12"
+    pitch: JointConfig = JointConfig(id=1, zero=511, min_position=409, max_position=613)
+    roll: JointConfig = JointConfig(id=2, zero=204, min_position=102, max_position=306)
+    speed: Annotated[float, Field(gt=0, le=1023 * SPEED_UNIT)] = 4.0
+    """Greatest speed of a joint, rad/s."""
+    margin: Annotated[int, Field(ge=0, le=255)] = 1
+    """Steps from the goal within which a joint is content."""
+    slope: Literal[2, 4, 8, 16, 32, 64, 128] = 32
+    """Steps from the goal at which a joint gives its full torque."""
+    rate: Annotated[float, Field(gt=0, le=100)] = 50.0
+    """Times a second both joints are read, if the adapter's latency allows."""
+    check_interval: Positive = 1.0
+    """Seconds between two looks at a joint's torque settings."""
+    absent_interval: Annotated[float, Field(ge=1)] = 1.0
+    """Seconds between two questions to a joint that does not answer: each costs a whole time-out."""
+    return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 500e-6
+    """Seconds a unit waits before it answers: its own setting."""
+    usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
+    """Latency timer of the adapter, s; 0.001 only where that is confirmed."""
+    command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
+    """Seconds after which joint goals are stale and not obeyed: the joints hold."""
+    alarm: AlarmConfig = AlarmConfig()
+
+    @model_validator(mode="after")
+    def _ids_differ(self) -> Self:
+        if self.pitch.id == self.roll.id:
+            raise ValueError(f"pitch and roll need different ids, both have {self.pitch.id}")
+        return self
+
+    @property
+    def speed_word(self) -> int:
+        """``speed`` in the unit's units; never 0, which would mean unlimited."""
+        return max(1, round(self.speed / SPEED_UNIT))
+
+    def timeout(self, size: int) -> float:
+        """Seconds to wait for an exchange of ``size`` bytes: line, return delay, and the adapter both ways."""
+        return max(TIMEOUT_MIN, size * 10 / BAUD + self.return_delay + 2 * self.usb_latency + SCHEDULING)

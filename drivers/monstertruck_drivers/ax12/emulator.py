@@ -1,0 +1,289 @@
+"""The device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
+
+import asyncio
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
+from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
+from monstertruck_drivers.link import DeviceEnd
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+
+UNITS_MAX: Final = 6
+BYTE_GAP: Final = 100_000_000
+"""Nanoseconds of silence inside a packet after which a unit gives it up."""
+BYTE_TIME: Final = 10 / p.BAUD
+BAUD_TOLERANCE: Final = 0.03
+
+Damage = Literal["late", "double", "truncate", "garble", "mute"]
+
+KNOWN: Final = (
+    "vanish ID, return ID, power on|off, block ID on|off, freeze ID on|off, heat ID CELSIUS, voltage VOLTS|source, "
+    "trip ID, reset ID, renumber ID NEW, latch on|off, echo on|off, mute|double|truncate|garble [COUNT], "
+    "late SECONDS [COUNT]"
+)
+
+
+class Ax12Bus:
+    """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` makes exchanges as long as real ones.
+
+    The adapter lives from USB, the units from the 12 V rail: unplugging leaves them as they are, ``power off``
+    silences all of them while the port stays. Two units with one number both obey, and garble each other's answers.
+    Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
+    (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``reset ID``
+    (factory), ``renumber ID NEW``, ``latch on|off`` (error bits outlast their cause), ``echo on|off``, and for the
+    next ``COUNT`` (1) answers ``mute``, ``double``, ``truncate``, ``garble`` and ``late SECONDS``.
+
+    Args:
+        clock: time.
+        ids: numbers of the units.
+        seed: of what a collision makes of the answers.
+        echo: the adapter gives back every byte it is sent.
+        latency_s: what the adapter adds to everything it passes to the host.
+        host_baud: rate the host opens the port with; units set to another one hear nothing.
+        answers_damage: whether a request with a wrong sum is answered (checksum error bit) or ignored.
+        positions: of the shafts at the start, steps per unit number; 512 where not named.
+        load: what pushes the shafts.
+        voltage: supply at the units.
+        name: of the device.
+
+    Raises:
+        InputError: too many units, or a bad number.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        ids: Sequence[int] = (1, 2),
+        *,
+        seed: int = 0,
+        echo: bool = False,
+        latency_s: float = 0.001,
+        host_baud: int = p.BAUD,
+        answers_damage: bool = True,
+        positions: Mapping[int, float] | None = None,
+        load: Load = no_load,
+        voltage: Voltage = steady_voltage,
+        name: str = "ax12",
+    ) -> None:
+        if len(ids) > UNITS_MAX or not all(0 <= ident <= p.ID_MAX for ident in ids):
+            raise InputError(f"{name}: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
+        self.name = name
+        self.received: deque[int] = deque(maxlen=1 << 16)
+        """Bytes the host sent, for tests."""
+        self.latency_s = latency_s
+        self._clock = clock
+        self._echo = echo
+        self._host_baud = host_baud
+        self._answers_damage = answers_damage
+        self._source = voltage
+        self._volts: float | None = None
+        self._rng = np.random.default_rng(seed)
+        self._damage: dict[Damage, int] = {}
+        self._late_s = 0.0
+        self._line_free = 0.0
+        places = positions or {}
+        now = clock.now()
+        self.units = [Unit(ident, places.get(ident, 512), now, load, self._voltage) for ident in ids]
+
+    # What the world calls
+
+    def angle(self, ident: int, time_ns: int) -> float:
+        """Shaft of a unit, rad, counter-clockwise positive, 0 at position 0; see ``angles``."""
+        return float(self.angles(ident, np.array([time_ns]))[0])
+
+    def angles(self, ident: int, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The same at several instants: the latest may be new, all may lie up to two seconds in the past."""
+        return self._find(ident).angles(times_ns) * p.STEP
+
+    def power_cycle(self) -> None:
+        """12 V off and on: the second part of the control table is lost."""
+        self._power(on=False)
+        self._power(on=True)
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            if not self._inject_bus(fault, values) and not self._inject_unit(fault, values):
+                raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: {KNOWN}"
+            ) from error
+
+    def _inject_bus(self, fault: str, values: tuple[str, ...]) -> bool:
+        match fault, values:
+            case "power", (("on" | "off") as state,):
+                self._power(on=state == "on")
+            case "voltage", ("source",):
+                self._volts = None
+            case "voltage", (volts,):
+                self._volts = float(volts)
+            case "latch", (("on" | "off") as state,):
+                for unit in self.units:
+                    unit.latched = state == "on"
+            case "echo", (("on" | "off") as state,):
+                self._echo = state == "on"
+            case "late", (seconds, *count):
+                self._late_s = float(seconds)
+                self._damage["late"] = int(*count or ("1",))
+            case ("mute" | "double" | "truncate" | "garble") as damage, (*count,):
+                self._damage[damage] = int(*count or ("1",))
+            case _:
+                return False
+        return True
+
+    def _inject_unit(self, fault: str, values: tuple[str, ...]) -> bool:
+        if not values:
+            return False
+        unit = self._find(int(values[0]))
+        now = self._clock.now()
+        unit.advance(now)
+        match fault, values[1:]:
+            case "vanish", ():
+                unit.present = False
+            case "return", ():
+                unit.present = True
+            case "block", (("on" | "off") as state,):
+                unit.blocked = state == "on"
+            case "freeze", (("on" | "off") as state,):
+                unit.frozen = state == "on"
+            case "heat", (celsius,):
+                unit.temperature = float(celsius)
+            case "trip", ():
+                unit.trip(Alarm.OVERLOAD)
+            case "reset", ():
+                unit.factory_reset()
+            case "renumber", (number,):
+                unit.put(p.ID, int(number))
+            case _:
+                return False
+        return True
+
+    def _find(self, ident: int) -> Unit:
+        for unit in self.units:
+            if unit.get(p.ID) == ident:
+                return unit
+        raise InputError(f"{self.name}: no unit {ident}; there are {[unit.get(p.ID) for unit in self.units]}")
+
+    def _power(self, *, on: bool) -> None:
+        now = self._clock.now()
+        for unit in self.units:
+            unit.power(on, now)
+
+    def _voltage(self, time_ns: int) -> float:
+        return self._source(time_ns) if self._volts is None else self._volts
+
+    # Serving
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve whoever has the port open."""
+        parser, heard = Parser(), 0
+        while True:
+            data = await end.read()
+            now = self._clock.now()
+            if now - heard > BYTE_GAP:
+                parser = Parser()
+            heard = now
+            self.received.extend(data)
+            if self._echo:
+                self._send(end, data, 0.0)
+            for packet in parser.feed(data):
+                self._obey(end, packet)
+            if self._answers_damage:
+                for unit in [unit for ident in parser.damaged for unit in self._listening(ident)]:
+                    self._answer(end, [Packet(unit.get(p.ID), unit.error(now) | Alarm.CHECKSUM)], [unit])
+
+    def _listening(self, ident: int) -> list[Unit]:
+        return [
+            unit
+            for unit in self.units
+            if unit.powered
+            and unit.present
+            and ident in (unit.get(p.ID), p.BROADCAST)
+            and abs(2_000_000 / (unit.get(p.BAUD_CODE) + 1) / self._host_baud - 1) <= BAUD_TOLERANCE
+        ]
+
+    def _obey(self, end: DeviceEnd, packet: Packet) -> None:
+        units = self._listening(packet.unit)
+        if packet.code == Instruction.SYNC_WRITE:
+            self._sync_write(packet.params)
+            return
+        answers = [answer for unit in units if (answer := self._execute(unit, packet)) is not None]
+        # A ping to everybody is answered where only one can.
+        if packet.unit != p.BROADCAST or (packet.code == Instruction.PING and len(units) == 1):
+            self._answer(end, answers, units)
+
+    def _execute(self, unit: Unit, packet: Packet) -> Packet | None:
+        """Carry out a request; the answer, if the unit's status level has one."""
+        now, params = self._clock.now(), packet.params
+        ident, answers_from = unit.get(p.ID), unit.get(p.STATUS_LEVEL)
+        level, error, data = 2, Alarm(0), b""
+        match packet.code, len(params):
+            case Instruction.PING, 0:
+                level = 0
+            case Instruction.READ, 2:
+                level = 1
+                error, data = unit.read(params[0], params[1], now)
+            case Instruction.WRITE, size if size >= 2:
+                error = unit.write(params[0], params[1:], now)
+            case Instruction.REG_WRITE, size if size >= 2:
+                error = unit.register(params[0], params[1:])
+            case Instruction.ACTION, 0:
+                error = unit.act(now)
+            case Instruction.RESET, 0:
+                unit.factory_reset()
+            case _:
+                error = Alarm.INSTRUCTION
+        return Packet(ident, unit.error(now) | error, data) if answers_from >= level else None
+
+    def _sync_write(self, params: bytes) -> None:
+        if len(params) < 2 or (len(params) - 2) % (params[1] + 1):
+            return
+        address, width = params[0], params[1]
+        for at in range(2, len(params), width + 1):
+            for unit in self._listening(params[at]):
+                unit.write(address, params[at + 1 : at + 1 + width], self._clock.now())
+
+    def _answer(self, end: DeviceEnd, answers: Sequence[Packet], units: Sequence[Unit]) -> None:
+        if not answers:
+            return
+        wire = answers[0].encode()
+        if len(answers) > 1:
+            wire = self._garbled(wire)
+        delay = min(unit.get(p.RETURN_DELAY) for unit in units) * p.DELAY_UNIT
+        for damage in [damage for damage, count in self._damage.items() if count]:
+            self._damage[damage] -= 1
+            match damage:
+                case "mute":
+                    return
+                case "truncate":
+                    wire = wire[:-2]
+                case "garble":
+                    wire = self._garbled(wire)
+                case "double":
+                    wire += wire
+                case "late":
+                    asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
+                    return
+        self._send(end, wire, delay + BYTE_TIME)
+
+    def _garbled(self, wire: bytes) -> bytes:
+        noise = self._rng.integers(1, 256, len(wire), dtype=np.uint8)
+        return bytes(np.frombuffer(wire, dtype=np.uint8) ^ noise)
+
+    def _send(self, end: DeviceEnd, data: bytes, delay: float) -> None:
+        """To the host, in order, after the adapter's latency."""
+        loop = asyncio.get_running_loop()
+        self._line_free = max(loop.time() + self.latency_s + delay, self._line_free + BYTE_TIME)
+        loop.call_at(self._line_free, end.write, data)

@@ -1,0 +1,64 @@
+"""Who is on the bus, and what does it read: without moving anything."""
+
+from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.config import Ax12Config
+from monstertruck_drivers.ax12.protocol import Present, alarm_names, word
+from monstertruck_drivers.ax12.session import Session
+from monstertruck_drivers.link import Port
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+IDS = range(1, 7)
+"""Numbers asked for: those of the robot's bus."""
+STORED = 19
+
+
+async def probe(port: Port, clock: Clock) -> dict[str, object]:
+    """Ping units 1 to 6 at 1 Mbaud and read settings and state of those that answer.
+
+    Returns:
+        JSON-able: ``device``, ``port``, ``echo`` of the adapter, ``units``: per unit its id, model, firmware, limits,
+        status level, error names, position in steps, voltage, temperature and torque settings.
+
+    Raises:
+        DeviceLostError: not plugged in.
+        DeviceTimeoutError: silence; the text tells what to check.
+        WrongDeviceError: bytes, but no unit.
+        PortBusyError: another process holds the port.
+    """
+    async with await port.open() as link:
+        session = Session(link, clock, Ax12Config().timeout)
+        await session.find_echo(*IDS)
+        units = [found for unit in IDS if (found := await _describe(session, unit)) is not None]
+    if not units and session.strange:
+        raise WrongDeviceError(f"{port.name}: {session.strange} bytes, but no answer of an AX-12A")
+    if not units:
+        raise DeviceTimeoutError(
+            f"{port.name}: silence; expected AX-12A units: is the 12 V rail up, the adapter at TTL?"
+        )
+    return {"device": "Dynamixel AX-12A", "port": port.name, "echo": session.echo, "units": units}
+
+
+async def _describe(session: Session, unit: int) -> dict[str, object] | None:
+    try:
+        error = await session.ping(unit)
+    except DeviceTimeoutError:
+        return None
+    known: dict[str, object] = {"id": unit, "errors": alarm_names(error)}
+    try:
+        stored = (await session.read(unit, p.MODEL_NUMBER, STORED)).data
+        settings = (await session.read(unit, p.TORQUE_ENABLE, 12)).data
+        present = Present.decode((await session.read(unit, p.PRESENT_POSITION, p.PRESENT_SIZE)).data)
+    except (DeviceTimeoutError, ProtocolError) as failure:
+        return known | {"unreadable": str(failure)}
+    return known | {
+        "model": word(stored),
+        "firmware": stored[p.FIRMWARE.address],
+        "limits": [word(stored, p.CW_LIMIT.address), word(stored, p.CCW_LIMIT.address)],
+        "status_level": stored[p.STATUS_LEVEL.address],
+        "torque_enabled": bool(settings[0]),
+        "torque_limit": word(settings, 10),
+        "position": present.position,
+        "voltage": round(present.voltage * p.VOLT_UNIT, 1),
+        "temperature": present.temperature,
+    }

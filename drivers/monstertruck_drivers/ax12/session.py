@@ -1,0 +1,155 @@
+"""Question and answer on the half-duplex bus over one open link; shared by driver and probe."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_drivers.ax12 import protocol
+from monstertruck_drivers.ax12.protocol import Alarm, Packet, Parser, Register, alarm_names
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+
+RETRIES: Final = 2
+GAP: Final = 100e-6
+"""Seconds between a packet that nobody answers and the next one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A status packet with the instants, ns, between which the unit spoke."""
+
+    error: Alarm
+    data: bytes
+    asked: int
+    received: int
+
+
+class Session:
+    """One conversation; the host speaks first, always.
+
+    A passive adapter gives back every byte that is sent. An echoed request looks like a status packet, even like a
+    good one; so whether there is an echo is found out once, by a request no answer resembles, and from then on each
+    exchange drops it.
+
+    Args:
+        link: open link to the adapter.
+        clock: time.
+        timeout: seconds to wait for an exchange of so many bytes.
+    """
+
+    def __init__(self, link: Link, clock: Clock, timeout: Callable[[int], float]) -> None:
+        self.echo = False
+        self.strange = 0
+        """Bytes heard that were no part of a correct packet."""
+        self._link = link
+        self._clock = clock
+        self._timeout = timeout
+        self._quiet_until = 0
+
+    async def find_echo(self, *units: int) -> None:
+        """Find out whether the adapter echoes; any of ``units`` may be absent.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        for unit in units:
+            # An answer to this holds three bytes, its echo two.
+            request = protocol.read(unit, protocol.MODEL_NUMBER, 3)
+            heard = await self._exchange(request, 3, lambda packet: len(packet.params) in (2, 3))
+            if heard is not None:
+                self.echo = heard[0].encode() == request
+                return
+
+    async def ping(self, unit: int, retries: int = RETRIES) -> Alarm:
+        """Error bits of a unit that is there.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, or no correct answer.
+        """
+        return (await self._ask(unit, protocol.ping(unit), 0, retries)).error
+
+    async def read(self, unit: int, start: Register, count: int, retries: int = RETRIES) -> Answer:
+        """Read ``count`` bytes of the control table.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, or no correct answer.
+            ProtocolError: the unit refused.
+        """
+        return await self._ask(unit, protocol.read(unit, start, count), count, retries)
+
+    async def write(self, unit: int, start: Register, data: bytes, retries: int = RETRIES) -> Alarm:
+        """Write to the control table and wait for the answer.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, or no correct answer.
+            ProtocolError: the unit refused.
+        """
+        answer = await self._ask(unit, protocol.write(unit, start, data), 0, retries)
+        refused = answer.error & (Alarm.ANGLE | Alarm.RANGE | Alarm.CHECKSUM | Alarm.INSTRUCTION)
+        if refused:
+            raise ProtocolError(
+                f"{self._link.name}: unit {unit} refused a write to {start.address}: {alarm_names(refused)} error"
+            )
+        return answer.error
+
+    async def sync_write(self, start: Register, data: Mapping[int, bytes]) -> None:
+        """Write to several units in one packet; nobody answers.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        await self._clock.sleep_until(self._quiet_until)
+        self._link.write(protocol.sync_write(start, data))
+        self._quiet_until = self._clock.now() + round(GAP * SECOND)
+
+    async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
+        for attempt in range(1 + retries):
+            heard = await self._exchange(
+                request, count, lambda packet: packet.unit == unit and len(packet.params) in (count, 0)
+            )
+            if heard is None:
+                continue
+            packet, asked, received = heard
+            error = Alarm(packet.code)
+            if Alarm.CHECKSUM in error and attempt < retries:
+                continue
+            if len(packet.params) != count:
+                raise ProtocolError(f"{self._link.name}: unit {unit} gave no data: {alarm_names(error)} error")
+            return Answer(error, packet.params, asked, received)
+        raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
+
+    async def _exchange(
+        self, request: bytes, count: int, wanted: Callable[[Packet], bool]
+    ) -> tuple[Packet, int, int] | None:
+        """Send a request; the first wanted packet with the instants of asking and hearing, or None.
+
+        Args:
+            request: whole packet.
+            count: data bytes the answer should have.
+            wanted: tells the answer from late ones to earlier requests.
+        """
+        await self._clock.sleep_until(self._quiet_until)
+        self._link.discard()
+        asked = self._clock.now()
+        self._link.write(request)
+        # A damaged length must not make the parser wait for more than can come.
+        parser = Parser(longest=max(len(request) - 4, count + 2))
+        echo_due = self.echo
+        try:
+            async with self._clock.deadline(self._timeout(len(request) + 6 + count)):
+                while True:
+                    data = await self._link.read()
+                    received = self._clock.now()
+                    self.strange += len(data)
+                    for packet in parser.feed(data):
+                        self.strange -= len(packet.params) + 6
+                        if echo_due and packet.encode() == request:
+                            echo_due = False
+                        elif wanted(packet):
+                            return packet, asked, received
+        except TimeoutError:
+            return None

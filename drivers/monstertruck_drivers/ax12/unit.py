@@ -1,0 +1,295 @@
+"""One emulated AX-12A: control table, control loop, heat and alarms."""
+
+from collections import deque
+from collections.abc import Callable
+from math import copysign, exp, tau
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.protocol import Alarm, Register
+from monstertruck_runtime.clock import SECOND
+
+Load = Callable[[int, int], float]
+"""Torque, N m, that pushes the shaft of a unit (first argument) at a time, ns; counter-clockwise positive."""
+Voltage = Callable[[int], float]
+"""Supply, V, at a time, ns."""
+
+TICK: Final = 2_000_000
+"""Nanoseconds of one step of the motion."""
+IDLE_TICK: Final = 100_000_000
+"""The same where the shaft stalls."""
+RATED_VOLTAGE: Final = 12.0
+NO_LOAD_SPEED: Final = 59 * tau / 60 / p.STEP
+"""Steps a second at rated voltage and full drive."""
+STALL_TORQUE: Final = 1.5
+"""N m at rated voltage."""
+GEAR_FRICTION: Final = 0.15
+"""N m the unpowered gear holds."""
+HEAT_RISE: Final = 80.0
+"""Degrees above the surroundings that lasting full drive ends at."""
+HEAT_TIME: Final = 100.0
+"""Time constant of the temperature, s."""
+OVERLOAD_DRIVE: Final = 0.8
+"""Share of the full torque that, without motion, is an overload."""
+OVERLOAD_TIME: Final = 1.0
+"""Seconds until the alarm."""
+AMBIENT: Final = 25.0
+HISTORY: Final = 1024
+"""Points of the shaft's past that are kept: two seconds of motion."""
+
+
+class Unit:
+    """Device side of one servo; time passes when somebody asks.
+
+    The shaft follows the goal with a speed proportional to the drive, which grows over the compliance slope from the
+    margin on, is never below the punch, and is cut by torque limit and moving speed. A load slows it down.
+
+    Args:
+        ident: number on the bus.
+        position: of the shaft, steps.
+        time_ns: now.
+        load: what pushes the shaft.
+        voltage: supply.
+    """
+
+    def __init__(self, ident: int, position: float, time_ns: int, load: Load, voltage: Voltage) -> None:
+        self.blocked = False
+        self.frozen = False
+        """The position sensor repeats its last value."""
+        self.powered = True
+        self.present = True
+        """False: fallen off the bus."""
+        self.latched = True
+        """Alarms stay in the error bits until torque is given again; otherwise only while their cause lasts."""
+        self.temperature = AMBIENT
+        self.position = position
+        self._load = load
+        self._voltage = voltage
+        self._time = time_ns
+        self._speed = 0.0
+        self._drive = 0.0
+        self._overload_for = 0.0
+        self._alarms = Alarm(0)
+        self._sensed = position
+        self._pending: tuple[int, bytes] | None = None
+        self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=HISTORY)
+        self._table = bytearray(p.TABLE_SIZE)
+        self.factory_reset()
+        self.put(p.ID, ident)
+
+    # Control table
+
+    def get(self, register: Register) -> int:
+        """Value of a register."""
+        return int.from_bytes(self._table[register.address : register.address + register.size], "little")
+
+    def put(self, register: Register, value: int) -> None:
+        """Set a register, whatever its access."""
+        self._table[register.address : register.address + register.size] = register.encode(value)
+
+    def read(self, address: int, count: int, time_ns: int) -> tuple[Alarm, bytes]:
+        """Bytes of the table; error bits of the request alone."""
+        if not count or address + count > p.TABLE_SIZE:
+            return Alarm.RANGE, b""
+        self.advance(time_ns)
+        self._refresh()
+        return Alarm(0), bytes(self._table[address : address + count])
+
+    def write(self, address: int, data: bytes, time_ns: int) -> Alarm:
+        """All of it or, with an error bit, nothing."""
+        error = self._refusal(address, data)
+        if error:
+            return error
+        self.advance(time_ns)
+        self._table[address : address + len(data)] = data
+        if self._touches(p.TORQUE_LIMIT, address, data) and self.get(p.TORQUE_LIMIT):
+            self._alarms &= ~(Alarm.OVERLOAD | Alarm.OVERHEAT)
+            self._overload_for = 0.0
+        return error
+
+    def register(self, address: int, data: bytes) -> Alarm:
+        """Keep a write for the next ``act``."""
+        error = self._refusal(address, data)
+        if not error:
+            self._pending = (address, data)
+            self.put(p.REGISTERED, 1)
+        return error
+
+    def act(self, time_ns: int) -> Alarm:
+        """Carry out the registered write."""
+        if self._pending is None:
+            return Alarm.INSTRUCTION
+        (address, data), self._pending = self._pending, None
+        self.put(p.REGISTERED, 0)
+        return self.write(address, data, time_ns)
+
+    def factory_reset(self) -> None:
+        """Everything to its default: number 1 among them."""
+        for register in p.REGISTERS:
+            self.put(register, register.default)
+        self._boot()
+
+    def _boot(self) -> None:
+        for register in p.REGISTERS:
+            if not register.is_stored:
+                self.put(register, register.default)
+        self.put(p.TORQUE_LIMIT, self.get(p.MAX_TORQUE))
+        self._alarms = Alarm(0)
+        self._overload_for = 0.0
+        self._pending = None
+
+    def _refusal(self, address: int, data: bytes) -> Alarm:
+        end = address + len(data)
+        if not data or end > p.TABLE_SIZE:
+            return Alarm.RANGE
+        if address < p.RAM_START and self.get(p.LOCK):
+            return Alarm.RANGE
+        table = self._table.copy()
+        table[address:end] = data
+        for register in p.REGISTERS:
+            if not self._touches(register, address, data):
+                continue
+            value = int.from_bytes(table[register.address : register.address + register.size], "little")
+            unlocks = register is p.LOCK and value < self.get(p.LOCK)
+            if register.read_only or unlocks or value > register.high:
+                return Alarm.RANGE
+            if register is p.GOAL_POSITION and not self.wheel_mode and not self._reachable(value):
+                return Alarm.ANGLE
+        return Alarm(0)
+
+    def _touches(self, register: Register, address: int, data: bytes) -> bool:
+        return register.address < address + len(data) and address < register.address + register.size
+
+    def _reachable(self, goal: int) -> bool:
+        return self.get(p.CW_LIMIT) <= goal <= self.get(p.CCW_LIMIT)
+
+    @property
+    def wheel_mode(self) -> bool:
+        """Turns endlessly: both limits are 0."""
+        return not self.get(p.CW_LIMIT) and not self.get(p.CCW_LIMIT)
+
+    def _refresh(self) -> None:
+        """Measurements into the table."""
+        if not self.frozen:
+            self._sensed = self.position
+        speed = round(self._speed * p.STEP / p.SPEED_UNIT)
+        self.put(p.PRESENT_POSITION, min(max(round(self._sensed), 0), p.POSITION_MAX))
+        self.put(p.PRESENT_SPEED, p.to_sign_bit(speed))
+        self.put(p.PRESENT_LOAD, p.to_sign_bit(round(self._drive / p.LOAD_UNIT)))
+        self.put(p.PRESENT_VOLTAGE, min(max(round(self._volts() / p.VOLT_UNIT), 0), 255))
+        self.put(p.PRESENT_TEMPERATURE, min(max(round(self.temperature), 0), 255))
+        self.put(p.MOVING, int(self._speed != 0))
+
+    def error(self, time_ns: int) -> Alarm:
+        """Error bits of the unit's state."""
+        self.advance(time_ns)
+        return self._alarms
+
+    def trip(self, alarm: Alarm) -> None:
+        """An alarm fires now."""
+        self._alarms |= alarm
+        if alarm & self.get(p.SHUTDOWN):
+            self.put(p.TORQUE_LIMIT, 0)
+
+    # Supply
+
+    def power(self, on: bool, time_ns: int) -> None:
+        """Switch the supply; the table's first part and the shaft's place survive."""
+        self.advance(time_ns)
+        self.powered = on
+        if on:
+            self._boot()
+
+    def _volts(self) -> float:
+        return self._voltage(self._time)
+
+    # Motion
+
+    def angles(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Shaft in steps at instants of the last seconds (or, beyond, the nearest known)."""
+        self.advance(int(times_ns.max()))
+        past = np.array(self._past)
+        return np.asarray(np.interp(times_ns.astype(np.float64), past[:, 0], past[:, 1]))
+
+    def advance(self, time_ns: int) -> None:
+        """Let time pass."""
+        while self._time < time_ns:
+            self._drive = self._wanted_drive()
+            self._speed = self._wanted_speed()
+            tick = TICK if self._speed else IDLE_TICK if self._drive else time_ns
+            span = min(tick, time_ns - self._time)
+            self._step(span / SECOND)
+            self._time += span
+            self._past.append((self._time, self.position))
+            self._judge(span / SECOND)
+
+    def _wanted_drive(self) -> float:
+        if not self.powered or not self.get(p.TORQUE_ENABLE):
+            return 0.0
+        limit = self.get(p.TORQUE_LIMIT) / 1023
+        if self.wheel_mode:
+            drive = p.from_sign_bit(self.get(p.MOVING_SPEED)) / 1023
+            return copysign(min(abs(drive), limit), drive)
+        left = self.get(p.GOAL_POSITION) - self.position
+        margin, slope = (p.CCW_MARGIN, p.CCW_SLOPE) if left > 0 else (p.CW_MARGIN, p.CW_SLOPE)
+        beyond = abs(left) - self.get(margin)
+        if beyond <= 0:
+            return 0.0
+        drive = max(self.get(p.PUNCH) / 1023, beyond / p.slope_of(self.get(slope)))
+        return copysign(min(drive, limit, 1.0), left)
+
+    def _wanted_speed(self) -> float:
+        """Steps a second."""
+        push = self._load(self.get(p.ID), self._time)
+        volts = self._volts() / RATED_VOLTAGE
+        if self.blocked or volts <= 0:
+            return 0.0
+        if self._drive == 0 and abs(push) <= GEAR_FRICTION:
+            return 0.0
+        speed = NO_LOAD_SPEED * (self._drive * volts + push / STALL_TORQUE)
+        top = self.get(p.MOVING_SPEED) * p.SPEED_UNIT / p.STEP
+        if self.wheel_mode or not top or not self._drive:
+            return speed
+        return copysign(min(abs(speed), top), speed)
+
+    def _step(self, seconds: float) -> None:
+        move = self._speed * seconds
+        if self.wheel_mode:
+            self.position = (self.position + move) % (tau / p.STEP)
+        elif self._speed:
+            left = self.get(p.GOAL_POSITION) - self.position
+            overshoots = self._drive * move > 0 and abs(move) > abs(left)
+            before = self.position
+            self.position = min(max(before + (left if overshoots else move), 0.0), float(p.POSITION_MAX))
+            self._speed = (self.position - before) / seconds
+        target = AMBIENT + HEAT_RISE * self._drive**2
+        self.temperature += (target - self.temperature) * (1 - exp(-seconds / HEAT_TIME))
+
+    def _judge(self, seconds: float) -> None:
+        if not self.powered:
+            return
+        stalled = abs(self._drive) >= min(OVERLOAD_DRIVE, self.get(p.TORQUE_LIMIT) / 1023) and abs(self._speed) < 1
+        self._overload_for = self._overload_for + seconds if stalled and self._drive else 0.0
+        volts = self._volts() / p.VOLT_UNIT
+        fired = Alarm(0)
+        if self._overload_for > OVERLOAD_TIME:
+            fired |= Alarm.OVERLOAD
+        if self.temperature > self.get(p.TEMPERATURE_LIMIT):
+            fired |= Alarm.OVERHEAT
+        if not self.get(p.VOLTAGE_MIN) <= volts <= self.get(p.VOLTAGE_MAX):
+            fired |= Alarm.VOLTAGE
+        self._alarms = self._alarms & (Alarm.OVERLOAD | Alarm.OVERHEAT) if self.latched else Alarm(0)
+        self.trip(fired)
+
+
+def steady_voltage(_: int) -> float:
+    """As from a good 12 V converter."""
+    return 11.1
+
+
+def no_load(_: int, __: int) -> float:
+    """Nothing pushes."""
+    return 0.0

@@ -1,0 +1,496 @@
+"""The emulated bus byte by byte: what real units answer, refuse, garble, and how they move."""
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.emulator import Ax12Bus
+from monstertruck_drivers.ax12.protocol import STEP, Alarm, Packet, Present
+from monstertruck_drivers.ax12.unit import AMBIENT, OVERLOAD_TIME
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
+from tests.unit.drivers.ax12.rig import Host, wire
+
+
+def on_wire(test, **options):
+    """Run ``test(bus, host, clock)`` on the virtual clock."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with wire(clock, **({"positions": {}} | options)) as (bus, host):
+            await test(bus, host, clock)
+
+    run_virtual(main)
+
+
+def write(unit: int, register: p.Register, value: int) -> bytes:
+    return p.write(unit, register, register.encode(value))
+
+
+async def value(host: Host, unit: int, register: p.Register) -> int:
+    packet = await host.status(p.read(unit, register, register.size))
+    return int.from_bytes(packet.params, "little")
+
+
+async def present(host: Host, unit: int = 1) -> Present:
+    return Present.decode((await host.status(p.read(unit, p.PRESENT_POSITION, p.PRESENT_SIZE))).params)
+
+
+def test_documented_exchange():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        assert await host.raw(p.ping(1)) == bytes.fromhex("FF FF 01 02 00 FC")
+        bus.inject("heat", "1", "32")
+        assert await host.raw(p.read(1, p.PRESENT_TEMPERATURE, 1)) == bytes.fromhex("FF FF 01 03 00 20 DB")
+        assert await host.raw(bytes.fromhex("FF FF 01 07 03 1E FF 01 66 00 70")) == bytes.fromhex("FF FF 01 02 00 FC")
+        assert await host.raw(p.ping(7)) == b""
+        assert bytes(bus.received).startswith(p.ping(1))
+
+    on_wire(test)
+
+
+def test_an_answer_takes_line_return_delay_and_adapter():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        assert await host.raw(p.read(1, p.PRESENT_POSITION, 8), 0.00170) == b""
+        await clock.sleep(0.1)
+        assert len(await host.raw(p.read(1, p.PRESENT_POSITION, 8), 0.00176)) == 14
+        await host.status(write(1, p.RETURN_DELAY, 0))
+        assert len(await host.raw(p.read(1, p.PRESENT_POSITION, 8), 0.00126)) == 14
+        bus.latency_s = 0.016
+        assert await host.raw(p.ping(1), 0.016) == b""
+
+    on_wire(test)
+
+
+def test_up_to_six_units():
+    async def test(_bus, host: Host, _clock) -> None:
+        for ident in range(1, 7):
+            assert (await host.status(p.ping(ident))).unit == ident
+
+    on_wire(test, ids=range(1, 7))
+
+
+@pytest.mark.parametrize("ids", [range(7), (254,), (-1,)])
+def test_impossible_buses_are_refused(ids):
+    async def main(clock: VirtualClock) -> None:
+        with pytest.raises(InputError, match=r"at most 6, each 0\.\.253"):
+            Ax12Bus(clock, ids=tuple(ids))
+
+    run_virtual(main)
+
+
+def test_an_echo_comes_before_the_answer():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        request = p.ping(1)
+        assert await host.raw(request) == request + Packet(1, 0).encode()
+        assert await host.raw(p.action()) == p.action()
+        bus.inject("echo", "off")
+        assert await host.raw(request) == Packet(1, 0).encode()
+
+    on_wire(test, echo=True)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_status_level_decides_what_is_answered(level: int):
+    async def test(_bus, host: Host, _clock) -> None:
+        await host.ask(write(1, p.STATUS_LEVEL, level))
+        assert len(await host.ask(p.ping(1))) == 1
+        assert len(await host.ask(p.read(1, p.ID, 1))) == (level >= 1)
+        assert len(await host.ask(write(1, p.LED, 1))) == (level >= 2)
+        assert len(await host.ask(p.reset(1))) == (level >= 2)
+
+    on_wire(test, ids=(1,))
+
+
+def test_a_broadcast_is_obeyed_in_silence():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        assert await host.ask(write(p.BROADCAST, p.LED, 1)) == []
+        assert [unit.get(p.LED) for unit in bus.units] == [1, 1]
+        assert await host.ask(p.ping(p.BROADCAST)) == []
+        bus.inject("vanish", "2")
+        assert [packet.unit for packet in await host.ask(p.ping(p.BROADCAST))] == [1]
+
+    on_wire(test)
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_wrong_sum_is_answered_by_its_error_bit_or_not_at_all(answers: bool):
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        damaged = bytearray(write(1, p.LED, 1))
+        damaged[-1] ^= 1
+        assert await host.ask(bytes(damaged)) == ([Packet(1, Alarm.CHECKSUM)] if answers else [])
+        assert bus.units[0].get(p.LED) == 0
+        assert (await host.status(p.ping(1))).code == 0
+
+    on_wire(test, answers_damage=answers)
+
+
+def test_half_a_packet_is_given_up_after_a_pause():
+    async def test(_bus, host: Host, _clock) -> None:
+        assert await host.raw(p.ping(1)[:4], wait=0.2) == b""
+        assert (await host.status(p.ping(1))).unit == 1
+        assert await host.raw(p.ping(1)[:4], wait=0.01) == b""
+        assert (await host.status(p.ping(1)[4:])).unit == 1, "a short pause does not matter"
+
+    on_wire(test)
+
+
+@pytest.mark.parametrize(
+    ("request_", "bits"),
+    [
+        (write(1, p.LED, 2), Alarm.RANGE),
+        (p.write(1, p.GOAL_POSITION, b"\x00\x04"), Alarm.RANGE),
+        (write(1, p.MODEL_NUMBER, 12), Alarm.RANGE),
+        (p.write(1, p.PUNCH, b"\x00\x00\x00"), Alarm.RANGE),
+        (p.read(1, p.PUNCH, 3), Alarm.RANGE),
+        (write(1, p.GOAL_POSITION, 300), Alarm.ANGLE),
+        (p.reg_write(1, p.GOAL_POSITION, p.GOAL_POSITION.encode(300)), Alarm.ANGLE),
+        (Packet(1, p.Instruction.BULK_READ, b"\x00\x02\x01\x24").encode(), Alarm.INSTRUCTION),
+        (Packet(1, 0x55).encode(), Alarm.INSTRUCTION),
+        (p.action(1), Alarm.INSTRUCTION),
+    ],
+)
+def test_what_cannot_be_done_is_refused_by_its_bit(request_: bytes, bits: Alarm):
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        await host.status(p.write(1, p.CW_LIMIT, p.CW_LIMIT.encode(409) + p.CCW_LIMIT.encode(613)))
+        before = [bus.units[0].get(register) for register in p.REGISTERS]
+        assert await host.status(request_) == Packet(1, bits)
+        assert [bus.units[0].get(register) for register in p.REGISTERS] == before
+        assert (await host.status(p.ping(1))).code == 0, "it was the request's error, not the unit's"
+
+    on_wire(test)
+
+
+def test_registered_writes_wait_for_the_action():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        for unit in (1, 2):
+            await host.status(p.reg_write(unit, p.GOAL_POSITION, p.GOAL_POSITION.encode(600)))
+            assert await value(host, unit, p.REGISTERED) == 1
+            assert await value(host, unit, p.GOAL_POSITION) == 0
+        assert await host.ask(p.action()) == []
+        assert [unit.get(p.GOAL_POSITION) for unit in bus.units] == [600, 600]
+        assert await value(host, 1, p.REGISTERED) == 0
+
+    on_wire(test)
+
+
+def test_sync_write_reaches_the_named_units_and_nobody_answers():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        goals = {1: p.GOAL_POSITION.encode(500), 3: p.GOAL_POSITION.encode(250), 9: p.GOAL_POSITION.encode(1)}
+        assert await host.ask(p.sync_write(p.GOAL_POSITION, goals)) == []
+        assert [unit.get(p.GOAL_POSITION) for unit in bus.units] == [500, 0, 250]
+        ragged = Packet(p.BROADCAST, p.Instruction.SYNC_WRITE, bytes((p.GOAL_POSITION.address, 2, 1, 0))).encode()
+        assert await host.ask(ragged) == []
+        assert bus.units[0].get(p.GOAL_POSITION) == 500
+
+    on_wire(test, ids=(1, 2, 3))
+
+
+def test_stored_settings_survive_the_supply_and_the_others_do_not():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        await host.status(write(1, p.MAX_TORQUE, 700))
+        await host.status(write(1, p.MOVING_SPEED, 100))
+        await host.status(write(1, p.LOCK, 1))
+        assert (await host.status(write(1, p.ID, 3))).code == Alarm.RANGE, "locked"
+        assert (await host.status(write(1, p.LOCK, 0))).code == Alarm.RANGE, "only the supply unlocks"
+        bus.power_cycle()
+        assert await value(host, 1, p.MAX_TORQUE) == 700
+        assert await value(host, 1, p.TORQUE_LIMIT) == 700, "copied at power-up"
+        assert await value(host, 1, p.MOVING_SPEED) == 0
+        assert (await host.status(write(1, p.ID, 3))).code == 0
+        assert (await host.status(p.ping(3))).unit == 3
+
+    on_wire(test)
+
+
+def test_the_12_v_rail_silences_all_units_and_nothing_else():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        bus.inject("power", "off")
+        assert await host.ask(p.ping(1)) == await host.ask(p.ping(2)) == []
+        bus.inject("power", "on")
+        assert len(await host.ask(p.ping(1)) + await host.ask(p.ping(2))) == 2
+
+    on_wire(test)
+
+
+def test_factory_reset_makes_it_number_1_and_two_of_a_number_garble():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        assert (await host.status(p.reset(2))).unit == 2
+        assert await host.ask(p.ping(2)) == []
+        heard = await host.raw(p.ping(1))
+        assert len(heard) == 6
+        assert heard != Packet(1, 0).encode()
+        await host.ask(write(1, p.LED, 1))
+        assert [unit.get(p.LED) for unit in bus.units] == [1, 1], "both obey"
+
+    on_wire(test)
+
+
+def test_a_unit_at_another_baud_rate_is_deaf():
+    async def test(_bus, host: Host, _clock) -> None:
+        await host.status(write(1, p.BAUD_CODE, 16))
+        assert await host.ask(p.ping(1)) == []
+        assert len(await host.ask(p.ping(2))) == 1
+
+    on_wire(test)
+
+
+def test_damaged_answers():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        good = Packet(1, 0).encode()
+        bus.inject("truncate")
+        assert await host.raw(p.ping(1)) == good[:-2]
+        bus.inject("double", "2")
+        assert await host.raw(p.ping(1)) == good * 2
+        assert await host.raw(p.ping(1)) == good * 2
+        bus.inject("garble")
+        assert await host.ask(p.ping(1)) == []
+        bus.inject("mute", "1")
+        assert await host.raw(p.ping(1)) == b""
+        bus.inject("late", "0.05")
+        assert await host.raw(p.ping(1), 0.045) == b""
+        assert await host.raw(b"", 0.01) == good
+        assert await host.raw(p.ping(1)) == good, "all of it is over"
+
+    on_wire(test)
+
+
+def test_a_unit_vanishes_and_returns():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        bus.inject("vanish", "2")
+        assert await host.ask(p.ping(2)) == []
+        assert len(await host.ask(p.ping(1))) == 1
+        bus.inject("return", "2")
+        assert len(await host.ask(p.ping(2))) == 1
+
+    on_wire(test)
+
+
+# Motion
+
+
+def test_it_moves_at_moving_speed_and_stops_within_the_margin():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(write(1, p.MOVING_SPEED, 102))  # 11.3 rpm: 231.6 steps a second
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 812))
+        start = clock.now()
+        await clock.sleep(0.48)
+        now = await present(host)
+        expected = 512 + 102 * p.SPEED_UNIT / STEP * (clock.now() - start - 0.02 * SECOND) / SECOND
+        assert now.position == pytest.approx(expected, abs=5)
+        assert now.speed == pytest.approx(102, abs=1)
+        assert now.load > 0
+        assert await value(host, 1, p.MOVING) == 1
+        await clock.sleep(2)
+        now = await present(host)
+        assert abs(now.position - 812) <= 1
+        assert now.speed == now.load == 0
+        assert await value(host, 1, p.MOVING) == 0
+        await host.status(write(1, p.GOAL_POSITION, 512))
+        await clock.sleep(0.3)
+        now = await present(host)
+        assert now.speed == pytest.approx(-102, abs=1)
+        assert now.load < 0
+        assert bus.angle(2, clock.now()) == pytest.approx(512 * STEP), "the other one stands"
+
+    on_wire(test)
+
+
+@pytest.mark.parametrize(("slope", "margin"), [(4, 0), (32, 1), (128, 10)])
+def test_slope_and_margin_shape_the_arrival(slope: int, margin: int):
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(p.write(1, p.CW_MARGIN, bytes((margin, margin, slope, slope))))
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 612))
+        await clock.sleep(3)
+        left = 612 - bus.angle(1, clock.now()) / STEP
+        assert left == pytest.approx(margin, abs=0.6)
+        loads = []
+        await host.status(write(1, p.GOAL_POSITION, 512))
+        for _ in range(40):
+            now = await present(host)
+            loads.append((now.position - 512, -now.load))
+        for error, load in loads:
+            if margin + 4 < error:
+                assert load == pytest.approx(1000 * min(1, (error - margin) / p.slope_of(slope)), abs=1500 / slope)
+
+    on_wire(test)
+
+
+def test_torque_limit_cuts_the_drive_and_zero_leaves_it_limp():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.TORQUE_LIMIT, 512))
+        await host.status(write(1, p.GOAL_POSITION, 900))
+        assert (await present(host)).load == pytest.approx(500, abs=2)
+        await host.status(write(1, p.TORQUE_LIMIT, 0))
+        before = bus.angle(1, clock.now())
+        await clock.sleep(1)
+        assert bus.angle(1, clock.now()) == before
+
+    on_wire(test)
+
+
+def test_a_load_slows_it_and_moves_a_limp_one():
+    push = {1: -0.5, 2: 0.1}
+
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 512))
+        await clock.sleep(1)
+        sagged = 512 - bus.angle(1, clock.now()) / STEP
+        assert sagged == pytest.approx(1 + 32 * 0.5 / 1.5 * 12 / 11.1, abs=1), "the slope is a spring"
+        assert (await present(host)).load == pytest.approx(1000 * 0.5 / 1.5 * 12 / 11.1, abs=20)
+        await host.status(write(1, p.TORQUE_ENABLE, 0))
+        await clock.sleep(0.2)
+        assert bus.angle(1, clock.now()) < (512 - sagged - 20) * STEP
+        assert bus.angle(2, clock.now()) == 512 * STEP, "the gear's friction holds a small load"
+
+    on_wire(test, load=lambda ident, _: push[ident])
+
+
+def test_both_limits_zero_turn_endlessly():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(p.write(1, p.CW_LIMIT, bytes(4)))
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.MOVING_SPEED, 512 | 1024))
+        await clock.sleep(1)
+        assert (await present(host)).speed < 0
+        seen = {round(bus.angle(1, clock.now() + i * SECOND // 10)) for i in range(30)}
+        assert len(seen) >= 6, "all round"
+
+    on_wire(test)
+
+
+def test_a_blocked_unit_overloads_gets_hot_and_shuts_down():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        bus.inject("block", "1", "on")
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 900))
+        now = await present(host)
+        assert (now.position, now.speed, now.load) == (512, 0, 1000)
+        await clock.sleep(OVERLOAD_TIME - 0.2)
+        assert (await host.status(p.ping(1))).code == 0
+        await clock.sleep(0.3)
+        status = await host.status(write(1, p.LED, 1))
+        assert status.code == Alarm.OVERLOAD, "writes are still answered"
+        assert await value(host, 1, p.TORQUE_LIMIT) == 0
+        assert await value(host, 1, p.TORQUE_ENABLE) == 1, "only the limit tells"
+        assert (await present(host)).load == 0
+        bus.inject("block", "1", "off")
+        await clock.sleep(5)
+        assert bus.angle(1, clock.now()) == 512 * STEP
+        assert (await host.status(p.ping(1))).code == Alarm.OVERLOAD
+        assert (await host.status(write(1, p.TORQUE_LIMIT, 1023))).code == 0
+        await clock.sleep(0.02)
+        assert bus.angle(1, clock.now()) > 512 * STEP, "with the old goal it jumps"
+
+    on_wire(test)
+
+
+def test_error_bits_may_clear_while_it_stays_limp():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        bus.inject("latch", "off")
+        bus.inject("block", "1", "on")
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 900))
+        await clock.sleep(2)
+        assert (await host.status(p.ping(1))).code == 0
+        assert await value(host, 1, p.TORQUE_LIMIT) == 0
+
+    on_wire(test)
+
+
+def test_heat_rises_with_the_drive_and_trips_the_alarm():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(write(1, p.SHUTDOWN, int(Alarm.OVERHEAT)))
+        bus.inject("block", "1", "on")
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 900))
+        await clock.sleep(30)
+        warm = (await present(host)).temperature
+        assert AMBIENT + 10 < warm < 70
+        while Alarm.OVERHEAT not in Alarm((await host.status(p.ping(1))).code):
+            await clock.sleep(1)
+        assert (await present(host)).temperature == pytest.approx(70, abs=1)
+        assert await value(host, 1, p.TORQUE_LIMIT) == 0
+        await clock.sleep(200)
+        assert (await present(host)).temperature < warm
+
+    on_wire(test)
+
+
+def test_an_alarm_outside_the_mask_changes_nothing_but_the_bit():
+    async def test(bus: Ax12Bus, host: Host, _clock) -> None:
+        await host.status(write(1, p.SHUTDOWN, int(Alarm.OVERHEAT)))
+        bus.inject("trip", "1")
+        assert (await host.status(p.ping(1))).code == Alarm.OVERLOAD
+        assert await value(host, 1, p.TORQUE_LIMIT) == 1023
+
+    on_wire(test)
+
+
+def test_voltage_follows_its_source_and_sets_its_bit():
+    volts = [12.0]
+
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        assert (await present(host)).voltage == 120
+        volts[0] = 5.5
+        await clock.sleep(0.1)
+        now = await host.status(p.read(1, p.PRESENT_POSITION, 8))
+        assert now.code == Alarm.VOLTAGE
+        assert Present.decode(now.params).voltage == 55, "data counts although a bit is set"
+        bus.inject("voltage", "11.1")
+        assert (await host.status(p.ping(1))).code == 0
+        bus.inject("voltage", "source")
+        assert (await host.status(p.ping(1))).code == Alarm.VOLTAGE
+
+    on_wire(test, voltage=lambda _: volts[0])
+
+
+def test_a_frozen_sensor_repeats_itself():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        bus.inject("freeze", "1", "on")
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.GOAL_POSITION, 600))
+        await clock.sleep(1)
+        assert (await present(host)).position == 512
+        bus.inject("freeze", "1", "off")
+        assert (await present(host)).position == pytest.approx(599, abs=1)
+
+    on_wire(test)
+
+
+def test_the_past_of_a_shaft_can_be_asked_for():
+    async def test(bus: Ax12Bus, host: Host, clock) -> None:
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        await host.status(write(1, p.MOVING_SPEED, 200))
+        await host.status(write(1, p.GOAL_POSITION, 900))
+        start = clock.now()
+        seen = [bus.angle(1, start + i * SECOND // 100) for i in range(10)]
+        await clock.sleep(0.5)
+        await present(host)
+        again = bus.angles(1, start + np.arange(10) * SECOND // 100)
+        assert again == pytest.approx(np.array(seen), abs=1e-4)
+
+    on_wire(test)
+
+
+@pytest.mark.parametrize(
+    "fault", [("nonsense",), ("block", "1"), ("block",), ("vanish", "x"), ("voltage", "much"), ("late",), ("power",)]
+)
+def test_unknown_faults_are_refused_with_what_is_known(fault: tuple[str, ...]):
+    async def test(bus: Ax12Bus, _host, _clock) -> None:
+        with pytest.raises(InputError, match="not understood; known: vanish ID"):
+            bus.inject(*fault)
+
+    on_wire(test)
+
+
+def test_a_fault_of_a_unit_that_is_not_there():
+    async def test(bus: Ax12Bus, _host, _clock) -> None:
+        with pytest.raises(InputError, match=r"no unit 5; there are \[1, 2\]"):
+            bus.inject("vanish", "5")
+        with pytest.raises(InputError, match="no unit 5"):
+            bus.angle(5, SECOND)
+
+    on_wire(test)
