@@ -1,17 +1,15 @@
 """Configuration of the Maestro: servo calibration, battery scale and thresholds, deadman."""
 
 import math
-from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, CHANNELS
 from monstertruck_schemas.base import Schema
 
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
-Volts = Annotated[float, Field(ge=0)]
-Seconds = Annotated[float, Field(ge=0)]
 Microseconds = Annotated[float, Field(gt=0, le=4000)]
 
 
@@ -50,38 +48,18 @@ class ServoConfig(Schema):
         return math.radians((quarters / 4 - self.centre_us) * self.direction / self.scale_us_per_deg)
 
 
-class BatteryConfig(Schema):
-    """Pack voltage through a divider on an analog input, and when it counts as low or critical."""
+class BatteryConfig(PackConfig):
+    """Pack voltage through a divider on an analog input."""
 
     channel: Channel = 5
-    cells: Annotated[int, Field(ge=1, le=14)] = 6
     volts_per_count: Annotated[float, Field(gt=0)] = 5.0 * 10 / ADC_MAX
     """The reference is the USB 5 V rail (5 % tolerance) behind a 1:10 divider: calibrate with a multimeter."""
     gain: Annotated[float, Field(gt=0)] = 1.0
     offset: float = 0.0
     """Volts added after the gain."""
-    smoothing: Seconds = 5.0
-    """Time constant of the published voltage."""
-    low: Volts = 22.0
-    low_after: Seconds = 10.0
-    clear: Volts = 22.4
-    """Low and critical end above this."""
-    clear_after: Seconds = 30.0
-    critical: Volts = 21.0
-    critical_after: Seconds = 10.0
-    collapsed: Volts = 19.8
-    """Critical too, after a shorter time."""
-    collapsed_after: Seconds = 2.0
-    plausible_min: Volts = 15.0
-    """Outside the plausible range the sensor is at fault, not the battery."""
-    plausible_max: Volts = 26.0
 
     @model_validator(mode="after")
-    def _thresholds_in_order(self) -> Self:
-        order = ("plausible_min", "collapsed", "critical", "low", "clear", "plausible_max")
-        for lower, upper in pairwise(order):
-            if not getattr(self, lower) < getattr(self, upper):
-                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+    def _ends_of_scale_are_faults(self) -> Self:
         # A broken divider reads 0 or full scale.
         for raw in (0, ADC_MAX):
             if self.plausible_min <= self.volts(raw) <= self.plausible_max:

@@ -3,10 +3,10 @@
 import contextlib
 from typing import Final
 
+from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
-from monstertruck_drivers.maestro.battery import BatteryJudge
 from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
-from monstertruck_drivers.maestro.protocol import Encoder, error_names
+from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import Session
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
@@ -14,20 +14,13 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Battery, BatteryLevel, SteeringFeedback
+from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 MISSES: Final = 3
 """Polls in a row without a usable answer that end the session."""
 LINE_HIGH: Final = 8000
 LINE_LOW: Final = 4000
 """Targets of a digital output, quarter microseconds: on either side of the device's threshold."""
-
-LEVEL_EVENTS: Final = {
-    BatteryLevel.NORMAL: (Reason.OK, Severity.INFO),
-    BatteryLevel.LOW: (Reason.BATTERY_LOW, Severity.WARNING),
-    BatteryLevel.CRITICAL: (Reason.BATTERY_CRITICAL, Severity.ERROR),
-    BatteryLevel.SENSOR_FAULT: (Reason.DEVICE_FAULT, Severity.ERROR),
-}
 
 
 class MaestroDriver:
@@ -51,6 +44,7 @@ class MaestroDriver:
         battery: pack voltage; None when the battery is measured elsewhere.
         events: where errors of the device are reported.
         name: service name.
+        drive: the motor's feedback, whose current explains the battery's sag.
     """
 
     def __init__(
@@ -63,6 +57,8 @@ class MaestroDriver:
         battery: Publisher[Battery] | None,
         events: EventSink,
         name: str = "steering",
+        *,
+        drive: Subscription[DriveFeedback] | None = None,
     ) -> None:
         self.name = name
         self._config = config
@@ -73,7 +69,7 @@ class MaestroDriver:
         self._events = events
         self._battery = None
         if battery is not None and config.battery is not None:
-            self._battery = BatteryReader(config.battery, battery, events, name)
+            self._battery = BatteryInput(config.battery, BatteryMonitor(config.battery, battery, events, name, drive))
         self._angles = [0.0, 0.0]
         self._start_session()
 
@@ -162,7 +158,7 @@ class MaestroDriver:
             packets += self._targets(session, self._command)
         session.send(*packets, *self._line(session, high=self._fresh))
 
-    async def _poll(self, session: Session, battery: "BatteryReader | None") -> None:
+    async def _poll(self, session: Session, battery: "BatteryInput | None") -> None:
         config = self._config
         channels = [config.front.channel, config.rear.channel] + ([battery.channel] if battery else [])
         asked = self._clock.now()
@@ -212,34 +208,14 @@ class MaestroDriver:
         )
 
 
-class BatteryReader:
-    """Publishes and judges what the battery's analog input reads; outlives sessions."""
+class BatteryInput:
+    """The analog input the battery hangs on."""
 
-    def __init__(self, config: BatteryConfig, out: Publisher[Battery], events: EventSink, source: str) -> None:
+    def __init__(self, config: BatteryConfig, monitor: BatteryMonitor) -> None:
         self.channel = config.channel
         self._config = config
-        self._out = out
-        self._events = events
-        self._source = source
-        self._judge = BatteryJudge(config)
-        self._level = BatteryLevel.NORMAL
+        self._monitor = monitor
 
     def take(self, stamp: int, received: int, raw: int) -> None:
         """Take one 10-bit reading."""
-        volts = self._config.volts(raw)
-        voltage, level = self._judge.update(stamp, volts)
-        if level is not self._level and level in LEVEL_EVENTS:
-            reason, severity = LEVEL_EVENTS[level]
-            self._events(reason, severity, self._source, f"battery {level.value} at {volts:.1f} V", raw_voltage=volts)
-            self._level = level
-        self._out.put(
-            Battery(
-                stamp=stamp,
-                received=received,
-                seq=self._out.next_seq(),
-                voltage=voltage,
-                raw_voltage=volts,
-                cells=self._config.cells,
-                level=level,
-            )
-        )
+        self._monitor.take(stamp, received, self._config.volts(raw), at_limit=raw in (0, ADC_MAX))

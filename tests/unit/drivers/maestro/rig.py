@@ -13,7 +13,8 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Battery, SteeringFeedback
+from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
+from tests.unit.drivers.kit import Latest
 
 M = TypeVar("M")
 
@@ -106,7 +107,10 @@ class Rig:
         self.battery: Kept[Battery] = Kept()
         self.events = Events()
         self.ready_at: list[int] = []
-        self.driver = MaestroDriver(config, port, clock, self.commands, self.out, self.battery, self.events)
+        self.drive: Latest[DriveFeedback] = Latest()
+        self.driver = MaestroDriver(
+            config, port, clock, self.commands, self.out, self.battery, self.events, drive=self.drive
+        )
 
     def _changed(self, channel: int, high: bool) -> None:
         self.outputs.append((channel, high, self.clock.now()))

@@ -24,7 +24,7 @@ from monstertruck_runtime.errors import (
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.health import ServiceHealth
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import BatteryLevel
+from monstertruck_schemas.sensor import BatteryLevel, DriveFeedback, DriveMode
 from tests.unit.drivers.maestro.rig import Commands, Events, Gate, Kept, Rig, background, bench
 
 LINE = MaestroConfig(deadman_channel=2)
@@ -266,6 +266,22 @@ def test_the_battery_is_read_judged_and_reported():
             assert rig.battery.kept[-1].level is BatteryLevel.SENSOR_FAULT
             assert rig.battery.kept[-1].voltage is None
         assert rig.events.reasons() == [Reason.BATTERY_LOW, Reason.BATTERY_CRITICAL, Reason.DEVICE_FAULT]
+
+    on_bench(test)
+
+
+def test_the_motors_current_explains_the_batterys_sag():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("battery", "22.0")
+        now = rig.clock.now()
+        rig.drive.latest = DriveFeedback(
+            stamp=now, received=now, seq=0, position=0.0, velocity=0.0, current=5.0, mode=DriveMode.ENABLED
+        )
+        async with rig.driving():
+            await rig.settle(0.5)
+            battery = rig.battery.kept[-1]
+            assert battery.voltage is not None
+            assert battery.rest_voltage == pytest.approx(battery.voltage + 0.3)
 
     on_bench(test)
 

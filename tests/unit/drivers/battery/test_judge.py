@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from monstertruck_drivers.maestro.battery import BatteryJudge
-from monstertruck_drivers.maestro.config import BatteryConfig
+from monstertruck_drivers.battery.config import PackConfig
+from monstertruck_drivers.battery.judge import CELL_VOLTS, BatteryJudge, charge_of
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import BatteryLevel
 
@@ -15,20 +15,22 @@ L = BatteryLevel
 class Bench:
     """Feeds a judge at 10 Hz."""
 
-    def __init__(self) -> None:
-        self.judge = BatteryJudge(BatteryConfig())
+    def __init__(self, **config: float) -> None:
+        self.judge = BatteryJudge(PackConfig(**config))
         self.time = 0
         self.voltage: float | None = None
+        self.rest: float | None = None
         self.level = L.UNKNOWN
 
-    def feed(self, volts: Iterable[float]) -> "Bench":
+    def feed(self, volts: Iterable[float], current: float | None = None) -> "Bench":
         for value in volts:
             self.time += SECOND // 10
-            self.voltage, self.level = self.judge.update(self.time, value)
+            verdict = self.judge.update(self.time, value, current)
+            self.voltage, self.rest, self.level = verdict.voltage, verdict.rest_voltage, verdict.level
         return self
 
-    def hold(self, volts: float, seconds: float) -> BatteryLevel:
-        return self.feed([volts] * round(seconds * 10)).level
+    def hold(self, volts: float, seconds: float, current: float | None = None) -> BatteryLevel:
+        return self.feed([volts] * round(seconds * 10), current).level
 
 
 def test_unknown_until_the_median_is_full():
@@ -113,9 +115,55 @@ def test_smoothing_has_its_time_constant():
 
 
 def test_smoothing_can_be_switched_off():
-    judge = BatteryJudge(BatteryConfig(smoothing=0.0))
+    judge = BatteryJudge(PackConfig(smoothing=0.0))
     for i in range(5):
         judge.update(i * SECOND // 10, 24.0)
     for i in range(5, 8):
-        voltage, _ = judge.update(i * SECOND // 10, 23.0)
-    assert voltage == 23.0
+        verdict = judge.update(i * SECOND // 10, 23.0)
+    assert verdict.voltage == 23.0
+
+
+def test_the_motors_current_explains_a_sag():
+    loaded, current = 21.7, 8.0  # 22.18 V at rest
+    assert Bench().hold(loaded, 30, current=None) is L.LOW
+    bench = Bench()
+    assert bench.hold(loaded, 30, current) is L.NORMAL
+    assert bench.voltage == pytest.approx(21.7)
+    assert bench.rest == pytest.approx(21.7 + 8.0 * 0.06)
+    assert Bench().hold(loaded, 30, -current) is L.NORMAL, "braking and reversing draw current too"
+
+
+def test_a_wrong_current_cannot_hide_an_empty_pack():
+    bench = Bench()
+    assert bench.hold(20.4, 30, current=1000.0) is L.LOW
+    assert bench.rest == pytest.approx(20.4 + 1.5)
+    assert Bench().hold(19.7, 30, current=1000.0) is L.CRITICAL, "collapsed is judged as measured"
+
+
+def test_overcharged_after_its_dwell_until_below_full():
+    bench = Bench()
+    assert bench.hold(25.4, 2.0) is L.NORMAL
+    assert bench.hold(25.4, 1.0) is L.OVERCHARGED
+    assert bench.hold(25.25, 5) is L.OVERCHARGED
+    assert bench.hold(25.15, 1) is L.NORMAL
+    assert Bench().hold(25.2, 60, current=5.0) is L.NORMAL, "a guess of the sag makes no full pack overcharged"
+
+
+def test_an_end_of_the_converters_scale_is_a_fault_however_wide_the_plausible_range():
+    bad = float("nan")
+    bench = Bench(plausible_min=0.0)
+    bench.hold(23.0, 2)
+    assert bench.feed([bad] * 2).level is L.NORMAL
+    assert bench.feed([bad]).level is L.SENSOR_FAULT
+    assert bench.hold(23.0, 0.5) is L.NORMAL
+
+
+def test_charge_follows_the_table_and_stays_within_its_ends():
+    assert [charge_of(volts) for volts in CELL_VOLTS] == pytest.approx([i / 20 for i in range(21)])
+    assert charge_of(3.78) == pytest.approx(0.325)
+    assert (charge_of(2.0), charge_of(5.0)) == (0.0, 1.0)
+
+
+def test_limits_must_be_in_order():
+    with pytest.raises(ValueError, match=r"overcharged_clear 25\.4 < overcharged 25\.3 does not hold"):
+        PackConfig(overcharged_clear=25.4)

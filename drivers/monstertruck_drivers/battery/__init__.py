@@ -1,0 +1,1 @@
+"""The truck's battery: judgement shared by everything that measures it, and a source on Linux IIO converters."""

@@ -1,0 +1,82 @@
+"""Configuration of the battery: the pack, when it counts as low, critical or overcharged, and where it is measured."""
+
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import Schema
+
+Volts = Annotated[float, Field(ge=0)]
+Seconds = Annotated[float, Field(ge=0)]
+
+
+class PackConfig(Schema):
+    """A lithium-polymer pack and its limits; the default is 6S.
+
+    Low, critical, clear and overcharged are compared with the voltage at rest (the measured one plus what the
+    motor's current costs), collapsed with the measured one. A pack is told apart from a wrong scale only by the
+    scale's own calibration: 5 % of error make a full pack overcharged.
+    """
+
+    cells: Annotated[int, Field(ge=1, le=14)] = 6
+    capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
+    """Of the pack that is in the truck: 3.7, 4.0 or 5.0"""
+    resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
+    """Ohm of cells and wiring, for the sag; 5 to 15 milliohm per cell are usual"""
+    max_compensation: Volts = 1.5
+    """Greatest sag the motor's current may explain: a wrong current shall not hide an empty pack"""
+    smoothing: Seconds = 5.0
+    """Time constant of the published voltages."""
+    low: Volts = 22.0
+    low_after: Seconds = 10.0
+    clear: Volts = 22.4
+    """Low and critical end above this."""
+    clear_after: Seconds = 30.0
+    critical: Volts = 21.0
+    critical_after: Seconds = 10.0
+    collapsed: Volts = 19.8
+    """Critical too, after a shorter time."""
+    collapsed_after: Seconds = 2.0
+    overcharged: Volts = 25.3
+    overcharged_after: Seconds = 2.0
+    overcharged_clear: Volts = 25.2
+    """Overcharged ends below this."""
+    plausible_min: Volts = 15.0
+    """Outside the plausible range the sensor is at fault, not the battery."""
+    plausible_max: Volts = 26.0
+
+    @model_validator(mode="after")
+    def _thresholds_in_order(self) -> Self:
+        order = (
+            "plausible_min",
+            "collapsed",
+            "critical",
+            "low",
+            "clear",
+            "overcharged_clear",
+            "overcharged",
+            "plausible_max",
+        )
+        for lower, upper in pairwise(order):
+            if not getattr(self, lower) < getattr(self, upper):
+                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+        return self
+
+
+class IioConfig(PackConfig):
+    """Pack voltage behind a divider on a channel of a Linux Industrial-IO converter."""
+
+    kind: Literal["iio"] = "iio"
+    device: str = ""
+    """Name the converter gives itself (file ``name``), such as ads1015; empty = the only one there is"""
+    channel: Annotated[int, Field(ge=0, le=63)] = 0
+    """Number N of in_voltageN_raw"""
+    divider: Annotated[float, Field(gt=0)] = 10.0
+    """Pack volts per volt at the pin; calibrate with a multimeter"""
+    offset: float = 0.0
+    """Volts added to the pack's voltage"""
+    full_scale: Annotated[int, Field(gt=0)] | None = None
+    """Greatest reading of the converter; None = from its scan element, or unknown"""
+    rate: Annotated[float, Field(gt=0, le=50)] = 10.0
+    """Readings a second"""

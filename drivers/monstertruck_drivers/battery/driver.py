@@ -1,0 +1,84 @@
+"""Battery driver on a Linux IIO converter."""
+
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.battery import iio
+from monstertruck_drivers.battery.config import IioConfig
+from monstertruck_drivers.battery.monitor import BatteryMonitor
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_schemas.sensor import Battery, DriveFeedback
+
+MISSES: Final = 3
+"""Readings in a row that may fail before the session ends."""
+
+
+class IioBatteryDriver:
+    """Reads one channel at a fixed rate.
+
+    Args:
+        config: pack, converter, divider.
+        clock: time.
+        out: battery messages.
+        events: told when the battery's level changes.
+        drive: the motor's feedback, whose current explains the sag; None = not used.
+        root: the kernel's folder of converters.
+        offload: where files are read: a conversion over I2C takes milliseconds.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: IioConfig,
+        clock: Clock,
+        out: Publisher[Battery],
+        events: EventSink,
+        drive: Subscription[DriveFeedback] | None = None,
+        *,
+        root: Path = iio.ROOT,
+        offload: Offload = in_thread,
+        name: str = "battery",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._clock = clock
+        self._root = root
+        self._offload = offload
+        self._monitor = BatteryMonitor(config, out, events, name, drive)
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: no such converter, or it vanished.
+            DeviceMismatchError: it has no such channel, or several converters are there and none is named.
+            DeviceTimeoutError: it does not answer, three readings in a row.
+            ProtocolError: no numbers, three readings in a row.
+            PortBusyError: another process streams from it.
+        """
+        channel = await self._offload(self._find)
+        await self._offload(channel.read)
+        ready()
+        schedule = Schedule(self._clock, self._config.rate)
+        misses = 0
+        while True:
+            await schedule.next()
+            stamp = self._clock.now()
+            try:
+                raw = await self._offload(channel.read)
+            except (DeviceTimeoutError, ProtocolError):
+                misses += 1
+                if misses >= MISSES:
+                    raise
+                continue
+            misses = 0
+            volts = channel.volts(raw) * self._config.divider + self._config.offset
+            self._monitor.take(stamp, self._clock.now(), volts, at_limit=channel.at_limit(raw))
+
+    def _find(self) -> iio.Channel:
+        converter = iio.find(self._root, self._config.device)
+        return iio.channel(converter, self._config.channel, self._config.full_scale)

@@ -1,0 +1,135 @@
+"""The sysfs files of a converter with the battery's divider on one channel."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+PERIOD: Final = 0.02
+"""Seconds between two conversions."""
+
+
+class IioEmulator:
+    """A 12-bit converter, 1 mV a count, as the kernel shows it.
+
+    Faults (``inject``): ``zero on|off`` (upper resistor open), ``full on|off`` (lower resistor open), ``freeze
+    on|off``, ``garbage on|off``, ``bounce [SECONDS]`` (0 for 50 ms), ``noise LSB``, ``volts V`` (at the pin,
+    instead of the source), ``unplug``, ``plug``.
+
+    Args:
+        root: folder that stands for /sys/bus/iio/devices.
+        clock: time.
+        source: volts at the pin at an instant, ns.
+        seed: of the noise.
+        channel: input the divider hangs on.
+        device: the converter's name.
+        noise_lsb: standard deviation.
+    """
+
+    FULL_SCALE: Final = 4095
+
+    def __init__(
+        self,
+        root: Path,
+        clock: Clock,
+        source: Callable[[int], float],
+        *,
+        seed: int = 0,
+        channel: int = 0,
+        device: str = "mcp3208",
+        noise_lsb: float = 1.0,
+        name: str = "battery",
+    ) -> None:
+        self.name = name
+        self.folder = root / "iio:device0"
+        self._clock = clock
+        self._source = source
+        self._rng = np.random.default_rng(seed)
+        self._stem = f"in_voltage{channel}"
+        self._device = device
+        self._noise = noise_lsb
+        self._forced: str | None = None
+        self._bounce_until = 0
+        self.plug()
+
+    def plug(self) -> None:
+        """The kernel found the converter."""
+        elements = self.folder / "scan_elements"
+        elements.mkdir(parents=True, exist_ok=True)
+        (self.folder / "name").write_text(f"{self._device}\n")
+        (self.folder / "in_voltage_scale").write_text("1.000000000\n")
+        (elements / f"{self._stem}_type").write_text("be:u12/16>>0\n")
+        self.convert()
+
+    def unplug(self) -> None:
+        """The converter is gone."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the kernel shows it."""
+        return self.folder.exists()
+
+    async def run(self) -> None:
+        """Convert until cancelled."""
+        while True:
+            if self.plugged:
+                self.convert()
+            await self._clock.sleep(PERIOD)
+
+    def convert(self) -> None:
+        """One conversion becomes readable, at once and whole."""
+        now = self._clock.now()
+        text = self._forced
+        if now < self._bounce_until:
+            text = "0"
+        if text == "frozen":
+            return
+        if text is None:
+            counts = self._source(now) * 1000 + self._noise * float(self._rng.standard_normal())
+            text = str(int(np.clip(round(counts), 0, self.FULL_SCALE)))
+        scratch = self.folder / ".raw"
+        scratch.write_text(f"{text}\n")
+        scratch.replace(self.folder / f"{self._stem}_raw")
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        forced = {"zero": "0", "full": str(self.FULL_SCALE), "garbage": "-", "freeze": "frozen"}
+        try:
+            match fault, values:
+                case (("zero" | "full" | "garbage" | "freeze"), ("on",)):
+                    self._forced = forced[fault]
+                case (("zero" | "full" | "garbage" | "freeze"), ("off",)):
+                    self._forced = None
+                case "bounce", ():
+                    self._bounce(0.05)
+                case "bounce", (seconds,):
+                    self._bounce(float(seconds))
+                case "noise", (lsb,):
+                    self._noise = float(lsb)
+                case "volts", (volts,):
+                    level = float(volts)
+                    self._source = lambda _: level
+                case "unplug", ():
+                    self.unplug()
+                case "plug", ():
+                    self.plug()
+                case _:
+                    raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: zero|full|freeze|garbage "
+                "on|off, bounce [SECONDS], noise LSB, volts V, unplug, plug"
+            ) from error
+
+    def _bounce(self, seconds: float) -> None:
+        self._bounce_until = self._clock.now() + round(seconds * SECOND)
