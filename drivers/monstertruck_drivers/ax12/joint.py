@@ -207,7 +207,8 @@ class Joint:
 
     async def _settings(self, session: Session) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
-        data = (await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries=0)).data
+        answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries=0)
+        self._error, data = answer.error, answer.data
         self._check_at = self._clock.now() + round(self._config.check_interval * SECOND)
         return data[0], word(data, 8), word(data, 10)
 
