@@ -18,6 +18,8 @@ from monstertruck_schemas.usb import UsbNode, UsbTree
 
 BURST: Final = 0.02
 """Seconds in which announcements are gathered: a hub announces dozens at once."""
+IMPATIENT: Final = 0.5
+"""Seconds between two looks while somebody waits for a hub."""
 PERIOD: Final = SECOND
 """Nanoseconds between two trees when nothing changes."""
 
@@ -75,6 +77,7 @@ class UsbService:
         self._hubs.on_miss = self._wake.set
         try:
             await self._look()
+            self._publish()
             ready()
             while True:
                 if await self._woken() or self._clock.now() >= self._next_look():
@@ -103,7 +106,9 @@ class UsbService:
     async def _look(self) -> None:
         snapshot = await self._machine.beside(lambda: read_tree(self._machine.sysfs))
         self._hubs.update(snapshot)
-        self._look_at = self._clock.now() + round(self._config.rescan * SECOND)
+        # Who waits for a hub does not ask for a look, so without announcements one has to be quick oneself.
+        rescan = min(self._config.rescan, IMPATIENT) if self._hubs.waiting else self._config.rescan
+        self._look_at = self._clock.now() + round(rescan * SECOND)
         for node in self._hubs.tree():
             if node.role is not None and node.autosuspend and self._told_asleep.get(node.name) != node.replugs:
                 self._told_asleep[node.name] = node.replugs
