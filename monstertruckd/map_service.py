@@ -1,8 +1,5 @@
 """The picture of the path over the scan map: feeds the renderer's worker, saves what it draws."""
 
-import asyncio
-import logging
-from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -17,8 +14,6 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
 from monstertruckd.config.truck import MapRender, Mount
 from monstertruckd.workers.actor import WorkerActor
-
-log = logging.getLogger(__name__)
 
 TARGET = "monstertruckd.workers.map_render:MapRenderer"
 SPACING = 0.02
@@ -79,8 +74,10 @@ class MapService:
                 scans = self._new_scan()
                 outcome = self._tracker.latest.outcome if self._tracker.latest is not None else Reason.DRIVING
                 if self._config.picture is not None and outcome is not drawn and outcome is not Reason.DRIVING:
-                    outputs = await worker.step({"scans": scans, "render": self._picture(outcome)})
-                    await self._save(self._config.picture, outputs["png"])
+                    file = str(self._config.picture)
+                    outputs = await worker.step({"scans": scans, "render": self._picture(outcome), "file": file})
+                    if (error := outputs.get("error")) is not None:
+                        self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"picture not saved: {error}")
                 elif scans:
                     await worker.step({"scans": scans})
                 drawn = outcome
@@ -102,16 +99,3 @@ class MapService:
         along = f"{state.along:.2f} of {state.length:.2f} m" if state is not None else ""
         title = f"Path {path.name if path else ''} over the scan map"
         return {"title": title, "subtitle": f"{outcome.text}, {along}", "paths": paths}
-
-    async def _save(self, file: FilePath, png: bytes) -> None:
-        try:
-            await asyncio.to_thread(_write, file, png)
-        except OSError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"picture not saved: {error}")
-
-
-def _write(file: FilePath, data: bytes) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    scratch = file.with_name(file.name + ".new")
-    scratch.write_bytes(data)
-    scratch.replace(file)

@@ -15,9 +15,7 @@ class LogDigest:
     def update(self, key: str, stamp: int, payload: bytes) -> None:
         """Add one message; lengths are part of the digest, so no two runs share one by shifted borders."""
         name = key.encode()
-        self._hash.update(_FRAME.pack(stamp, len(name), len(payload)))
-        self._hash.update(name)
-        self._hash.update(payload)
+        self._hash.update(_FRAME.pack(stamp, len(name), len(payload)) + name + payload)
 
     def hexdigest(self) -> str:
         """64 hexadecimal digits of all messages so far."""

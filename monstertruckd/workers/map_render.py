@@ -5,14 +5,17 @@ A step's inputs are a dict:
 - ``scans``: list of (pose, points): sensor pose (x, y, yaw) in the map frame, m and rad; points shape (n, 2) in the
   sensor's frame, m;
 - ``render``: absent, or what to draw: ``title``, ``subtitle`` and ``paths``, a list of dicts with ``name``, ``poses``
-  (shape (n, 2) or (n, 3), map frame) and ``style``, a key of ``STYLES``.
+  (shape (n, 2) or (n, 3), map frame) and ``style``, a key of ``STYLES``;
+- ``file``: where to save the picture; the file appears complete or not at all.
 
-Its outputs are a dict: ``scans``, how many were taken in since the start, and ``png``, the picture, if asked for.
+Its outputs are a dict: ``scans``, how many were taken in since the start, and, of a picture, ``png`` (or ``error``, why
+it could not be saved).
 """
 
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,7 +74,19 @@ class MapRenderer:
         outputs: dict[str, Any] = {"scans": self._scans}
         if (wish := inputs.get("render")) is not None:
             outputs["png"] = render(self._raster, **wish)
+            if (file := inputs.get("file")) is not None:
+                try:
+                    _save(Path(file), outputs["png"])
+                except OSError as error:
+                    outputs["error"] = str(error)
         return outputs
+
+
+def _save(file: Path, data: bytes) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    scratch = file.with_name(file.name + ".new")
+    scratch.write_bytes(data)
+    scratch.replace(file)
 
 
 def render(

@@ -65,3 +65,26 @@ async def test_wall_clock_is_monotonic_and_knows_real_time():
     await clock.sleep(0.01)
     assert clock.now() - before >= 9_000_000
     assert clock.now() + clock.real_offset() > 1_700_000_000 * SECOND
+
+
+def test_timers_of_one_instant_fire_in_the_order_they_were_set():
+    async def main(clock: VirtualClock) -> list[int]:
+        fired: list[int] = []
+        loop = asyncio.get_running_loop()
+        due = loop.time() + 1
+        for number in range(50):
+            loop.call_at(due, fired.append, number)
+        await clock.sleep(2)
+        return fired
+
+    assert run_virtual(main) == list(range(50))
+
+
+def test_another_thread_reaches_the_loop_with_and_without_timers():
+    async def main(clock: VirtualClock) -> tuple[str, str]:
+        ticking = asyncio.create_task(clock.sleep(1e9))
+        with_timers = await asyncio.to_thread(lambda: "a")
+        ticking.cancel()
+        return with_timers, await asyncio.to_thread(lambda: "b")
+
+    assert run_virtual(main) == ("a", "b")
