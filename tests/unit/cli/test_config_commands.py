@@ -1,0 +1,124 @@
+"""`check-config` and `topics` as a user sees them: one clear line per mistake, exit code 2."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from monstertruck_schemas.topics import TOPICS
+from monstertruckd.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[3]
+SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["monstertruckd", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize("config", SHIPPED, ids=lambda path: path.name)
+def test_every_shipped_configuration_is_accepted(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run(monkeypatch, "check-config", str(config)) == 0
+    out = capsys.readouterr().out
+    assert f"{config}:" in out, "every value shows its origin"
+    assert " default" in out
+
+
+def test_json_output_has_values_and_origins(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "check-config", "--json", str(ROOT / "configs" / "demo.yaml")) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["config"]["geometry"]["wheelbase"] == 0.32
+    assert shown["origins"]["geometry.wheelbase"].endswith("truck.yaml:6")
+
+
+TRUCK = """version: 1
+devices:
+  lidar: {port: {path: /dev/a}, driver: {kind: hokuyo_urg}}
+  compass: {port: {path: /dev/b}, driver: {kind: os4000}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "said"),
+    [
+        (TRUCK + "gaet: {}\n", "bad.yaml:5: gaet: unknown key (did you mean gate?)", ""),
+        (
+            TRUCK + "gate: {acceleraton: 1}\n",
+            "gate.acceleraton: unknown key (did you mean acceleration?)",
+            "",
+        ),
+        (
+            TRUCK + "geometry: {wheelbase: 32 cm}\n",
+            "bad.yaml:5: geometry.wheelbase: ",
+            "Metres between front and rear",
+        ),
+        (
+            TRUCK + "geometry: {wheelbase: 32}\n",
+            "bad.yaml:5: geometry.wheelbase: ",
+            "Metres between front and rear",
+        ),
+        (TRUCK + "path: {file: nowhere.csv}\n", "bad.yaml:5: path.file: no such file: ", "nowhere.csv"),
+        ("include: gone.yaml\n" + TRUCK, "bad.yaml:1: include: no such file: ", "gone.yaml"),
+        (TRUCK.replace("/dev/b", "/dev/a"), "bad.yaml:2: devices: lidar and compass share the port /dev/a", "its own"),
+        (TRUCK + "geometry: {length: 0.3}\n", "bad.yaml:5: geometry: impossible geometry", "less than the wheelbase"),
+        (TRUCK + "geometry: {width: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "less than the track"),
+        (TRUCK + "geometry: {wheel_radius: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "touch"),
+        (TRUCK.replace("hokuyo_urg", "sick"), "bad.yaml:3: devices.lidar.driver.kind: ", "hokuyo_urg"),
+        (TRUCK + "tracker: {kind: pure_pursuit}\n", "a tracker needs the devices drive and steering", ""),
+        (TRUCK + "sim: {world: {map: loop, gravity: 1}}\n", "bad.yaml:5: sim.world.gravity: unknown key", ""),
+    ],
+)
+def test_a_mistake_is_one_clear_line_and_exit_code_2(
+    text: str,
+    where: str,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(text)
+    assert run(monkeypatch, "check-config", str(bad)) == 2
+    streams = capsys.readouterr()
+    assert streams.out == ""
+    assert len(streams.err.strip().splitlines()) == 1
+    assert where in streams.err
+    assert said in streams.err
+
+
+def test_the_gate_may_not_promise_more_braking_than_the_drive_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    config = tmp_path / "brave.yaml"
+    config.write_text(
+        f"include: {ROOT}/configs/truck.yaml\nversion: 1\ngate: {{deceleration: 1.15, quick_deceleration: 5}}\n"
+    )
+    assert run(monkeypatch, "check-config", str(config)) == 2
+    assert "90000 rpm/s, which is 1.10 m/s^2" in capsys.readouterr().err
+
+
+def test_topics_prints_every_row(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setenv("COLUMNS", "160")
+    assert run(monkeypatch, "topics") == 0
+    out = capsys.readouterr().out
+    assert all(topic.name in out for topic in TOPICS)
+    assert run(monkeypatch, "topics", "--json") == 0
+    assert [row["name"] for row in json.loads(capsys.readouterr().out)] == [topic.name for topic in TOPICS]
+
+
+def test_unknown_device_and_topic_are_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "probe", "toaster", "--port", "/dev/null") == 3
+    assert "unknown device 'toaster'; known: hokuyo_urg (lidar)" in capsys.readouterr().err
+    assert run(monkeypatch, "echo", "sensor/smell") == 4
+    assert "no topic 'sensor/smell'" in capsys.readouterr().err
+
+
+def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out.strip().count(".") == 2
