@@ -1,0 +1,1 @@
+"""Behaviours beside driving along a path: keeping the lidar level."""
