@@ -37,8 +37,11 @@ STATE_STYLE = {
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
 LIDAR = (0.14, 0.0, 0.0)
 """Mount assumed by the picture; the robot's own transforms are not needed for a screen of this grain."""
-VIEW_METRES = 2.4
-"""Half the width of the scan view."""
+VIEW_METRES = 2.6
+"""Least distance the scan view shows ahead and to each side."""
+WIDE = 104
+HORIZON = 0.72
+"""Where the truck stands in the scan view, from the top: the lidar looks ahead."""
 
 
 @dataclass(slots=True)
@@ -90,15 +93,15 @@ class ScreenState:
                 pass
 
 
-def draw(state: ScreenState) -> RenderableType:
-    """The whole screen."""
+def draw(state: ScreenState, width: int) -> RenderableType:
+    """The whole screen; a terminal narrower than ``WIDE`` columns gets no scan view."""
     layout = Layout()
     layout.split_column(Layout(name="top", ratio=1), Layout(_events(state), name="events", size=8))
-    layout["top"].split_row(
-        Layout(_truck(state), name="truck", size=34),
-        Layout(Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim"), name="scan"),
-        Layout(_services(state), name="services", size=40),
-    )
+    parts = [Layout(_truck(state), size=40), Layout(_services(state), size=34 if width >= WIDE else None)]
+    if width >= WIDE:
+        scan = Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")
+        parts.insert(1, Layout(scan))
+    layout["top"].split_row(*parts)
     return layout
 
 
@@ -127,8 +130,8 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "battery", f"{volts} {state.battery.level.value}")
     if state.tracker is not None:
         done = state.tracker.along / state.tracker.length if state.tracker.length else 0.0
-        bar = "█" * round(done * 14)
-        _row(table, "path", f"{bar:░<14} {done:4.0%}")
+        bar = "█" * round(done * 16)
+        _row(table, "path", f"{bar:░<16} {done:4.0%}")
         _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
     if state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
@@ -173,7 +176,7 @@ class _Braille:
     def __rich_console__(self, _console: object, options: object) -> "list[Text]":
         width: int = getattr(options, "max_width", 60)
         height: int = getattr(options, "height", None) or 20
-        scale = min(width * 2, height * 4) / (2 * VIEW_METRES)
+        scale = min(width, height * 4 * HORIZON) / VIEW_METRES
         cells = np.zeros((height, width), np.uint8)
         if self._state.scan is not None:
             _plot(cells, scan_points(self._state.scan, LIDAR), scale)
@@ -184,7 +187,8 @@ class _Braille:
             for bits, trail_bits in zip(row.tolist(), trail.tolist(), strict=True):
                 style = "green" if trail_bits and not bits else "cyan"
                 line.append(chr(0x2800 + (bits | trail_bits)), style=style)
-        lines[height // 2].plain = _with_arrow(lines[height // 2].plain, width // 2)
+        truck = lines[int(height * HORIZON)]
+        truck.plain = _with_arrow(truck.plain, width // 2)
         return lines
 
 
@@ -206,10 +210,10 @@ _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.ui
 
 
 def _plot(cells: NDArray[np.uint8], points: NDArray[np.float64], scale: float) -> None:
-    """Set the braille dots of ``points`` (x forward = up, y left = left) around the middle of ``cells``."""
+    """Set the braille dots of ``points`` (x forward = up, y left = left) around the truck's place in ``cells``."""
     height, width = cells.shape
     column = np.round(width - points[:, 1] * scale).astype(int)
-    row = np.round(height * 2 - points[:, 0] * scale).astype(int)
+    row = np.round((int(height * HORIZON) + 0.5) * 4 - points[:, 0] * scale).astype(int)
     inside = (column >= 0) & (column < width * 2) & (row >= 0) & (row < height * 4)
     row, column = row[inside], column[inside]
     np.bitwise_or.at(cells, (row // 4, column // 2), _BITS[row % 4, column % 2])

@@ -64,7 +64,7 @@ async def watch(clock: Clock, robot: str, endpoint: str) -> None:
         try:
             with Live(console=Console(), screen=True, auto_refresh=False) as live:
                 while True:
-                    live.update(draw(follower.state), refresh=True)
+                    live.update(draw(follower.state, live.console.width), refresh=True)
                     await clock.sleep(PERIOD)
         finally:
             task.cancel()

@@ -155,7 +155,7 @@ async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:
             await following
         with Live(console=Console(), screen=True, auto_refresh=False) as live:
             while True:
-                live.update(draw(follower.state), refresh=True)
+                live.update(draw(follower.state, live.console.width), refresh=True)
                 await clock.sleep(PERIOD)
     finally:
         following.cancel()

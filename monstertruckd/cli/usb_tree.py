@@ -1,0 +1,104 @@
+"""The USB tree of a robot or of this machine, drawn or as a table."""
+
+from collections.abc import Iterable
+
+from rich.text import Text
+from rich.tree import Tree
+
+from monstertruck_drivers.usb.config import UsbConfig
+from monstertruck_drivers.usb.hub import HubCoordinator
+from monstertruck_drivers.usb.sysfs import Sysfs
+from monstertruck_drivers.usb.tree import parent_of, port_of, read_tree, sort_key
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NotFoundError
+from monstertruck_schemas.topics import USB
+from monstertruck_schemas.usb import UsbNode, UsbState
+
+STATE_STYLE = {
+    UsbState.PRESENT: "green",
+    UsbState.ABSENT: "bold red",
+    UsbState.WAITING: "yellow",
+    UsbState.HELD: "bold red",
+}
+
+
+async def robot_tree(clock: Clock, robot: str, endpoint: str) -> tuple[UsbNode, ...]:
+    """Tree a running robot published last.
+
+    Raises:
+        NotFoundError: the robot is not there, or watches no USB tree.
+    """
+    async with TruckClient(robot, endpoint, clock=clock) as client:
+        tree = await client.get_retained(USB)
+    if tree is None:
+        raise NotFoundError(f"robot {robot!r} watches no USB tree (simulated robots have none); --local shows this one")
+    return tree.nodes
+
+
+async def local_tree(clock: Clock) -> tuple[UsbNode, ...]:
+    """Tree of this machine as it is now; roles and replugs are known to a daemon only."""
+    hubs = HubCoordinator(UsbConfig(), {}, clock, lambda *_, **__: None)
+    hubs.update(read_tree(Sysfs()))
+    return hubs.tree()
+
+
+def draw(nodes: Iterable[UsbNode]) -> list[Tree]:
+    """One tree per bus; a hub nobody has seen yet shows by its name."""
+    rows = {node.name: node for node in nodes}
+    trees: dict[str, Tree] = {}
+    roots = []
+
+    def branch(name: str) -> Tree:
+        if name not in trees:
+            parent = parent_of(name)
+            label = _label(name, rows.get(name))
+            trees[name] = Tree(label) if parent is None else branch(parent).add(label)
+            if parent is None:
+                roots.append(trees[name])
+        return trees[name]
+
+    for name in sorted(rows, key=sort_key):
+        branch(name)
+    return roots
+
+
+def _label(name: str, node: UsbNode | None) -> Text:
+    label = Text(name if parent_of(name) is None else f"port {port_of(name)}", style="dim")
+    if node is None:
+        return label.append(f"  {name} never seen", style=STATE_STYLE[UsbState.ABSENT])
+    if node.hub:
+        label.append(f"  hub {name}", style="bold")
+    if node.role is not None:
+        label.append(f"  {node.role}", style="bold cyan")
+    label.append(f"  {' '.join(part for part in (node.title, node.usb_id, node.tty) if part)}", style="default")
+    label.append(f"  {node.state.value}", style=STATE_STYLE[node.state])
+    for remark in _remarks(node):
+        label.append(f"  {remark}", style="yellow")
+    return label
+
+
+def _remarks(node: UsbNode) -> list[str]:
+    remarks = []
+    if node.replugs:
+        remarks.append(f"{node.replugs} replug{'s' if node.replugs > 1 else ''}")
+    if node.over_current:
+        remarks.append(f"over-current {node.over_current}")
+    if node.autosuspend and not node.hub:
+        remarks.append("may be suspended")
+    if node.latency_ms is not None:
+        remarks.append(f"latency {node.latency_ms} ms")
+    return remarks
+
+
+def plain(nodes: Iterable[UsbNode]) -> list[str]:
+    """The tree as a table, for pipes: hub, port, role, state, replugs, USB id, node, remarks, product."""
+    lines = [f"{'hub':10} {'port':4} {'role':11} {'state':8} {'replugs':7} {'id':9} {'node':9} device"]
+    for node in nodes:
+        hub, port = node.parent or node.name, port_of(node.name) or "-"
+        remarks = "".join(f", {remark}" for remark in _remarks(node) if "replug" not in remark)
+        lines.append(
+            f"{hub:10} {port:<4} {node.role or '-':11} {node.state.value:8} {node.replugs:<7} {node.usb_id or '-':9} "
+            f"{node.tty or '-':9} {node.title or '-'}{remarks}"
+        )
+    return lines

@@ -1,0 +1,110 @@
+"""The live screen draws whatever there is, in any terminal."""
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
+from monstertruck_schemas.plan import TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+from monstertruckd.cli.screen import ScreenState, draw
+from monstertruckd.cli.watch import plain
+
+HEADER = {"stamp": 10**9, "received": 10**9, "seq": 0}
+
+
+def full() -> ScreenState:
+    state = ScreenState("truck", started=0, now=3 * 10**9)
+    ranges = np.full(682, 1.5)
+    ranges[::7] = np.inf
+    for message in (
+        GateState(
+            **HEADER,
+            mode=GateMode.DRIVING,
+            nonce="n",
+            holder="tracker",
+            role=Role.TRACKER,
+            lease_left=0.2,
+            speed_limit=0.08,
+            reasons=(Reason.TILT_SLOW,),
+        ),
+        Odometry(
+            **HEADER,
+            pose=Pose2D(x=1.25, y=-0.5, yaw=0.5),
+            twist=Twist2D(vx=-0.1, vy=0.0, wz=0.0),
+            pose_covariance=np.zeros(9),
+            twist_covariance=np.zeros(9),
+            age=0.0,
+        ),
+        LaserScan(
+            **HEADER,
+            start_angle=-2.09,
+            end_angle=2.09,
+            time_increment=1e-4,
+            scan_time=0.1,
+            range_min=0.02,
+            range_max=5.6,
+            ranges=ranges,
+            codes=np.full(682, 255, np.uint8),
+        ),
+        Attitude(**HEADER, heading=1.0, roll=0.1, pitch=0.2),
+        Battery(**HEADER, voltage=None, raw_voltage=0.0, cells=6, level=BatteryLevel.SENSOR_FAULT),
+        TrackerState(
+            **HEADER, cross_track=0.012, heading_error=0.0, along=5.0, length=10.0, outcome=Reason.DRIVING, path="loop"
+        ),
+        HealthTable(
+            **HEADER,
+            services=(
+                ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=0, restarts=3, detail="unplugged"),
+            ),
+        ),
+        LoopHealth(**HEADER, ticks=5, lateness_p50=0.0, lateness_p99=0.0012, lateness_max=0.01),
+        RecorderHealth(**HEADER, recording=False, reason=Reason.DISK_FULL),
+        Event(**HEADER, reason=Reason.TILT_SLOW, severity=Severity.WARNING, source="gate"),
+    ):
+        state.take(message)
+    return state
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (103, 30), (104, 30), (200, 60), (20, 5)])
+@pytest.mark.parametrize("state", [full(), ScreenState("truck", 0)], ids=["full", "empty"])
+def test_it_fits_the_terminal(state: ScreenState, width: int, height: int):
+    console = Console(width=width, height=height, record=True, force_terminal=True, color_system="truecolor")
+    console.print(draw(state, width), height=height)
+    lines = console.export_text().splitlines()
+    assert len(lines) <= height
+    assert max(map(len, lines)) <= width
+
+
+def test_it_shows_what_matters():
+    console = Console(width=140, height=40, record=True)
+    console.print(draw(full(), 140), height=40)
+    text = console.export_text()
+    for words in (
+        "DRIVING",
+        "tracker (tracker)",
+        "tilted: speed limited",
+        "+1.25 -0.50 m",
+        "-0.10 m/s",
+        "sensor_fault",
+        "50%",
+        "+1.2 cm",
+        "NOT RECORDING: no space left",
+        "backoff",
+        "1.00 s  gate: tilted",
+        "▲",
+    ):
+        assert words in text
+    assert any(0x2800 < ord(sign) < 0x2900 for sign in text), "the scan is drawn"
+
+
+def test_plain_words_for_pipes():
+    text = "\n".join(plain(full()))
+    assert "driving, driver tracker, why tilt_slow" in text
+    assert "lidar        backoff   restarts 3 lost" in text
+    assert plain(ScreenState("truck", 0)) == []
