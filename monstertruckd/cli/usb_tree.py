@@ -32,7 +32,7 @@ async def robot_tree(clock: Clock, robot: str, endpoint: str) -> tuple[UsbNode, 
     async with TruckClient(robot, endpoint, clock=clock) as client:
         tree = await client.get_retained(USB)
     if tree is None:
-        raise NotFoundError(f"robot {robot!r} watches no USB tree (simulated robots have none); --local shows this one")
+        raise NotFoundError(f"robot {robot!r} watches no USB tree; --local shows this machine's")
     return tree.nodes
 
 

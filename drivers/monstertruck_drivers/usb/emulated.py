@@ -6,19 +6,19 @@ nodes lead to emulated ports; so everything above runs as on a robot, on either 
 
 import errno
 import shutil
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from monstertruck_drivers.link import EmulatedPort, MemoryPort, Port, SerialPort
 from monstertruck_drivers.pty_port import PtyPort
-from monstertruck_drivers.usb.sysfs import Machine, Sysfs
+from monstertruck_drivers.usb.machine import Machine
+from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, sort_key
 from monstertruck_runtime.clock import Clock
-
-T = TypeVar("T")
+from monstertruck_runtime.threads import inline
 
 FTDI_LATENCY: Final = 16
 ENUMERATION: Final = 0.12
@@ -89,7 +89,7 @@ class EmulatedUsb:
 
     def machine(self, clock: Clock) -> Machine:
         """What the code under test takes for its computer."""
-        return Machine(clock, self.sysfs, self.dev, _inline, self._run, self._serial)
+        return Machine(clock, self.sysfs, self.dev, inline, self._run, self._serial)
 
     # What there is
 
@@ -337,10 +337,3 @@ class _EmulatedSysfs(Sysfs):
 
 def _interface_prefix(name: str) -> str:
     return f"{name[3:]}-0" if name.startswith("usb") else name
-
-
-def _inline(function: Callable[[], T]) -> Awaitable[T]:
-    async def call() -> T:
-        return function()
-
-    return call()

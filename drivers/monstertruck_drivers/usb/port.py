@@ -6,8 +6,8 @@ from monstertruck_drivers.link import Link
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.ftdi import ADVICE, set_latency
 from monstertruck_drivers.usb.hub import HubCoordinator
+from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.power import PortPower
-from monstertruck_drivers.usb.sysfs import Machine
 from monstertruck_drivers.usb.tree import Node, place, read_device
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import BusyError, DeviceError, DeviceLostError, PortBusyError, WrongDeviceError

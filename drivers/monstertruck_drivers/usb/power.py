@@ -4,7 +4,7 @@ import contextlib
 from typing import Final
 
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig
-from monstertruck_drivers.usb.sysfs import Machine
+from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.tree import DEVICES, parent_of, place, port_directory, port_of, read_device
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import BusyError, DeviceError

@@ -6,8 +6,8 @@ from typing import Final
 
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_drivers.usb.hub import NAME, HubCoordinator
+from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.power import keep_awake
-from monstertruck_drivers.usb.sysfs import Machine
 from monstertruck_drivers.usb.tree import place, read_tree
 from monstertruck_drivers.usb.watch import Watcher
 from monstertruck_runtime.clock import SECOND

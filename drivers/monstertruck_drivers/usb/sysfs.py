@@ -1,16 +1,6 @@
-"""Small reads and writes in sysfs, and the machine they belong to."""
+"""Small reads and writes in sysfs."""
 
-import asyncio
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeVar
-
-from monstertruck_drivers.link import Port, SerialPort
-from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.threads import in_thread
-
-T = TypeVar("T")
 
 
 class Sysfs:
@@ -51,45 +41,3 @@ class Sysfs:
         """
         with (self.root / path).open("r+") as attribute:  # an attribute is never created
             attribute.write(text)
-
-
-class Beside(Protocol):
-    """Runs a blocking function where it does not hold up the loop."""
-
-    def __call__(self, function: Callable[[], T], /) -> Awaitable[T]:
-        """Result of ``function()``."""
-        ...
-
-
-async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
-    """Run a program without a shell.
-
-    Returns:
-        Its exit code and what it printed.
-
-    Raises:
-        OSError: it cannot be started.
-    """
-    process = await asyncio.create_subprocess_exec(
-        *arguments, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
-    )
-    try:
-        output, _ = await process.communicate()
-    except asyncio.CancelledError:
-        process.kill()
-        await process.wait()
-        raise
-    return process.returncode or 0, output.decode(errors="replace").strip()
-
-
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """The computer the hubs are plugged into; an emulated one stands in for it in tests."""
-
-    clock: Clock
-    sysfs: Sysfs = field(default_factory=Sysfs)
-    dev: Path = Path("/dev")
-    beside: Beside = in_thread
-    run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
-    serial: Callable[[Path, int], Port] = SerialPort
-    """A serial node and a baud rate to a port."""

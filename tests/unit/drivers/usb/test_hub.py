@@ -1,15 +1,20 @@
 """Losses are grouped by hub, and what comes back starts in order of safety, spaced apart."""
 
 import asyncio
+import contextlib
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_drivers.usb.tree import DEVICES
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.ports import Ready
+from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.usb import UsbState
 from tests.unit.drivers.usb.rig import PORTS, Bench, play
@@ -90,6 +95,37 @@ def test_waiting_devices_are_not_retried(tmp_path: Path):
         await bench.usb.return_hub("1-1", bench.clock)
         link = await opening
         link.close()
+
+    play(tmp_path, scene)
+
+
+def test_an_outage_costs_a_supervised_driver_one_restart(tmp_path: Path):
+    class Driver:
+        name = "lidar"
+
+        def __init__(self, bench: Bench) -> None:
+            self._port = bench.ports["lidar"]
+
+        async def run(self, ready: Ready) -> None:
+            async with await self._port.open() as link:
+                ready()
+                await link.read()
+
+    rows: list[ServiceHealth] = []
+
+    async def scene(bench: Bench) -> None:
+        rng = np.random.default_rng(0)
+        task = asyncio.create_task(supervise(Driver(bench), RestartPolicy(), bench.clock, rows.append, rng))
+        await bench.clock.sleep(1)
+        bench.usb.lose_hub("1-1")
+        await bench.clock.sleep(300)
+        assert (rows[-1].state, rows[-1].restarts) == (ServiceState.STARTING, 1)
+        await bench.usb.return_hub("1-1", bench.clock)
+        await bench.clock.sleep(3)
+        assert (rows[-1].state, rows[-1].restarts) == (ServiceState.READY, 1)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
     play(tmp_path, scene)
 
