@@ -245,6 +245,8 @@ class DeviceEnd:
         self.faults = LineFaults()
         self.on_plug: Callable[[bool], None] | None = None
         """Told True/False when the cable is plugged/unplugged."""
+        self.on_bytes: Callable[[bool, bytes], None] | None = None
+        """Told of all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
         self._received = Link(name, lambda _: None, _nothing)
         self._out_free = 0.0
         self._in_free = 0.0
@@ -281,10 +283,14 @@ class DeviceEnd:
 
     def _emit(self, data: bytes) -> None:
         if self._deliver is not None and not self.faults.stalled:
+            if self.on_bytes is not None:
+                self.on_bytes(False, data)
             self._deliver(data)
 
     def _accept(self, data: bytes) -> None:
         if not self.faults.deaf:
+            if self.on_bytes is not None:
+                self.on_bytes(True, data)
             self._received.feed(data)
 
 

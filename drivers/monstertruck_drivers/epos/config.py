@@ -25,9 +25,10 @@ class EposConfig(Schema):
     max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 18_000
     """Set points are limited to this; also written to the controller as its own limit."""
     acceleration_rpm_s: RpmPerSecond = 60_000
-    deceleration_rpm_s: RpmPerSecond = 90_000
-    quick_stop_deceleration_rpm_s: RpmPerSecond = 100_000
-    """From full speed to rest in 0.18 s."""
+    deceleration_rpm_s: RpmPerSecond = 200_000
+    """2.4 m/s^2, less than what makes the slipper clutch slip; the wheels follow the motor some 0.1 s later."""
+    quick_stop_deceleration_rpm_s: RpmPerSecond = 240_000
+    """From full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
     """Encoder pulses per motor turn (counts / 4); None = believe the controller's own setting."""

@@ -134,6 +134,8 @@ class _Session:
         self._fault: int | None = None
         self._stopping = False
         """The quick stop that is wanted now was sent."""
+        self._told_off = False
+        """The power stage was switched off by this host."""
         self._prepared = False
         """Mode and profile are those configured."""
         self._commands_after = self._clock.now()
@@ -286,7 +288,7 @@ class _Session:
         was, self._state = self._state, state_of(await self._read(od.STATUSWORD))
         if self._state in OFF and was not in OFF:
             self._prepared = False
-        if was is State.ENABLED and self._state in OFF:
+        if was is State.ENABLED and self._state in OFF and not self._told_off:
             raise DeviceLostError("the controller restarted")
         if self._state in FAULTED:
             await self._attend_fault()
@@ -317,6 +319,7 @@ class _Session:
             await self._control(control)
 
     async def _control(self, control: Control) -> None:
+        self._told_off = control is Control.DISABLE_VOLTAGE
         try:
             await self._line.write(od.CONTROLWORD, control)
         except ObjectError as error:
