@@ -17,12 +17,10 @@ GAP: Final = 100e-6
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A status packet with the instants, ns, between which the unit spoke."""
+    """What a status packet told."""
 
     error: Alarm
     data: bytes
-    asked: int
-    received: int
 
 
 class Session:
@@ -58,7 +56,7 @@ class Session:
             request = protocol.read(unit, protocol.MODEL_NUMBER, 3)
             heard = await self._exchange(request, 3, lambda packet: len(packet.params) in (2, 3))
             if heard is not None:
-                self.echo = heard[0].encode() == request
+                self.echo = heard.encode() == request
                 return
 
     async def ping(self, unit: int, retries: int = RETRIES) -> Alarm:
@@ -108,24 +106,21 @@ class Session:
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
         for attempt in range(1 + retries):
-            heard = await self._exchange(
+            packet = await self._exchange(
                 request, count, lambda packet: packet.unit == unit and len(packet.params) in (count, 0)
             )
-            if heard is None:
+            if packet is None:
                 continue
-            packet, asked, received = heard
             error = Alarm(packet.code)
             if Alarm.CHECKSUM in error and attempt < retries:
                 continue
             if len(packet.params) != count:
                 raise ProtocolError(f"{self._link.name}: unit {unit} gave no data: {alarm_names(error)} error")
-            return Answer(error, packet.params, asked, received)
+            return Answer(error, packet.params)
         raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
 
-    async def _exchange(
-        self, request: bytes, count: int, wanted: Callable[[Packet], bool]
-    ) -> tuple[Packet, int, int] | None:
-        """Send a request; the first wanted packet with the instants of asking and hearing, or None.
+    async def _exchange(self, request: bytes, count: int, wanted: Callable[[Packet], bool]) -> Packet | None:
+        """Send a request; the first wanted packet, or None when time is up.
 
         Args:
             request: whole packet.
@@ -134,7 +129,6 @@ class Session:
         """
         await self._clock.sleep_until(self._quiet_until)
         self._link.discard()
-        asked = self._clock.now()
         self._link.write(request)
         # A damaged length must not make the parser wait for more than can come.
         parser = Parser(longest=max(len(request) - 4, count + 2))
@@ -143,13 +137,12 @@ class Session:
             async with self._clock.deadline(self._timeout(len(request) + 6 + count)):
                 while True:
                     data = await self._link.read()
-                    received = self._clock.now()
                     self.strange += len(data)
                     for packet in parser.feed(data):
                         self.strange -= len(packet.params) + 6
                         if echo_due and packet.encode() == request:
                             echo_due = False
                         elif wanted(packet):
-                            return packet, asked, received
+                            return packet
         except TimeoutError:
             return None

@@ -211,6 +211,8 @@ class Unit:
     def angles(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Shaft in steps at instants of the last seconds (or, beyond, the nearest known)."""
         self.advance(int(times_ns.max()))
+        if times_ns.min() >= self._time:
+            return np.full(times_ns.shape, self.position)
         past = np.array(self._past)
         return np.asarray(np.interp(times_ns.astype(np.float64), past[:, 0], past[:, 1]))
 

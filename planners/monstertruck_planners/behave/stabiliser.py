@@ -25,6 +25,7 @@ from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
@@ -185,21 +186,15 @@ class StabiliserService:
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""
         ready()
-        period = round(SECOND / self._config.rate)
+        schedule = Schedule(self._clock, self._config.rate)
         tilt, joints, seen = TiltFilter(self._config), SQUARE, None
-        due = self._clock.now()
         while True:
+            await schedule.next()
             reading = self._compass.latest
             if reading is not None and reading is not seen:
                 tilt.observe(reading)
                 seen = reading
             now = self._clock.now()
-            joints = goals(tilt.tilt(now), joints, period / SECOND, self._config)
-            self._out.put(
-                StabiliserCommand(
-                    stamp=now, received=now, seq=self._out.next_seq(), pitch=joints.pitch, roll=joints.roll
-                )
-            )
-            # Stays on the grid; goals that were missed are not made up for.
-            due += period * max(1, -((due - self._clock.now()) // period))
-            await self._clock.sleep_until(due)
+            joints = goals(tilt.tilt(now), joints, 1 / self._config.rate, self._config)
+            seq = self._out.next_seq()
+            self._out.put(StabiliserCommand(stamp=now, received=now, seq=seq, pitch=joints.pitch, roll=joints.roll))

@@ -516,6 +516,30 @@ def test_a_hot_joint_is_left_to_cool():
     on_bench(test, FAST.model_copy(update={"alarm": ALARM}))
 
 
+def test_torque_that_does_not_come_back_is_tried_again_ever_later():
+    """The unit's own limit (70) is below the configured one: it shuts down at once."""
+
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.bus.inject("heat", "1", "78")
+            await rig.settle(0.2)
+            rig.bus.received.clear()
+            tried: list[float] = []
+            for _ in range(800):
+                await rig.settle(0.01)
+                if any(packet.params[:1] == bytes((p.GOAL_POSITION.address,)) for packet in requests(rig)):
+                    tried.append(rig.clock.now() / SECOND)
+                rig.bus.received.clear()
+            assert [after - before for before, after in pairwise(tried)] == pytest.approx([2.0, 4.0], abs=0.1)
+            assert rig.out.kept[-1].pitch_joint.torque is TorqueState.LIMP
+        errors = [event for event in rig.events.kept if event[1] is Severity.ERROR]
+        assert len(errors) == 1, "one outage, one report"
+
+    alarm = ALARM.model_copy(update={"cool_below": 90})
+    on_bench(test, FAST.model_copy(update={"alarm": alarm}))
+
+
 def test_a_hot_unit_is_not_given_torque_at_the_start():
     async def test(rig: Rig) -> None:
         rig.bus.inject("heat", "1", "68")
