@@ -162,6 +162,7 @@ class GateService:
                 rear=output.rear,
                 front_servo=output.front_servo,
                 rear_servo=output.rear_servo,
+                deadman=Reason.DRIVE_STALE not in output.reasons,
             )
         )
         for event in output.events:

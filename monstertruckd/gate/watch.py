@@ -21,6 +21,14 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruckd.gate.config import GateConfig, SensorLimit, TiltLimits
 
+SENSOR_SERVICES: Final = {
+    "lidar": Reason.SCAN_STALE,
+    "compass": Reason.ATTITUDE_STALE,
+    "drive": Reason.DRIVE_STALE,
+    "steering": Reason.STEERING_STALE,
+}
+"""Services whose reported loss ends the worth of their samples at once."""
+
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
@@ -53,6 +61,7 @@ class Watch:
         self._attitude: Attitude | None = None
         self._battery: Battery | None = None
         self._failed: tuple[str, ...] = ()
+        self._lost: dict[Reason, int] = {}
         self._tilt = _Tilt(config.tilt)
 
     def observe_scan(self, scan: LaserScan) -> bool:
@@ -83,7 +92,10 @@ class Watch:
             self._battery = battery
 
     def observe_health(self, table: HealthTable) -> None:
-        """Take the services' health."""
+        """Take the services' health: samples from before a service was lost no longer count."""
+        for row in table.services:
+            if row.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(row.name)) is not None:
+                self._lost[stale] = row.since
         self._failed = tuple(
             row.name
             for row in table.services
@@ -93,21 +105,22 @@ class Watch:
     def _good(self, message: Message) -> bool:
         return abs(message.received - message.stamp) <= self._config.max_latency * SECOND
 
-    @staticmethod
-    def _fresh(message: Message | None, limit: SensorLimit, now: int) -> bool:
-        return message is not None and now - message.received <= limit.stale_after * SECOND
+    def _fresh(self, message: Message | None, limit: SensorLimit, now: int, stale: Reason) -> bool:
+        if message is None or message.received <= self._lost.get(stale, -1):
+            return False
+        return now - message.received <= limit.stale_after * SECOND
 
     def scan_fresh(self, now: int) -> bool:
         """Whether the scan still counts."""
-        return self._fresh(self.scan, self._config.scan, now)
+        return self._fresh(self.scan, self._config.scan, now, Reason.SCAN_STALE)
 
     def steering_fresh(self, now: int) -> bool:
         """Whether the steering feedback still counts."""
-        return self._fresh(self.steering, self._config.steering, now)
+        return self._fresh(self.steering, self._config.steering, now, Reason.STEERING_STALE)
 
     def speed(self, now: int) -> float | None:
         """Measured speed of the wheels over ground, m/s; None without fresh feedback."""
-        if self.drive is None or not self._fresh(self.drive, self._config.drive, now):
+        if self.drive is None or not self._fresh(self.drive, self._config.drive, now, Reason.DRIVE_STALE):
             return None
         return self._drivetrain.speed(self.drive.velocity)
 
@@ -139,9 +152,9 @@ class Watch:
             (self._attitude, config.attitude, Reason.ATTITUDE_STALE),
             (self._battery, config.battery, Reason.BATTERY_STALE),
         ):
-            if limit.critical and not self._fresh(message, limit, now):
+            if limit.critical and not self._fresh(message, limit, now, reason):
                 blocks.append(reason)
-        if self._fresh(self._attitude, config.attitude, now):
+        if self._fresh(self._attitude, config.attitude, now, Reason.ATTITUDE_STALE):
             values["tilt"] = self._tilt.angle
             if self._tilt.stop:
                 blocks.append(Reason.TILT_STOP)
@@ -162,7 +175,9 @@ class Watch:
             blocks.append(Reason.BATTERY_CRITICAL)
         elif battery.level is BatteryLevel.LOW:
             limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
-        if not self._config.battery.critical and not self._fresh(battery, self._config.battery, now):
+        if not self._config.battery.critical and not self._fresh(
+            battery, self._config.battery, now, Reason.BATTERY_STALE
+        ):
             limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
 
     @property

@@ -35,3 +35,5 @@ class SteeringCommand(Message):
     front_servo: float
     """Servo angle, rad, left positive, 0 = straight ahead."""
     rear_servo: float
+    deadman: bool = True
+    """Level of the deadman line, where it is wired: False stops the motor without a word to its controller."""

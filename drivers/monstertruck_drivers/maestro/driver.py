@@ -33,7 +33,8 @@ class MaestroDriver:
     the time-out trips too although the driver still lives; feedback and battery pause meanwhile. With ``always``
     polling goes on, and the time-out guards only against a hung or dead process. Before the first command of a
     session there is nothing to guard: the line is low and polling runs. Channels that go home are the unit's own
-    setting: deadman line "Off", steering "Ignore".
+    setting: deadman line "Off", steering "Ignore". A command may lower the line too: nothing else reaches a motor
+    whose own link is lost.
 
     Args:
         config: calibration and rates.
@@ -127,7 +128,7 @@ class MaestroDriver:
                     if self._is_fresh(command):
                         self._command = command
                         self._fresh = True
-                        session.send(*self._targets(session, command), *self._line(session, high=True))
+                        session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
 
     def _is_fresh(self, command: SteeringCommand) -> bool:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
@@ -156,7 +157,8 @@ class MaestroDriver:
             packets.append(session.encode.set_acceleration(servo.channel, servo.acceleration))
         if self._command is not None:
             packets += self._targets(session, self._command)
-        session.send(*packets, *self._line(session, high=self._fresh))
+        alive = self._fresh and self._command is not None and self._command.deadman
+        session.send(*packets, *self._line(session, high=alive))
 
     async def _poll(self, session: Session, battery: "BatteryInput | None") -> None:
         config = self._config

@@ -194,6 +194,19 @@ def test_state_goes_out_on_change_and_ten_times_a_second():
     on_bench(scenario)
 
 
+def test_the_deadman_line_falls_when_the_drive_is_silent_and_rises_with_its_voice():
+    async def scenario(bench):
+        assert bench.out.steering.last.deadman
+        heard, bench.drive.send = bench.drive.send, lambda _: None
+        await bench.clock.sleep(0.3)
+        assert not bench.out.steering.last.deadman
+        bench.drive.send = heard
+        await bench.clock.sleep(0.1)
+        assert bench.out.steering.last.deadman
+
+    on_bench(scenario)
+
+
 def test_a_direct_order_is_answered():
     async def scenario(bench):
         now = bench.clock.now()

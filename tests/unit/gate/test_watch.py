@@ -58,6 +58,22 @@ def test_a_sensor_that_stays_away_disarms(sensor):
     assert STALE[sensor] in rig.out.reasons
 
 
+@pytest.mark.parametrize(
+    ("service", "sensor"), [("lidar", "scan"), ("compass", "attitude"), ("drive", "drive"), ("steering", "steering")]
+)
+def test_a_sensor_reported_lost_stops_at_once_until_it_delivers_again(service, sensor):
+    rig = Rig().driving()
+    rig.silent = {sensor}
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, service))
+    rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    assert rig.out.reasons == (STALE[sensor],)
+    rig.gate.observe_health(health(rig.now - SECOND // 100, ServiceState.STARTING, service))
+    rig.silent = set()
+    rig.tick(30)
+    assert rig.out.mode is GateMode.DRIVING
+
+
 def test_uncritical_sensors_may_be_silent():
     rig = Rig(**{name: {"stale_after": 0.2, "critical": False} for name in ("scan", "attitude", "steering")})
     rig.silent = {"scan", "attitude", "steering"}

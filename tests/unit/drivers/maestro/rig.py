@@ -79,6 +79,7 @@ class Gate:
         self.front = 0.0
         self.rear = 0.0
         self.talking = True
+        self.deadman = True
         self._clock = clock
         self._commands = commands
 
@@ -88,7 +89,14 @@ class Gate:
             if self.talking:
                 now = self._clock.now()
                 command = SteeringCommand(
-                    stamp=now, received=now, seq=seq, front=0.0, rear=0.0, front_servo=self.front, rear_servo=self.rear
+                    stamp=now,
+                    received=now,
+                    seq=seq,
+                    front=0.0,
+                    rear=0.0,
+                    front_servo=self.front,
+                    rear_servo=self.rear,
+                    deadman=self.deadman,
                 )
                 self._commands.put(command)
                 seq += 1

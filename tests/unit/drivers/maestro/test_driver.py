@@ -160,6 +160,24 @@ def test_a_hung_driver_drops_the_line_by_the_serial_timeout():
         on_bench(test, MaestroConfig(deadman_channel=2, deadman_feed="always"), serial_timeout_s=0.5)
 
 
+def test_a_command_lowers_and_raises_the_line_and_a_restore_keeps_it_so():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.gate.deadman = False
+            await rig.settle(0.03)
+            assert not rig.outputs[-1][1]
+            rig.emulator.inject("error", "0")
+            await rig.settle(0.2)
+            assert not rig.outputs[-1][1]
+            assert rig.out.kept[-1].received > rig.clock.now() - SECOND // 10, "polling goes on"
+            rig.gate.deadman = True
+            await rig.settle(0.03)
+            assert rig.outputs[-1][1]
+
+    on_bench(test, LINE)
+
+
 def test_ending_the_session_releases_the_line():
     async def test(rig: Rig) -> None:
         async with rig.driving():
