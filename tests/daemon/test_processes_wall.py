@@ -177,3 +177,27 @@ async def _all_devices_busy(endpoint: str) -> None:
                                 return
             except NotFoundError:
                 await asyncio.sleep(0.1)
+
+
+async def test_the_stop_script_stops_the_truck_after_the_daemon_was_killed(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            await truck.drive(client)
+        await end(truck.daemon, signal.SIGKILL)
+        started = truck.clock.now() / SECOND
+        script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), str(tmp_path / "dev" / "drive")]
+        done = await asyncio.to_thread(subprocess.run, script, capture_output=True, text=True, timeout=20, check=False)
+        assert done.returncode == 0, done.stderr
+        await asyncio.sleep(0.5)
+        truth = await truck.truth()
+    moving = truth[(truth[:, 0] > started) & (np.abs(truth[:, 4]) > 0.01)]
+    assert len(moving) == 0 or moving[-1, 0] - started < 2.0
+    assert np.abs(truth[-5:, 4]).max() < 0.01
+
+
+def test_the_unit_file_names_what_exists():
+    unit = (ROOT / "systemd" / "monstertruckd.service").read_text()
+    assert "systemd/neutral.py" in unit
+    assert "monstertruckd run --config" in unit
