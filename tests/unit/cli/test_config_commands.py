@@ -97,10 +97,10 @@ def test_the_gate_may_not_promise_more_braking_than_the_drive_has(
 ):
     config = tmp_path / "brave.yaml"
     config.write_text(
-        f"include: {ROOT}/configs/truck.yaml\nversion: 1\ngate: {{deceleration: 1.15, quick_deceleration: 5}}\n"
+        f"include: {ROOT}/configs/truck.yaml\nversion: 1\ngate: {{deceleration: 1.0, quick_deceleration: 5}}\n"
     )
     assert run(monkeypatch, "check-config", str(config)) == 2
-    assert "90000 rpm/s, which is 1.10 m/s^2" in capsys.readouterr().err
+    assert "gate.quick_deceleration 5.0 m/s^2: the drive is configured to brake with" in capsys.readouterr().err
 
 
 def test_topics_prints_every_row(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

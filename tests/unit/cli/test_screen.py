@@ -59,9 +59,7 @@ def full() -> ScreenState:
         ),
         HealthTable(
             **HEADER,
-            services=(
-                ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=0, restarts=3, detail="unplugged"),
-            ),
+            services=(ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=0, restarts=3, detail="lost"),),
         ),
         LoopHealth(**HEADER, ticks=5, lateness_p50=0.0, lateness_p99=0.0012, lateness_max=0.01),
         RecorderHealth(**HEADER, recording=False, reason=Reason.DISK_FULL),
