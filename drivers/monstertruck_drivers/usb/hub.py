@@ -157,7 +157,8 @@ class HubCoordinator:
         elif name not in self._judging:
             slot.free_at = now
             if self._looked:
-                self._tell_if_moved(name, slot.device)
+                if before is None or not _alike(before, slot.device):
+                    self._tell_if_moved(name, slot.device)
                 if slot.device.hub:  # a new hub's devices start one after the other, too
                     self._outages[name] = _Outage(name, now, now, {name}, announced=False)
 
@@ -236,9 +237,9 @@ class HubCoordinator:
 
     # Telling
 
-    def _tell_lost(self, hub: str, members: Iterable[str]) -> None:
+    def _tell_lost(self, hub: str, members: set[str]) -> None:
         devices = sorted((name for name in members if not self._is_hub(name)), key=sort_key)
-        what = "vanished" if not self._slots[hub].present else "is there, but all behind it vanished"
+        what = "vanished" if hub in members else "is there, but all behind it vanished"
         self._events(
             Reason.HUB_LOST,
             Severity.WARNING,
@@ -266,8 +267,6 @@ class HubCoordinator:
 
     def _tell_if_moved(self, name: str, device: Device) -> None:
         """A device that looks like a missing one came at another place. It is told, never used there."""
-        if name in self._roles:
-            return
         for other, slot in self._slots.items():
             known = slot.device
             wanted = other in self._roles or other in self._outages

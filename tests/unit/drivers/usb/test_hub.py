@@ -174,6 +174,28 @@ def test_a_hub_that_stays_but_loses_all_devices_is_one_event(tmp_path: Path):
     assert "all behind it vanished" in bench.events.of(Reason.HUB_LOST)[0][2]
 
 
+def test_the_only_device_of_a_hub_is_not_the_hub(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        bench.usb.unplug("1-2.2")
+        await bench.clock.sleep(1)
+        bench.usb.unplug("1-2.1")
+        await bench.clock.sleep(1)
+        assert bench.service.waiting == frozenset()
+
+    assert play(tmp_path, scene).events.kept == []
+
+
+def test_a_hub_with_one_device_is_a_hub(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        bench.usb.unplug("1-2.2")
+        await bench.clock.sleep(1)
+        bench.usb.lose_hub("1-2")
+        await bench.clock.sleep(1)
+        assert bench.service.waiting == {"compass"}
+
+    assert play(tmp_path, scene).events.of(Reason.HUB_LOST)[0][3] == {"hub": "1-2", "devices": 1}
+
+
 def test_three_of_four_cables_are_no_hub(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         for name in ("1-1.1", "1-1.2", "1-1.3"):
@@ -313,6 +335,7 @@ def test_without_the_service_nobody_waits(tmp_path: Path):
             assert not waiting.done()
         await waiting
         assert bench.hubs.waiting == frozenset()
+        assert bench.usb.watcher._hint is None
         await bench.service.gate_start("no such role")
 
     play(tmp_path, scene, watched=False)
@@ -380,13 +403,33 @@ def test_a_cable_in_another_port_is_told(tmp_path: Path):
         bench.usb.move("1-1.2", "1-2.3")
         await bench.clock.sleep(1)
         assert bench.states()["1-1.2"] is UsbState.ABSENT
-        bench.usb.add_device("1-2.4", "0403:6001", serial="other")
+        bench.usb.unplug("1-1.3")
+        bench.usb.add_device("1-2.4", "0403:6001", serial="another adapter")
+        await bench.clock.sleep(1)
+        bench.usb.move("1-1.3", "1-1.2")  # the drive's cable in the steering's port
         await bench.clock.sleep(1)
 
     bench = play(tmp_path, scene)
-    [(_, _, text, values)] = bench.events.of(Reason.PORT_MOVED)
+    (_, _, text, values), (_, _, _, swapped) = bench.events.of(Reason.PORT_MOVED)
     assert "hub 1-1 port 2 (steering) seems to be at hub 1-2 port 3" in text
     assert values == {"configured": "1-1.2", "found": "1-2.3"}
+    assert swapped == {"configured": "1-1.3", "found": "1-1.2"}
+
+
+def test_twins_that_return_to_their_own_ports_have_not_moved(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        for name in ("1-1.3", "1-1.4"):
+            bench.usb.unplug(name)
+            bench.usb.add_device(name, "0403:6001", node="ttyUSB")
+        await bench.clock.sleep(1)
+        bench.events.kept.clear()
+        bench.usb.unplug("1-1.3")
+        bench.usb.unplug("1-1.4")
+        await bench.clock.sleep(1)
+        bench.usb.plug("1-1.4")
+        await bench.clock.sleep(1)
+
+    assert play(tmp_path, scene).events.kept == []
 
 
 def test_a_hub_in_another_port_is_told(tmp_path: Path):
