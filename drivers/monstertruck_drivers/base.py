@@ -113,3 +113,19 @@ class AttitudeSource(Protocol):
     def compass(self, time_ns: int) -> CompassReading:
         """Reading at ``time_ns``."""
         ...
+
+
+class ViewSource(Protocol):
+    """What a camera sees."""
+
+    def ranges(self, time_ns: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Horizontal distances, m, at ``time_ns``; inf = nothing.
+
+        Args:
+            time_ns: instant of the exposure.
+            angles: (n,) directions from the camera's axis, rad, left positive.
+
+        Returns:
+            (n,), float64.
+        """
+        ...

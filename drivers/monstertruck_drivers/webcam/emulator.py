@@ -1,0 +1,197 @@
+"""An emulated camera that shows the world."""
+
+import asyncio
+import errno
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.base import ViewSource
+from monstertruck_drivers.link import DeviceEnd, EmulatedPort
+from monstertruck_drivers.webcam.packets import Kind, Packet, encode_mode
+from monstertruck_drivers.webcam.render import Renderer
+from monstertruck_drivers.webcam.source import Mode
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.threads import Offload, in_thread
+
+SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (160, 120))
+"""Sizes offered; like a real driver it grants the nearest one."""
+RATE_MAX: Final = 30.0
+LINE_LIMIT: Final = 256
+CHUNK: Final = 2048
+"""Bytes written at a time: a pty takes no more than a few thousand until they are read."""
+CHUNK_PAUSE: Final = 0.0002
+
+REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno.ENOSPC, "off": 0}
+
+
+class WebcamEmulator:
+    """A camera that streams rendered JPEGs while a host wants them.
+
+    Distances are asked of the world on the loop; drawing and compressing happens in ``offload``.
+
+    Faults (``inject``): ``drop N`` (pictures counted, but not sent), ``corrupt N`` (start marker overwritten),
+    ``truncate N`` (the second half is missing), ``bare on|off`` (no Huffman tables), ``jump SECONDS`` (added to all
+    stamps from now on), ``stuck on|off`` (streams nothing, says nothing), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
+    next openings), ``vanish [SECONDS]`` (gone from USB in mid-stream, and back).
+
+    Args:
+        clock: time.
+        view: what is to be seen; None = an empty plain.
+        offload: where pictures are drawn: a thread, or ``inline`` on the virtual clock.
+        usb: the port it hangs on, for ``vanish``.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        view: ViewSource | None = None,
+        *,
+        offload: Offload = in_thread,
+        usb: EmulatedPort | None = None,
+        name: str = "camera",
+    ) -> None:
+        self.name = name
+        self.usb = usb
+        self._clock = clock
+        self._view = view
+        self._offload = offload
+        self._wanted = asyncio.Event()
+        self._to_damage = {"drop": 0, "corrupt": 0, "truncate": 0}
+        self._bare = False
+        self._stuck = False
+        self._jump = 0
+        self._refusal = 0
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Supply off and on again: it streams no more, and counts from 0."""
+        self._sequence = 0
+        self._session = 0
+        self._renderer: Renderer | None = None
+        self._rate = RATE_MAX
+        self._wanted.clear()
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve for ever."""
+        end.on_plug = lambda _: self.power_cycle()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._listen(end))
+            group.create_task(self._stream(end))
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case (("drop" | "corrupt" | "truncate"), (count,)):
+                    self._to_damage[fault] = int(count)
+                case "bare", (("on" | "off") as state,):
+                    self._bare = state == "on"
+                case "stuck", (("on" | "off") as state,):
+                    self._stuck = state == "on"
+                case "jump", (seconds,):
+                    self._jump = round(float(seconds) * SECOND)
+                case "refuse", (("EINVAL" | "EBUSY" | "ENOSPC" | "off") as how,):
+                    self._refusal = REFUSALS[how]
+                case "vanish", ():
+                    self._vanish(0.5)
+                case "vanish", (seconds,):
+                    self._vanish(float(seconds))
+                case _:
+                    raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: drop|corrupt|truncate N, "
+                "bare|stuck on|off, jump SECONDS, refuse EINVAL|EBUSY|ENOSPC|off, vanish [SECONDS]"
+            ) from error
+
+    # Serving
+
+    async def _listen(self, end: DeviceEnd) -> None:
+        buffer = b""
+        while True:
+            *lines, buffer = (buffer + await end.read())[-LINE_LIMIT:].split(b"\n")
+            for line in lines:
+                self._obey(end, line)
+
+    def _obey(self, end: DeviceEnd, line: bytes) -> None:
+        match line.split():
+            case [b"OPEN", *numbers]:
+                try:
+                    width, height, rate = (float(number) for number in numbers)
+                except ValueError:
+                    return
+                self._open(end, width, height, rate)
+            case [b"CLOSE"]:
+                self._wanted.clear()
+            case _:
+                pass
+
+    def _open(self, end: DeviceEnd, width: float, height: float, rate: float) -> None:
+        if self._refusal:
+            end.write(Packet(Kind.REFUSED, self._refusal).encode())
+            return
+        size = min(SIZES, key=lambda offered: abs(offered[0] - width) + abs(offered[1] - height))
+        granted = Mode(*size, min(max(rate, 1.0), RATE_MAX))
+        self._renderer, self._rate = Renderer(granted), granted.rate
+        self._session += 1
+        self._wanted.set()
+        end.write(Packet(Kind.GRANTED, payload=encode_mode(granted)).encode())
+
+    async def _stream(self, end: DeviceEnd) -> None:
+        while True:
+            await self._wanted.wait()
+            session, schedule = self._session, Schedule(self._clock, self._rate)
+            while self._wanted.is_set() and session == self._session:
+                stamp = await schedule.next()
+                if self._wanted.is_set() and session == self._session and self._renderer is not None:
+                    await self._expose(end, stamp, self._renderer)
+
+    async def _expose(self, end: DeviceEnd, stamp: int, renderer: Renderer) -> None:
+        if self._stuck:
+            return
+        number = self._sequence
+        self._sequence += 1
+        if self._uses_up("drop"):
+            return
+        ranges = self._ranges(stamp, renderer.angles)
+        data = self._damaged(await self._offload(lambda: renderer.jpeg(ranges, number)))
+        packet = Packet(Kind.PICTURE, number, stamp + self._jump, data).encode()
+        for at in range(0, len(packet), CHUNK):
+            end.write(packet[at : at + CHUNK])
+            await self._clock.sleep(CHUNK_PAUSE)
+
+    def _ranges(self, stamp: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._view is None:
+            return np.full(len(angles), np.inf)
+        return self._view.ranges(stamp, angles)
+
+    def _damaged(self, data: bytes) -> bytes:
+        if self._bare:
+            # Four segments, of one table each, as the encoder writes them.
+            head, _, tail = data.partition(b"\xff\xc4")
+            data = head + tail[tail.index(b"\xff\xda") :]
+        if self._uses_up("corrupt"):
+            data = bytes(4) + data[4:]
+        if self._uses_up("truncate"):
+            data = data[: len(data) // 2]
+        return data
+
+    def _uses_up(self, fault: str) -> bool:
+        left = self._to_damage[fault]
+        self._to_damage[fault] = max(0, left - 1)
+        return left > 0
+
+    def _vanish(self, seconds: float) -> None:
+        if self.usb is None:
+            self.power_cycle()
+        else:
+            self.usb.unplug()
+            asyncio.get_running_loop().call_later(seconds, self.usb.plug)

@@ -1,0 +1,109 @@
+"""What an emulated camera says over its port: the answers and pictures a real one gives through the kernel.
+
+Host to camera: lines ``OPEN <width> <height> <rate>`` and ``CLOSE``. Camera to host: packets of a header with its
+own CRC-32 and a payload, little-endian.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from monstertruck_drivers.webcam.source import Mode
+from monstertruck_runtime.errors import ProtocolError
+
+MAGIC: Final = b"\x89MTC"
+PAYLOAD_LIMIT: Final = 1 << 22
+_HEADER: Final = struct.Struct("<4sB3xIqI")
+_CRC: Final = struct.Struct("<I")
+_MODE: Final = struct.Struct("<IId")
+HEADER_SIZE: Final = _HEADER.size + _CRC.size
+
+
+class Kind(IntEnum):
+    """What a packet is."""
+
+    GRANTED = 1
+    """Streaming begins; the payload is the mode."""
+    REFUSED = 2
+    """``number`` is the kernel's error number."""
+    PICTURE = 3
+    """``number`` is the camera's count, ``stamp`` the exposure."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet."""
+
+    kind: Kind
+    number: int = 0
+    stamp: int = 0
+    payload: bytes = b""
+
+    def encode(self) -> bytes:
+        """Bytes on the line."""
+        header = _HEADER.pack(MAGIC, self.kind, self.number, self.stamp, len(self.payload))
+        return header + _CRC.pack(zlib.crc32(header)) + self.payload
+
+
+def encode_mode(mode: Mode) -> bytes:
+    """Payload of ``GRANTED``."""
+    return _MODE.pack(mode.width, mode.height, mode.rate)
+
+
+def decode_mode(payload: bytes) -> Mode:
+    """Mode in the payload of ``GRANTED``.
+
+    Raises:
+        ProtocolError: wrong length.
+    """
+    if len(payload) != _MODE.size:
+        raise ProtocolError(f"mode takes {_MODE.size} bytes, got {len(payload)}")
+    return Mode(*_MODE.unpack(payload))
+
+
+class PacketParser:
+    """Bytes in, packets out, however they are cut; after lost bytes it goes on at the next correct header."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._header: tuple[Kind, int, int, int] | None = None
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Everything that became complete, in order."""
+        self._buffer += data
+        packets: list[Packet] = []
+        while (packet := self._next()) is not None:
+            packets.append(packet)
+        return packets
+
+    def _next(self) -> Packet | None:
+        if self._header is None and not self._find_header():
+            return None
+        assert self._header is not None
+        kind, number, stamp, length = self._header
+        if len(self._buffer) < length:
+            return None
+        payload = bytes(self._buffer[:length])
+        del self._buffer[:length]
+        self._header = None
+        return Packet(kind, number, stamp, payload)
+
+    def _find_header(self) -> bool:
+        while True:
+            at = self._buffer.find(MAGIC)
+            if at < 0:
+                del self._buffer[: -len(MAGIC) + 1]
+                return False
+            del self._buffer[:at]
+            if len(self._buffer) < HEADER_SIZE:
+                return False
+            header = bytes(self._buffer[: _HEADER.size])
+            _, kind, number, stamp, length = _HEADER.unpack(header)
+            (crc,) = _CRC.unpack(self._buffer[_HEADER.size : HEADER_SIZE])
+            if crc == zlib.crc32(header) and length <= PAYLOAD_LIMIT and kind in list(Kind):
+                del self._buffer[:HEADER_SIZE]
+                self._header = Kind(kind), number, stamp, length
+                return True
+            del self._buffer[: len(MAGIC)]

@@ -1,0 +1,39 @@
+"""Which cameras are there, and what do they offer."""
+
+from typing import Any
+
+from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam.v4l2_source import asked, enumerate_formats, enumerate_modes
+from monstertruck_runtime.errors import DeviceError
+from monstertruck_runtime.threads import Offload, in_thread
+
+
+async def probe(
+    pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_thread
+) -> dict[str, Any]:
+    """Ask every node that fits ``pattern``; nothing is streamed.
+
+    Returns:
+        JSON-able: ``nodes``: path, driver, card, bus, whether it captures, pixel formats, and the sizes and rates of
+        motion JPEG; or why it cannot be asked.
+    """
+    system = kernel or v4l2.LinuxKernel()
+    return await offload(lambda: {"nodes": [_describe(path, system) for path in system.nodes(pattern)]})
+
+
+def _describe(path: str, kernel: v4l2.Kernel) -> dict[str, Any]:
+    try:
+        with asked(path, kernel) as (fd, node):
+            formats = enumerate_formats(fd, kernel) if node.captures else []
+            modes = enumerate_modes(fd, kernel) if v4l2.MJPG in formats else []
+    except DeviceError as error:
+        return {"path": path, "error": str(error)}
+    return {
+        "path": path,
+        "driver": node.driver,
+        "card": node.card,
+        "bus": node.bus,
+        "captures": node.captures,
+        "formats": [v4l2.fourcc(pixel_format) for pixel_format in formats],
+        "mjpg_modes": [{"width": m.width, "height": m.height, "rate": round(m.rate, 2)} for m in modes],
+    }

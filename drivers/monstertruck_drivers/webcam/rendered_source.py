@@ -1,0 +1,81 @@
+"""Pictures of the emulated camera, over the port it is plugged into."""
+
+from types import TracebackType
+from typing import Final, Self
+
+from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser, decode_mode
+from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, Mode, device_error
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceTimeoutError
+
+ANSWER_TIMEOUT: Final = 2.0
+"""Seconds until an emulated camera must grant or refuse."""
+
+
+class RenderedSource:
+    """A camera whose ``WebcamEmulator`` runs at the other end of ``port``: in this process or in another.
+
+    Args:
+        port: memory port or pty.
+        clock: time.
+    """
+
+    def __init__(self, port: Port, clock: Clock) -> None:
+        self.name = port.name
+        self._port = port
+        self._clock = clock
+
+    async def open(self, mode: Mode, buffers: int) -> "RenderedStream":
+        """Start the camera, see ``FrameSource``."""
+        link = await self._port.open()
+        parser = PacketParser()
+        try:
+            link.write(f"\nOPEN {mode.width} {mode.height} {mode.rate}\n".encode())
+            async with self._clock.deadline(ANSWER_TIMEOUT):
+                granted = await self._answer(link, parser)
+            return RenderedStream(link, parser, granted)
+        except TimeoutError:
+            link.close()
+            raise DeviceTimeoutError(f"{self.name}: no camera answers") from None
+        except BaseException:
+            link.close()
+            raise
+
+    async def _answer(self, link: Link, parser: PacketParser) -> Mode:
+        """Wait for it; pictures of an earlier session are dropped."""
+        while True:
+            for packet in parser.feed(await link.read()):
+                if packet.kind is Kind.GRANTED:
+                    return decode_mode(packet.payload)
+                if packet.kind is Kind.REFUSED:
+                    error = OSError(packet.number, "refused")
+                    raise device_error(self.name, SET_FORMAT, error)
+
+
+class RenderedStream:
+    """Newest picture of a streaming emulator."""
+
+    def __init__(self, link: Link, parser: PacketParser, mode: Mode) -> None:
+        self.mode = mode
+        self._link = link
+        self._parser = parser
+
+    async def next(self) -> Frame:
+        """Wait for a picture, see ``FrameStream``."""
+        picture: Packet | None = None
+        while picture is None:
+            for packet in self._parser.feed(await self._link.read()):
+                if packet.kind is Kind.PICTURE:
+                    picture = packet
+        return Frame(picture.stamp, picture.number, picture.payload)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._link.is_lost:
+            self._link.write(b"CLOSE\n")
+        self._link.close()

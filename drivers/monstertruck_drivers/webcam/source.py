@@ -1,0 +1,114 @@
+"""Where pictures come from: the interface that the real and the emulated camera share."""
+
+import errno
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+from monstertruck_runtime.errors import (
+    DeviceError,
+    DeviceFaultError,
+    DeviceLostError,
+    DeviceMismatchError,
+    DeviceTimeoutError,
+    PortBusyError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """What a camera is asked for, or what it granted."""
+
+    width: int
+    height: int
+    rate: float
+    """Pictures a second."""
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height} at {self.rate:g} Hz"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture as the camera gave it: not checked yet."""
+
+    stamp: int | None
+    """Nanoseconds of CLOCK_MONOTONIC at the exposure; None = the camera does not tell."""
+    sequence: int
+    """The camera's own count."""
+    data: bytes
+    damaged: bool = False
+    """The kernel says that it is incomplete."""
+
+
+class FrameStream(Protocol):
+    """A camera that is sending."""
+
+    mode: Mode
+    """What it granted, not always what was asked for."""
+
+    async def next(self) -> Frame:
+        """Wait for a picture newer than the last one; those in between are dropped.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceError: the camera failed otherwise.
+        """
+        ...
+
+    async def __aenter__(self) -> Self:
+        """The stream itself."""
+        ...
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the camera and let it go."""
+        ...
+
+
+class FrameSource(Protocol):
+    """Somewhere a camera may be plugged in."""
+
+    name: str
+
+    async def open(self, mode: Mode, buffers: int) -> FrameStream:
+        """Start the camera.
+
+        Raises:
+            DeviceLostError: none is plugged in.
+            PortBusyError: another program streams from it.
+            DeviceMismatchError: it has no motion JPEG, or refuses the mode.
+            DeviceFaultError: no bandwidth on its hub.
+            DeviceError: it failed otherwise.
+        """
+        ...
+
+
+_KINDS: Final[dict[int, type[DeviceError]]] = {
+    errno.ENODEV: DeviceLostError,
+    errno.ENXIO: DeviceLostError,
+    errno.ENOENT: DeviceLostError,
+    errno.EIO: DeviceLostError,
+    errno.EBUSY: PortBusyError,
+    errno.ENOSPC: DeviceFaultError,
+    errno.ETIMEDOUT: DeviceTimeoutError,
+}
+_HINTS: Final = {
+    errno.ENOSPC: "no USB bandwidth left on its hub: ask for a smaller size, or use a port of the other hub",
+    errno.EACCES: "no permission: the user must be in the group 'video'",
+    errno.EBUSY: "another program uses the camera",
+}
+
+
+def device_error(name: str, doing: str, error: OSError) -> DeviceError:
+    """What an error number of the kernel means for a camera; EINVAL while ``set the format`` is a mismatch."""
+    number = error.errno or 0
+    kind = _KINDS.get(number, DeviceError)
+    if number == errno.EINVAL and doing == SET_FORMAT:
+        kind = DeviceMismatchError
+    return kind(f"{name}: cannot {doing}: {_HINTS.get(number) or error.strerror}")
+
+
+SET_FORMAT: Final = "set the format"
+"""The step at which a camera refuses a mode."""

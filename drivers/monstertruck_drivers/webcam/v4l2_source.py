@@ -1,0 +1,268 @@
+"""The real camera: finds its node, sets it up, and takes pictures from the kernel's buffers."""
+
+import asyncio
+import contextlib
+import errno
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Final, Self
+
+from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, Mode, device_error
+from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
+from monstertruck_runtime.threads import Offload, in_thread
+
+ENUMERATION_LIMIT: Final = 256
+"""Rows at most: a broken driver may never say that there are no more."""
+
+
+class V4l2Source:
+    """A camera by its device node.
+
+    Args:
+        pattern: node, symlink or glob pattern, such as ``/dev/v4l/by-path/*usb-0:1.2:1.0-video-index*``. A camera has
+            several nodes; of those that fit, the first one that captures motion JPEG is taken.
+        kernel: system calls.
+        offload: where setting up and letting go is done: control transfers over USB take tens of milliseconds.
+    """
+
+    def __init__(
+        self, pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_thread
+    ) -> None:
+        self.name = pattern
+        self._kernel = kernel or v4l2.LinuxKernel()
+        self._offload = offload
+
+    async def open(self, mode: Mode, buffers: int) -> "V4l2Stream":
+        """Start the camera, see ``FrameSource``."""
+        started: list[Camera] = []
+        try:
+            await self._offload(lambda: started.append(Camera.start(self.name, self._kernel, mode, buffers)))
+        except asyncio.CancelledError:
+            for camera in started:
+                await self._offload(camera.stop)
+            raise
+        return V4l2Stream(started[0], self._offload)
+
+
+class Camera:
+    """An open node; its methods block."""
+
+    def __init__(self, path: str, kernel: v4l2.Kernel, fd: int) -> None:
+        self.path = path
+        self.fd = fd
+        self.mode = Mode(0, 0, 0.0)
+        self._kernel = kernel
+        self._memory: list[v4l2.Mapping] = []
+
+    @classmethod
+    def start(cls, pattern: str, kernel: v4l2.Kernel, mode: Mode, buffers: int) -> "Camera":
+        """Open the node that captures motion JPEG and let it stream."""
+        path = find_node(pattern, kernel)
+        with _doing(path, "open it"):
+            camera = cls(path, kernel, kernel.open(path))
+        try:
+            camera._set(mode)
+            camera._map(buffers)
+            with _doing(path, "start streaming"):
+                kernel.ioctl(camera.fd, v4l2.STREAMON, bytearray(v4l2.NUMBER.pack(v4l2.CAPTURE)))
+        except BaseException:
+            camera.stop()
+            raise
+        return camera
+
+    def take(self) -> Frame | None:
+        """The oldest picture that is ready, if any; its buffer goes back to the kernel.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceError: streaming failed.
+        """
+        argument = v4l2.buffer(0)
+        try:
+            with _doing(self.path, "take a picture"):
+                self._kernel.ioctl(self.fd, v4l2.DQBUF, argument)
+                filled = v4l2.Filled.unpack(argument)
+                data = self._memory[filled.index][: filled.used]
+                self._kernel.ioctl(self.fd, v4l2.QBUF, v4l2.buffer(filled.index))
+        except BlockingIOError:
+            return None
+        return Frame(filled.stamp, filled.sequence, data, damaged=bool(filled.flags & v4l2.FLAG_ERROR))
+
+    def stop(self) -> None:
+        """Stop streaming, unmap and close; a camera that is gone is let go just the same."""
+        with contextlib.suppress(OSError):
+            self._kernel.ioctl(self.fd, v4l2.STREAMOFF, bytearray(v4l2.NUMBER.pack(v4l2.CAPTURE)))
+        for memory in self._memory:
+            memory.close()
+        self._memory.clear()
+        with contextlib.suppress(OSError):
+            self._kernel.close(self.fd)
+
+    def _set(self, mode: Mode) -> None:
+        argument = v4l2.format_request(mode)
+        with _doing(self.path, SET_FORMAT):
+            self._kernel.ioctl(self.fd, v4l2.S_FMT, argument)
+        width, height, pixel_format = v4l2.format_granted(argument)
+        if pixel_format != v4l2.MJPG:
+            raise DeviceMismatchError(f"{self.path}: sends {v4l2.fourcc(pixel_format)} instead of motion JPEG")
+        rate = v4l2.rate_request(mode.rate)
+        try:
+            self._kernel.ioctl(self.fd, v4l2.S_PARM, rate)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTTY):  # a camera of one fixed rate
+                raise device_error(self.path, "set the rate", error) from error
+        self.mode = Mode(width, height, v4l2.rate_granted(rate, mode.rate))
+
+    def _map(self, count: int) -> None:
+        with _doing(self.path, "get buffers"):
+            request = bytearray(v4l2.REQUEST_BUFFERS.pack(count, v4l2.CAPTURE, v4l2.MMAP, 0, 0))
+            self._kernel.ioctl(self.fd, v4l2.REQBUFS, request)
+            granted, *_ = v4l2.REQUEST_BUFFERS.unpack(request)
+            for index in range(granted):
+                argument = v4l2.buffer(index)
+                self._kernel.ioctl(self.fd, v4l2.QUERYBUF, argument)
+                found = v4l2.Filled.unpack(argument)
+                self._memory.append(self._kernel.map(self.fd, found.length, found.offset))
+                self._kernel.ioctl(self.fd, v4l2.QBUF, v4l2.buffer(index))
+
+
+class V4l2Stream:
+    """Newest picture of a streaming camera."""
+
+    def __init__(self, camera: Camera, offload: Offload) -> None:
+        self.mode = camera.mode
+        self._camera = camera
+        self._offload = offload
+        self._frame: Frame | None = None
+        self._error: DeviceError | None = None
+        self._news = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(camera.fd, self._readable)
+
+    async def next(self) -> Frame:
+        """Wait for a picture, see ``FrameStream``."""
+        await self._news.wait()
+        if self._error is not None:
+            raise self._error
+        self._news.clear()
+        frame, self._frame = self._frame, None
+        assert frame is not None
+        return frame
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._loop.remove_reader(self._camera.fd)
+        await self._offload(self._camera.stop)
+
+    def _readable(self) -> None:
+        try:
+            frame = self._camera.take()
+        except DeviceError as error:
+            # The node stays readable for ever now.
+            self._loop.remove_reader(self._camera.fd)
+            self._error = error
+            self._news.set()
+            return
+        if frame is not None:
+            self._frame = frame
+            self._news.set()
+
+
+def find_node(pattern: str, kernel: v4l2.Kernel) -> str:
+    """The first node of ``pattern`` that captures motion JPEG.
+
+    Raises:
+        DeviceLostError: there is no such node.
+        DeviceMismatchError: nodes fit, but none captures motion JPEG.
+        DeviceError: a node cannot be asked.
+    """
+    paths = kernel.nodes(pattern)
+    if not paths:
+        raise DeviceLostError(f"{pattern}: no camera")
+    failed: DeviceError | None = None
+    for path in paths:
+        try:
+            if v4l2.MJPG in pixel_formats(path, kernel):
+                return path
+        except DeviceError as error:
+            failed = failed or error
+    raise failed or DeviceMismatchError(f"{', '.join(paths)}: no node captures motion JPEG")
+
+
+def pixel_formats(path: str, kernel: v4l2.Kernel) -> list[int]:
+    """Pixel formats a node can capture; none if it does not capture.
+
+    Raises:
+        DeviceError: it cannot be asked.
+    """
+    with asked(path, kernel) as (fd, capability):
+        return enumerate_formats(fd, kernel) if capability.captures else []
+
+
+@contextmanager
+def asked(path: str, kernel: v4l2.Kernel) -> Iterator[tuple[int, v4l2.Capability]]:
+    """Open a node and ask what it is; closed again behind the context."""
+    with _doing(path, "ask it what it is"):
+        fd = kernel.open(path)
+        try:
+            argument = bytearray(v4l2.CAPABILITY.size)
+            kernel.ioctl(fd, v4l2.QUERYCAP, argument)
+            yield fd, v4l2.Capability.unpack(argument)
+        finally:
+            kernel.close(fd)
+
+
+def enumerate_formats(fd: int, kernel: v4l2.Kernel) -> list[int]:
+    """Pixel formats an open node can capture."""
+    rows = _enumerate(fd, kernel, v4l2.ENUM_FMT, v4l2.FORMAT_DESCRIPTION, v4l2.CAPTURE)
+    return [int(row[4]) for row in rows]
+
+
+def enumerate_modes(fd: int, kernel: v4l2.Kernel) -> list[Mode]:
+    """Discrete sizes and rates of motion JPEG; stepwise ones are left out."""
+    modes = []
+    for _, _, size_kind, width, height, *_ in _enumerate(fd, kernel, v4l2.ENUM_FRAMESIZES, v4l2.FRAME_SIZE, v4l2.MJPG):
+        if size_kind != v4l2.DISCRETE:
+            continue
+        intervals = _enumerate(fd, kernel, v4l2.ENUM_FRAMEINTERVALS, v4l2.FRAME_INTERVAL, v4l2.MJPG, width, height)
+        modes += [
+            Mode(width, height, denominator / numerator)
+            for _, _, _, _, kind, numerator, denominator, *_ in intervals
+            if kind == v4l2.DISCRETE and numerator
+        ]
+    return modes
+
+
+def _enumerate(fd: int, kernel: v4l2.Kernel, request: int, layout: struct.Struct, *key: int) -> list[tuple[Any, ...]]:
+    """Rows of an enumeration: index and key go in first, the whole structure comes back."""
+    head = struct.Struct(f"@{1 + len(key)}I")
+    rows: list[tuple[Any, ...]] = []
+    while len(rows) < ENUMERATION_LIMIT:
+        argument = bytearray(layout.size)
+        head.pack_into(argument, 0, len(rows), *key)
+        try:
+            kernel.ioctl(fd, request, argument)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                break
+            raise
+        rows.append(layout.unpack(argument))
+    return rows
+
+
+@contextmanager
+def _doing(path: str, what: str) -> Iterator[None]:
+    """Turn the kernel's errors into ours; "nothing there yet" passes."""
+    try:
+        yield
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        raise device_error(path, what, error) from error
