@@ -429,9 +429,11 @@ def test_an_overloaded_joint_rests_and_holds_again_without_a_jump():
             assert feedback.pitch_joint.error == p.Alarm.OVERLOAD
             assert feedback.roll_joint.torque is TorqueState.HOLDING
             rig.unit(1).position = 511.0  # sagged while limp
+            goal = rig.unit(1).get(p.GOAL_POSITION)
             rig.wish(-0.3, 0.1)
             await rig.settle(0.7)
             assert rig.joint("pitch") == 0.0
+            assert rig.unit(1).get(p.GOAL_POSITION) == goal, "a limp joint is given no goals"
             assert rig.joint("roll") == pytest.approx(0.1, abs=2 * STEP), "the other one works on"
             speeds = []
             while rig.out.kept[-1].pitch_joint.torque is not TorqueState.HOLDING:
@@ -566,6 +568,17 @@ def test_a_brown_out_of_one_unit_is_noticed_and_repaired():
         ((reason, _, text, _),) = rig.events.kept
         assert reason is Reason.DEVICE_FAULT
         assert "lost its settings" in text
+
+    on_bench(test)
+
+
+def test_a_lost_speed_limit_is_noticed_and_repaired():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(1)
+            rig.unit(1).put(p.MOVING_SPEED, 0)  # unlimited
+            await rig.settle(1.1)
+            assert rig.unit(1).get(p.MOVING_SPEED) == FAST.speed_word
 
     on_bench(test)
 

@@ -60,6 +60,14 @@ def test_an_answer_takes_line_return_delay_and_adapter():
     on_wire(test)
 
 
+def test_answers_keep_the_order_of_the_requests():
+    async def test(_bus, host: Host, _clock) -> None:
+        await host.status(write(2, p.RETURN_DELAY, 0))
+        assert [packet.unit for packet in await host.ask(p.ping(1) + p.ping(2))] == [1, 2]
+
+    on_wire(test)
+
+
 def test_up_to_six_units():
     async def test(_bus, host: Host, _clock) -> None:
         for ident in range(1, 7):
@@ -304,6 +312,7 @@ def test_slope_and_margin_shape_the_arrival(slope: int, margin: int):
         await clock.sleep(3)
         left = 612 - bus.angle(1, clock.now()) / STEP
         assert left == pytest.approx(margin, abs=0.6)
+        assert await value(host, 1, p.MOVING) == 0, "at rest"
         loads = []
         await host.status(write(1, p.GOAL_POSITION, 512))
         for _ in range(40):
@@ -312,6 +321,19 @@ def test_slope_and_margin_shape_the_arrival(slope: int, margin: int):
         for error, load in loads:
             if margin + 4 < error:
                 assert load == pytest.approx(1000 * min(1, (error - margin) / p.slope_of(slope)), abs=1500 / slope)
+
+    on_wire(test)
+
+
+def test_the_punch_is_the_least_drive():
+    async def test(_bus, host: Host, _clock) -> None:
+        await host.status(p.write(1, p.CW_MARGIN, bytes((0, 0, 128, 128))))
+        await host.status(write(1, p.GOAL_POSITION, 514))
+        await host.status(write(1, p.TORQUE_ENABLE, 1))
+        assert (await present(host)).load == 31
+        await host.status(write(1, p.PUNCH, 100))
+        await host.status(write(1, p.GOAL_POSITION, 508))
+        assert (await present(host)).load == -98
 
     on_wire(test)
 

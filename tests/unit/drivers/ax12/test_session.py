@@ -22,11 +22,14 @@ class Script:
         self._port = port
         self._answers = answers
 
+    def say(self, data: bytes) -> None:
+        self._port.device.write(data)
+
     async def run(self) -> None:
         while True:
             self.requests.append(await self._port.device.read())
             if self._answers:
-                self._port.device.write(self._answers.pop(0))
+                self.say(self._answers.pop(0))
 
 
 def scripted(answers: list[bytes], test, *, echo: bool = False) -> None:
@@ -90,6 +93,17 @@ def test_answers_of_others_and_of_other_lengths_do_not_count():
     scripted([status(0, bytes(8), unit=2) + late + b"\xff\x00" + status(0, bytes(range(8)))], test)
 
 
+def test_an_answer_that_came_too_late_is_thrown_away():
+    async def test(session: Session, script: Script, clock) -> None:
+        with pytest.raises(DeviceTimeoutError):
+            await session.read(1, p.PRESENT_POSITION, 8, retries=0)
+        script.say(status(0, bytes(8)))
+        await clock.sleep(0.01)
+        assert (await session.read(1, p.PRESENT_POSITION, 8)).data == bytes(range(8))
+
+    scripted([b"", status(0, bytes(range(8)))], test)
+
+
 def test_silence_is_asked_three_times():
     async def test(session: Session, script: Script, clock) -> None:
         start = clock.now()
@@ -126,11 +140,12 @@ def test_an_echo_is_found_by_a_request_no_answer_resembles(answer: bytes | None,
 
 
 def test_after_a_sync_write_the_bus_gets_a_pause():
-    async def test(session: Session, _script, clock) -> None:
+    async def test(session: Session, script: Script, clock) -> None:
         start = clock.now()
         await session.sync_write(p.GOAL_POSITION, {1: b"\x00\x01"})
         assert clock.now() == start
         await session.ping(1)
-        assert clock.now() - start >= 100_000
+        assert 100_000 <= clock.now() - start < 200_000
+        assert [request[4] for request in script.requests] == [p.Instruction.SYNC_WRITE, p.Instruction.PING]
 
     scripted([b"", status()], test)
