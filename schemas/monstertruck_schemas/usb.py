@@ -25,7 +25,7 @@ class UsbNode(Schema):
 
     name: str
     """Kernel's name of the place: ``usb1`` is a root hub, ``1-1.2`` is port 2 of the hub at root port 1."""
-    parent: str | None
+    parent: str | None = None
     """Name of the hub; None for a root hub."""
     title: str = ""
     """Product as the device calls itself."""
