@@ -24,7 +24,10 @@ class VirtualRig:
     """
 
     def __init__(self, config: SimulatedTruckConfig, clock: VirtualClock, tree: Tree | None = None) -> None:
+        self.config = config
         self.clock = clock
+        self.began = clock.now()
+        """Start of the world, ns."""
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
         self.robot = SimulatedRobot(config.sim, config.devices, clock, self.ports)
         self.world = self.robot.world
@@ -53,10 +56,17 @@ class VirtualRig:
         try:
             yield self
         finally:
-            await self.end_daemon()
-            for task in around:
-                task.cancel()
-            await asyncio.wait(around)
+            try:
+                await self.end_daemon()
+            finally:
+                for task in around:
+                    task.cancel()
+                await asyncio.wait(around)
+
+    @property
+    def daemon_ended(self) -> bool:
+        """Whether the daemon has ended, asked to or not."""
+        return self._daemon_task is not None and self._daemon_task.done()
 
     async def end_daemon(self) -> None:
         """Ask the daemon to end, as SIGTERM does, and wait until it has."""

@@ -1,0 +1,91 @@
+"""Scripted faults on the whole daemon, on the virtual clock; figures and goals are those of the benchmark."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+from monstertruck_runtime.clock import run_virtual
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.fast import run_fast_demo
+from monstertruckd.demo.summary import GOAL_CLOSING
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults import Expect, Reaction, Scenario
+from monstertruckd.sim.faults_drill import measure
+from monstertruckd.sim.faults_goals import shortcomings
+from monstertruckd.sim.faults_scenarios import SCENARIOS
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
+BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
+
+
+@cache
+def config() -> SimulatedTruckConfig:
+    return load_config(DEMO, SimulatedTruckConfig)[0]
+
+
+def drill(scenario: Scenario) -> Reaction:
+    return run_virtual(lambda clock: measure(scenario, config(), clock))
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_fault_ends_as_it_should(name: str):
+    scenario = BY_NAME[name]
+    assert shortcomings(scenario, drill(scenario)) == []
+
+
+def test_a_reaction_that_is_too_late_or_wrong_is_seen():
+    scenario = BY_NAME["lidar: unplugged"]
+    assert shortcomings(scenario, drill(Scenario("nothing happens", lambda _: None, Expect.STOP))) != []
+    late = Reaction("x", 0.0, 0.06, 0.31, 0.4, reason=Reason.SCAN_STALE, seen=(Reason.SCAN_STALE,), collided=True)
+    found = " ".join(shortcomings(scenario, late))
+    for word in ("ran into", "stop bytes after 0.06", "from the last sample", "lidar down", "not back", "again"):
+        assert word in found, found
+
+
+def test_a_fault_that_stays_is_reset_three_times_at_most():
+    scenario = BY_NAME["drive: over-current that stays"]
+    assert drill(scenario).resets == 3
+
+
+def test_an_obstacle_is_kept_at_a_distance():
+    reaction = drill(BY_NAME["obstacle 0.6 m ahead"])
+    assert 0.4 < reaction.metres < 0.6
+
+
+# The fast demo
+
+
+def short_demo(folder: Path, seed: int) -> str:
+    """Digest of a run along the first 2 m of the lap."""
+    folder.mkdir()
+    whole = (DEMO.parent / "paths" / "loop.csv").read_text().splitlines()
+    path = folder / "short.csv"
+    path.write_text("\n".join(whole[:41]) + "\n")
+    file = folder / "short.yaml"
+    overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(path), "closed": False}}
+    file.write_text(yaml.safe_dump(overlay))
+    summary = run_fast_demo(file, folder / "run", seed)
+    assert summary.lap.outcome is Reason.GOAL_REACHED
+    assert summary.digest is not None
+    return summary.digest
+
+
+def test_one_seed_is_one_log_and_another_seed_another(tmp_path: Path):
+    first = short_demo(tmp_path / "a", 7)
+    assert short_demo(tmp_path / "b", 7) == first
+    assert short_demo(tmp_path / "c", 8) != first
+
+
+def test_a_lap_of_the_demo_closes(tmp_path: Path):
+    summary = run_fast_demo(DEMO, tmp_path, None)
+    assert summary.lap.outcome is Reason.GOAL_REACHED
+    assert not summary.collided
+    assert summary.closing_error <= GOAL_CLOSING
+    assert summary.distance > 10
+    assert summary.lap.cross_track_rms < 0.05
+    assert (tmp_path / "map.png").exists()
