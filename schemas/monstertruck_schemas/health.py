@@ -76,6 +76,8 @@ class LinkLevel(StrEnum):
     POOR = "poor"
     UNUSABLE = "unusable"
     DOWN = "down"
+    UNKNOWN = "unknown"
+    """Connected by Wi-Fi, but the kernel does not tell the signal."""
 
 
 class LinkHealth(Message):

@@ -1,17 +1,18 @@
 """The sysfs files of a converter with the battery's divider on one channel."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.file_tree import FileTree
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-PERIOD: Final = 0.02
+PERIOD: Final = 0.05
 """Seconds between two conversions."""
+FOLDER: Final = "iio:device0"
 
 
 class IioEmulator:
@@ -46,7 +47,9 @@ class IioEmulator:
         name: str = "battery",
     ) -> None:
         self.name = name
-        self.folder = root / "iio:device0"
+        self.plugged = False
+        """Whether the kernel shows it."""
+        self._files = FileTree(root)
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
@@ -59,21 +62,16 @@ class IioEmulator:
 
     def plug(self) -> None:
         """The kernel found the converter."""
-        elements = self.folder / "scan_elements"
-        elements.mkdir(parents=True, exist_ok=True)
-        (self.folder / "name").write_text(f"{self._device}\n")
-        (self.folder / "in_voltage_scale").write_text("1.000000000\n")
-        (elements / f"{self._stem}_type").write_text("be:u12/16>>0\n")
+        self.plugged = True
+        self._files.put(f"{FOLDER}/name", self._device)
+        self._files.put(f"{FOLDER}/in_voltage_scale", "1.000000000")
+        self._files.put(f"{FOLDER}/scan_elements/{self._stem}_type", "be:u12/16>>0")
         self.convert()
 
     def unplug(self) -> None:
         """The converter is gone."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    @property
-    def plugged(self) -> bool:
-        """Whether the kernel shows it."""
-        return self.folder.exists()
+        self.plugged = False
+        self._files.remove(FOLDER)
 
     async def run(self) -> None:
         """Convert until cancelled."""
@@ -93,9 +91,7 @@ class IioEmulator:
         if text is None:
             counts = self._source(now) * 1000 + self._noise * float(self._rng.standard_normal())
             text = str(int(np.clip(round(counts), 0, self.FULL_SCALE)))
-        scratch = self.folder / ".raw"
-        scratch.write_text(f"{text}\n")
-        scratch.replace(self.folder / f"{self._stem}_raw")
+        self._files.put(f"{FOLDER}/{self._stem}_raw", text)
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault, see the class.

@@ -72,31 +72,31 @@ def test_volts_level_and_charge_are_published_ten_times_a_second(tmp_path: Path)
 def test_low_critical_and_overcharged_are_reported_once_each(tmp_path: Path):
     async def test(rig: Rig) -> None:
         async with background(rig.session()):
-            for volts, seconds in ((23.5, 2), (25.6, 4), (23.5, 2), (21.8, 12), (20.5, 12), (23.0, 32)):
+            for volts, seconds in ((23.5, 2), (25.6, 4), (23.5, 2), (21.8, 4), (20.5, 4), (23.0, 5)):
                 rig.volts = volts
                 await rig.clock.sleep(seconds)
         assert rig.events.reasons() == [
             Reason.BATTERY_OVERCHARGED, Reason.OK, Reason.BATTERY_LOW, Reason.BATTERY_CRITICAL, Reason.OK,
         ]  # fmt: skip
 
-    on_bench(tmp_path, test)
+    on_bench(tmp_path, test, low_after=2.0, critical_after=2.0, clear_after=3.0)
 
 
 def test_a_fresh_motor_current_explains_the_sag_and_a_stale_one_does_not(tmp_path: Path):
     async def test(rig: Rig) -> None:
         rig.volts = 21.8
         async with background(rig.session()):
-            for _ in range(150):
+            for _ in range(40):
                 rig.current(6.0)
                 await rig.clock.sleep(0.1)
             assert rig.out.last.level is BatteryLevel.NORMAL
             assert rig.out.last.voltage == pytest.approx(21.8, abs=0.02)
             assert rig.out.last.rest_voltage == pytest.approx(21.8 + 0.36, abs=0.02)
             rig.current(None)  # feedback without a current keeps the last one for a while
-            await rig.clock.sleep(12)
+            await rig.clock.sleep(4)
             assert rig.out.last.level is BatteryLevel.LOW
 
-    on_bench(tmp_path, test)
+    on_bench(tmp_path, test, low_after=2.0)
 
 
 @pytest.mark.parametrize("fault", ["zero", "full"])
@@ -171,7 +171,7 @@ def test_unknown_faults_are_refused_with_a_list(tmp_path: Path):
         rig.emulator.inject("freeze", "on")
         rig.emulator.inject("bounce", "0.0")
         rig.emulator.convert()
-        assert (rig.emulator.folder / "in_voltage0_raw").read_text() == "2000\n"
+        assert (tmp_path / "iio:device0/in_voltage0_raw").read_text() == "2000\n"
 
     on_bench(tmp_path, test)
 

@@ -1,0 +1,1 @@
+"""Health of the computer the daemon runs on."""

@@ -1,0 +1,51 @@
+"""Configuration of the host monitor."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import Schema
+
+Celsius = Annotated[float, Field(ge=-40, le=150)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Seconds = Annotated[float, Field(ge=0, le=3600)]
+Bytes = Annotated[int, Field(ge=0)]
+
+GIGABYTE = 1_000_000_000
+
+
+class HostHealthConfig(Schema):
+    """When the computer is in need; every ``..._clear`` is where that ends again."""
+
+    kind: Literal["host_health"] = "host_health"
+    rate: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Looks a second"""
+    after: Seconds = 3.0
+    """Seconds beyond a limit before it is reported"""
+    hot: Celsius = 80.0
+    """Degree Celsius of the hottest thermal zone"""
+    hot_clear: Celsius = 75.0
+    busy: Share = 0.95
+    """Busy share of all cores"""
+    busy_clear: Share = 0.85
+    busy_after: Seconds = 10.0
+    """As ``after``: planning may take all there is for a while"""
+    slow: Share = 0.8
+    """Greatest allowed clock as a share of the greatest possible one; lower it where a cap is wanted"""
+    memory: Share = 0.1
+    """Available share of the memory"""
+    memory_clear: Share = 0.15
+    disk: Bytes = GIGABYTE
+    """Free bytes of the file system that holds ``disk_path``"""
+    disk_clear: Bytes = 3 * GIGABYTE // 2
+    disk_path: Path = Path("runs")
+    """Where logs are written; need not exist yet"""
+
+    @model_validator(mode="after")
+    def _clear_of_the_limits(self) -> Self:
+        pairs = (("hot_clear", "hot"), ("busy_clear", "busy"), ("memory", "memory_clear"), ("disk", "disk_clear"))
+        for lower, upper in pairs:
+            if not getattr(self, lower) < getattr(self, upper):
+                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+        return self

@@ -1,0 +1,119 @@
+"""Host monitor: looks once a second, reports what gets short."""
+
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.host_health.config import HostHealthConfig
+from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_runtime.thresholds import Alarm, Threshold
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import HostHealth
+from monstertruck_schemas.reasons import Reason
+
+SEVERITIES: Final = {Reason.DISK_LOW: Severity.ERROR, Reason.MEMORY_LOW: Severity.ERROR}
+"""The others are warnings."""
+
+
+class HostHealthDriver:
+    """Publishes the computer's health and reports every limit that is passed, and when it is over.
+
+    Args:
+        config: limits.
+        clock: time.
+        out: host health.
+        events: what gets short, and when it is over.
+        root: folder that holds ``proc`` and ``sys``.
+        offload: where files are read.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: HostHealthConfig,
+        clock: Clock,
+        out: Publisher[HostHealth],
+        events: EventSink,
+        *,
+        root: Path = Path("/"),
+        offload: Offload = in_thread,
+        name: str = "host",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._root = root
+        self._offload = offload
+        self._before: Reading | None = None
+        self._alarms = {
+            Reason.HOST_HOT: Alarm(Threshold(config.hot, config.hot_clear, config.after)),
+            Reason.HOST_THROTTLED: Alarm(Threshold(0.5, 0.25, config.after)),
+            Reason.HOST_BUSY: Alarm(Threshold(config.busy, config.busy_clear, config.busy_after)),
+            Reason.MEMORY_LOW: Alarm(Threshold(config.memory, config.memory_clear, config.after)),
+            Reason.DISK_LOW: Alarm(Threshold(config.disk, config.disk_clear, config.after)),
+        }
+
+    async def run(self, ready: Ready) -> None:
+        """Look until cancelled.
+
+        Raises:
+            DeviceError: /proc cannot be read, or the disk cannot be asked.
+            ProtocolError: /proc is not as documented.
+        """
+        schedule = Schedule(self._clock, self._config.rate)
+        while True:
+            await schedule.next()
+            stamp = self._clock.now()
+            reading = await self._offload(lambda: read_host(self._root, self._config.disk_path))
+            health = self._health(stamp, reading)
+            self._out.put(health)
+            self._judge(health)
+            self._before = reading
+            ready()
+
+    def _health(self, stamp: int, reading: Reading) -> HostHealth:
+        return HostHealth(
+            stamp=stamp,
+            received=self._clock.now(),
+            seq=self._out.next_seq(),
+            load=reading.load,
+            cores=reading.cores,
+            cpu=None if self._before is None else busy_share(self._before.times, reading.times),
+            temperature=reading.temperature,
+            frequency=reading.frequency,
+            frequency_share=reading.frequency_share,
+            throttled=self._is_throttled(reading),
+            memory_total=reading.memory_total,
+            memory_available=reading.memory_available,
+            disk_total=reading.disk.total,
+            disk_free=reading.disk.free,
+            daemon_memory=reading.daemon_memory,
+            daemon_files=reading.daemon_files,
+        )
+
+    def _is_throttled(self, reading: Reading) -> bool:
+        hotter = self._before is not None and reading.throttle_events > self._before.throttle_events
+        capped = reading.frequency_share is not None and reading.frequency_share < self._config.slow
+        return reading.firmware_throttled or hotter or capped
+
+    def _judge(self, health: HostHealth) -> None:
+        values: dict[Reason, float | None] = {
+            Reason.HOST_HOT: health.temperature,
+            Reason.HOST_THROTTLED: float(health.throttled),
+            Reason.HOST_BUSY: health.cpu,
+            Reason.MEMORY_LOW: health.memory_available / max(health.memory_total, 1),
+            Reason.DISK_LOW: float(health.disk_free),
+        }
+        for reason, value in values.items():
+            alarm = self._alarms[reason]
+            if not alarm.update(health.stamp, value):
+                continue
+            if alarm.active:
+                self._events(reason, SEVERITIES.get(reason, Severity.WARNING), self.name, reason.text, value=value)
+            else:
+                self._events(Reason.OK, Severity.INFO, self.name, f"over: {reason.text}", value=value)

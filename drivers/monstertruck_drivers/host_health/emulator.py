@@ -1,0 +1,117 @@
+"""Files of a small computer with four cores, as the kernel writes them."""
+
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.file_tree import FileTree
+from monstertruck_drivers.host_health.readings import FIRMWARE_THROTTLED
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+
+PERIOD: Final = 0.5
+"""Seconds between two writes."""
+TICKS: Final = 100
+"""Processor ticks a second and core."""
+CORES: Final = 4
+MAX_KILOHERTZ: Final = 1_800_000
+MEMORY_KIB: Final = 4_000_000
+
+
+class HostEmulator:
+    """Board with one thermal zone, cpufreq, throttle counters and the Raspberry Pi's firmware word.
+
+    Faults (``inject``): ``temperature C``, ``busy SHARE``, ``memory SHARE`` (available), ``cap SHARE`` (of the
+    clock), ``firmware HEX``, ``throttle`` (one more event of the counter), ``blind`` (no /sys at all), ``broken``
+    (/proc/stat is empty).
+
+    The disk is the real one that ``disk_path`` of the driver is on.
+
+    Args:
+        root: folder that stands for /.
+        clock: time.
+    """
+
+    def __init__(self, root: Path, clock: Clock, name: str = "host") -> None:
+        self.name = name
+        self._files = FileTree(root)
+        self._clock = clock
+        self._busy_ticks = self._ticks = 0
+        self._busy = 0.25
+        self._celsius = 50.0
+        self._memory = 0.6
+        self._cap = 1.0
+        self._firmware = 0
+        self._throttled = 0
+        self._sys = True
+        self._broken = False
+        self.write()
+
+    async def run(self) -> None:
+        """Let time pass until cancelled."""
+        while True:
+            await self._clock.sleep(PERIOD)
+            ticks = round(TICKS * CORES * PERIOD)
+            self._ticks += ticks
+            self._busy_ticks += round(ticks * self._busy)
+            self.write()
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "temperature", (value,):
+                    self._celsius = float(value)
+                case "busy", (value,):
+                    self._busy = float(value)
+                case "memory", (value,):
+                    self._memory = float(value)
+                case "cap", (value,):
+                    self._cap = float(value)
+                case "firmware", (value,):
+                    self._firmware = int(value, 16)
+                case "throttle", ():
+                    self._throttled += 1
+                case "blind", ():
+                    self._sys = False
+                case "broken", ():
+                    self._broken = True
+                case _:
+                    raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: temperature C, busy SHARE, "
+                "memory SHARE, cap SHARE, firmware HEX, throttle, blind, broken"
+            ) from error
+        self.write()
+
+    def write(self) -> None:
+        """Bring all files up to date, each at once and whole."""
+        idle = self._ticks - self._busy_ticks
+        rows = [f"cpu  {self._busy_ticks} 0 0 {idle} 0 0 0 0 0 0"]
+        rows += [f"cpu{core} {self._busy_ticks // CORES} 0 0 {idle // CORES} 0 0 0 0 0 0" for core in range(CORES)]
+        self._files.put("proc/stat", "" if self._broken else "\n".join([*rows, "intr 1", "ctxt 2"]))
+        self._files.put("proc/loadavg", f"{self._busy * CORES:.2f} 0.90 0.80 1/200 4711")
+        available = round(MEMORY_KIB * self._memory)
+        self._files.put("proc/meminfo", f"MemTotal: {MEMORY_KIB} kB\nMemFree: 1 kB\nMemAvailable: {available} kB")
+        self._files.put("proc/self/statm", "20000 12000 3000 1 0 9000 0")
+        for descriptor in range(7):
+            self._files.put(f"proc/self/fd/{descriptor}", "")
+        if self._sys:
+            self._write_sys()
+        else:
+            self._files.remove("sys")
+
+    def _write_sys(self) -> None:
+        self._files.put("sys/class/thermal/thermal_zone0/temp", str(round(self._celsius * 1000)))
+        self._files.put("sys/class/thermal/thermal_zone1/temp", "-274000")
+        self._files.put(FIRMWARE_THROTTLED, f"{self._firmware:x}")
+        for core in range(CORES):
+            folder = f"sys/devices/system/cpu/cpu{core}"
+            self._files.put(f"{folder}/cpufreq/cpuinfo_max_freq", str(MAX_KILOHERTZ))
+            self._files.put(f"{folder}/cpufreq/scaling_max_freq", str(round(MAX_KILOHERTZ * self._cap)))
+            self._files.put(f"{folder}/cpufreq/scaling_cur_freq", str(round(MAX_KILOHERTZ * self._cap * 0.9)))
+            self._files.put(f"{folder}/thermal_throttle/core_throttle_count", str(self._throttled))

@@ -1,0 +1,37 @@
+"""Configuration of the link monitor."""
+
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import Schema
+
+Dbm = Annotated[float, Field(ge=-120, le=0)]
+
+
+class LinkQualityConfig(Schema):
+    """Which interface is watched, and what its signal is worth (rules of thumb)."""
+
+    kind: Literal["link_quality"] = "link_quality"
+    interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
+    """Name of the interface; None = the connected Wi-Fi, else the connected cable"""
+    rate: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Looks a second"""
+    smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0
+    """Seconds, time constant of the signal's mean"""
+    excellent: Dbm = -50.0
+    """dBm from which the signal is excellent"""
+    good: Dbm = -67.0
+    fair: Dbm = -75.0
+    poor: Dbm = -85.0
+    """Below it the link is unusable"""
+    hysteresis: Annotated[float, Field(ge=0, le=20)] = 3.0
+    """Decibels above its limit from which a better level is reached again"""
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> Self:
+        for lower, upper in pairwise(("poor", "fair", "good", "excellent")):
+            if not getattr(self, lower) < getattr(self, upper):
+                raise ValueError(f"{lower} {getattr(self, lower)} < {upper} {getattr(self, upper)} does not hold")
+        return self

@@ -1,0 +1,113 @@
+"""Link monitor: looks at the interface once a second."""
+
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.link_quality.config import LinkQualityConfig
+from monstertruck_drivers.link_quality.interfaces import Sample, choose, read_interfaces
+from monstertruck_drivers.link_quality.judge import LinkJudge
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
+from monstertruck_schemas.reasons import Reason
+
+CONCERNS: Final = {
+    LinkLevel.POOR: (Reason.LINK_WEAK, Severity.WARNING),
+    LinkLevel.UNUSABLE: (Reason.LINK_WEAK, Severity.WARNING),
+    LinkLevel.DOWN: (Reason.LINK_DOWN, Severity.WARNING),
+}
+FINE: Final = (Reason.OK, Severity.INFO)
+
+
+class LinkQualityDriver:
+    """Publishes the link's quality and reports when it becomes weak, is lost, and is fine again.
+
+    That a station is out of reach is found by its heartbeat, never by the signal: this is for people and plans.
+
+    Args:
+        config: interface and limits.
+        clock: time.
+        out: link health.
+        events: changes for the worse and back.
+        root: folder that holds ``proc`` and ``sys``.
+        offload: where files are read.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: LinkQualityConfig,
+        clock: Clock,
+        out: Publisher[LinkHealth],
+        events: EventSink,
+        *,
+        root: Path = Path("/"),
+        offload: Offload = in_thread,
+        name: str = "link",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._root = root
+        self._offload = offload
+        self._judge = LinkJudge(config)
+        self._concern = FINE
+        self._before: tuple[int, Sample] | None = None
+
+    async def run(self, ready: Ready) -> None:
+        """Look for ever; nothing the kernel says or leaves unsaid ends the session."""
+        schedule = Schedule(self._clock, self._config.rate)
+        while True:
+            await schedule.next()
+            stamp = self._clock.now()
+            samples = await self._offload(lambda: read_interfaces(self._root))
+            self._publish(stamp, choose(samples, self._config.interface))
+            ready()
+
+    def _publish(self, stamp: int, sample: Sample | None) -> None:
+        level = self._judge.update(stamp, sample)
+        self._report(level, sample)
+        receive, send = self._rates(stamp, sample)
+        wifi = sample is not None and sample.medium is LinkMedium.WIFI
+        signal = sample.signal if sample is not None and sample.connected else None
+        self._out.put(
+            LinkHealth(
+                stamp=stamp,
+                received=self._clock.now(),
+                seq=self._out.next_seq(),
+                interface=sample.name if sample is not None else None,
+                medium=sample.medium if sample is not None else None,
+                level=level,
+                signal=self._judge.signal,
+                raw_signal=signal.level if signal is not None else None,
+                noise=signal.noise if signal is not None else None,
+                bit_rate=sample.bit_rate if sample is not None and not wifi else None,
+                receive_rate=receive,
+                send_rate=send,
+                errors=sample.errors if sample is not None else 0,
+            )
+        )
+        self._before = None if sample is None else (stamp, sample)
+
+    def _report(self, level: LinkLevel, sample: Sample | None) -> None:
+        concern = CONCERNS.get(level, FINE)
+        if concern == self._concern:
+            return
+        self._concern = concern
+        name = sample.name if sample is not None else self._config.interface or "no interface"
+        self._events(*concern, self.name, f"{name}: link is {level.value}", signal=self._judge.signal)
+
+    def _rates(self, stamp: int, sample: Sample | None) -> tuple[float | None, float | None]:
+        """Bytes a second received and sent since the last look at the same interface."""
+        if self._before is None or sample is None:
+            return None, None
+        then, before = self._before
+        if before.name != sample.name or sample.received < before.received or sample.sent < before.sent:
+            return None, None  # another interface, or its counters began anew
+        seconds = (stamp - then) / SECOND
+        return (sample.received - before.received) / seconds, (sample.sent - before.sent) / seconds

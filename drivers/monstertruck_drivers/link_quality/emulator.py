@@ -1,0 +1,116 @@
+"""Files of a Wi-Fi and a wired interface, as the kernel writes them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.file_tree import FileTree
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+
+PERIOD: Final = 0.5
+"""Seconds between two changes of the signal."""
+HEADER: Final = (
+    "Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE\n"
+    " face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22\n"
+)
+STYLES: Final = ("normal", "no_dot", "unsigned", "header", "missing")
+ON_AIR: Final = 20_000
+"""Bytes a second both ways while connected."""
+
+
+class NetworkEmulator:
+    """``wlan0`` with a signal, ``eth0`` with or without a cable, ``lo``.
+
+    Faults (``inject``): ``signal DBM`` (instead of the source), ``style normal|no_dot|unsigned|header|missing`` (how
+    /proc/net/wireless is printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged),
+    ``plug``, ``reset`` (counters begin anew).
+
+    Args:
+        root: folder that stands for /.
+        clock: time.
+        signal: dBm at an instant, ns; None = out of reach.
+    """
+
+    def __init__(
+        self, root: Path, clock: Clock, signal: Callable[[int], float | None] = lambda _: -55.0, name: str = "link"
+    ) -> None:
+        self.name = name
+        self._files = FileTree(root)
+        self._clock = clock
+        self._signal = signal
+        self._style = "normal"
+        self._wifi = self._present = True
+        self._cable = False
+        self._bytes = 0
+        self.write()
+
+    async def run(self) -> None:
+        """Follow the signal until cancelled."""
+        while True:
+            await self._clock.sleep(PERIOD)
+            self._bytes += round(ON_AIR * PERIOD)
+            self.write()
+
+    def write(self) -> None:
+        """Bring all files up to date, each at once and whole."""
+        level = self._signal(self._clock.now()) if self._wifi else None
+        self._interface("lo", {"type": "772", "operstate": "unknown", "carrier": "1"})
+        self._interface("eth0", {"type": "1", "speed": "1000" if self._cable else "-1", "device/vendor": "0x8086"})
+        self._carrier("eth0", self._cable)
+        if self._present:
+            self._interface("wlan0", {"type": "1", "phy80211/index": "0"})
+            self._carrier("wlan0", level is not None)
+        else:
+            self._files.remove("sys/class/net/wlan0")
+        self._wireless(level)
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "signal", (dbm,):
+                    level = float(dbm)
+                    self._signal = lambda _: level
+                case "style", (style,) if style in STYLES:
+                    self._style = style
+                case "wifi", (("on" | "off") as state,):
+                    self._wifi = state == "on"
+                case "cable", (("on" | "off") as state,):
+                    self._cable = state == "on"
+                case (("remove" | "plug"), ()):
+                    self._present = fault == "plug"
+                case "reset", ():
+                    self._bytes = 0
+                case _:
+                    raise ValueError("unknown")
+        except ValueError as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: signal DBM, "
+                f"style {'|'.join(STYLES)}, wifi on|off, cable on|off, remove, plug, reset"
+            ) from error
+        self.write()
+
+    def _interface(self, name: str, files: dict[str, str]) -> None:
+        counters = {"rx_bytes": self._bytes, "tx_bytes": self._bytes // 2, "rx_errors": 1, "tx_dropped": 2}
+        for file, text in files.items():
+            self._files.put(f"sys/class/net/{name}/{file}", text)
+        for counter, value in counters.items():
+            self._files.put(f"sys/class/net/{name}/statistics/{counter}", str(value))
+
+    def _carrier(self, name: str, up: bool) -> None:
+        self._files.put(f"sys/class/net/{name}/operstate", "up" if up else "down")
+        self._files.put(f"sys/class/net/{name}/carrier", "1" if up else "0")
+
+    def _wireless(self, level: float | None) -> None:
+        if self._style == "missing":
+            self._files.remove("proc/net/wireless")
+            return
+        dot = "" if self._style == "no_dot" else "."
+        shown = 0 if level is None else round(level) + (256 if self._style == "unsigned" else 0)
+        row = f" wlan0: 0000   54{dot}  {shown}{dot}  -256        0      0      0      3     42        0\n"
+        self._files.put("proc/net/wireless", HEADER + (row if self._present and self._style != "header" else ""))

@@ -1,0 +1,109 @@
+"""Network interfaces in /sys/class/net and /proc/net/wireless; blocks for as long as reading small files takes.
+
+Source: kernel documentation, ABI/testing/sysfs-class-net, and the text the kernel's wireless extensions print.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.small_files import number_of, text_of
+from monstertruck_schemas.health import LinkMedium
+
+ARPHRD_ETHER: Final = 1
+"""``type`` of Ethernet and Wi-Fi."""
+MEGABIT: Final = 1e6
+ERROR_COUNTERS: Final = ("rx_errors", "tx_errors", "rx_dropped", "tx_dropped")
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One row of /proc/net/wireless."""
+
+    level: float | None
+    """dBm; None = not connected."""
+    noise: float | None
+    """dBm; None = unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """An interface at one instant."""
+
+    name: str
+    medium: LinkMedium
+    connected: bool
+    signal: Signal | None
+    """None on a cable, and where the kernel has no wireless-extensions compatibility."""
+    bit_rate: float | None
+    """Bit/s."""
+    received: int
+    """Bytes since the interface came up."""
+    sent: int
+    errors: int
+
+
+def parse_wireless(text: str) -> dict[str, Signal]:
+    """Rows by interface; header and damaged lines are skipped."""
+    rows = {}
+    for line in text.splitlines():
+        name, colon, rest = line.partition(":")
+        fields = rest.split()
+        try:
+            # status, link quality, level, noise: a dot behind a number means "new since the last look"
+            level, noise = (int(field.rstrip(".")) for field in fields[2:4])
+        except ValueError:
+            continue
+        if colon:
+            rows[name.strip()] = Signal(_dbm(level), _dbm(noise))
+    return rows
+
+
+def _dbm(value: int) -> float | None:
+    """Some drivers print the byte without its sign; 0 and -256 stand for nothing."""
+    if value in (0, -256):
+        return None
+    return float(value - 256 if value > 63 else value)
+
+
+def read_interfaces(root: Path) -> list[Sample]:
+    """All Wi-Fi and wired interfaces, bridges and the like left out.
+
+    Args:
+        root: folder that holds ``proc`` and ``sys``.
+    """
+    signals = parse_wireless(text_of(root / "proc/net/wireless") or "")
+    folders = sorted((root / "sys/class/net").glob("*"))
+    return [sample for folder in folders if (sample := _read(folder, signals)) is not None]
+
+
+def choose(samples: list[Sample], name: str | None) -> Sample | None:
+    """The interface of that name; without a name the one the truck most likely talks over.
+
+    That is Wi-Fi before cable, but whatever is connected before what is not: it is Wi-Fi that gets weak.
+    """
+    if name is not None:
+        return next((sample for sample in samples if sample.name == name), None)
+    return min(samples, key=lambda sample: (not sample.connected, sample.medium is not LinkMedium.WIFI), default=None)
+
+
+def _read(folder: Path, signals: dict[str, Signal]) -> Sample | None:
+    name = folder.name
+    wifi = name in signals or (folder / "wireless").exists() or (folder / "phy80211").exists()
+    physical = wifi or (folder / "device").exists()
+    if not physical or number_of(folder / "type") != ARPHRD_ETHER:
+        return None
+    signal = signals.get(name) if wifi else None
+    connected = text_of(folder / "operstate") in ("up", "unknown") and number_of(folder / "carrier") == 1
+    speed = number_of(folder / "speed")
+    statistics = folder / "statistics"
+    return Sample(
+        name=name,
+        medium=LinkMedium.WIFI if wifi else LinkMedium.ETHERNET,
+        connected=connected,
+        signal=signal,
+        bit_rate=speed * MEGABIT if speed is not None and speed > 0 else None,
+        received=number_of(statistics / "rx_bytes") or 0,
+        sent=number_of(statistics / "tx_bytes") or 0,
+        errors=sum(number_of(statistics / counter) or 0 for counter in ERROR_COUNTERS),
+    )
