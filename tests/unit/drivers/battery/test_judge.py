@@ -2,10 +2,13 @@
 
 from collections.abc import Iterable
 
+import numpy as np
 import pytest
 
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.battery.judge import CELL_VOLTS, BatteryJudge, charge_of
+from monstertruck_drivers.world.battery import Battery
+from monstertruck_drivers.world.config import BatteryConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import BatteryLevel
 
@@ -167,3 +170,21 @@ def test_charge_follows_the_table_and_stays_within_its_ends():
 def test_limits_must_be_in_order():
     with pytest.raises(ValueError, match=r"overcharged_clear 25\.4 < overcharged 25\.3 does not hold"):
         PackConfig(overcharged_clear=25.4)
+
+
+@pytest.mark.parametrize("motor_w", [0.0, 40.0, 100.0])
+def test_with_a_fitted_resistance_the_charge_is_right_to_a_tenth(motor_w: float):
+    """Against the simulated pack, through its divider and a 10-bit converter, from full to a tenth."""
+    pack = Battery(BatteryConfig())
+    judge = BatteryJudge(PackConfig(resistance=0.12))
+    rng = np.random.default_rng(0)
+    time, errors = 0, []
+    while pack.charge > 0.1:
+        pack.step(20.0, motor_w)
+        for _ in range(10):
+            time += SECOND // 10
+            counts = round((pack.analog_volts + 0.003 * rng.standard_normal()) / 5 * 1023)
+            verdict = judge.update(time, counts * 50 / 1023, motor_w / pack.volts)
+        assert verdict.rest_voltage is not None
+        errors.append(charge_of(verdict.rest_voltage / 6) - pack.charge)
+    assert max(map(abs, errors)) < 0.1
