@@ -1,10 +1,11 @@
 """Reproducible noise: every draw is a function of (seed, stream, index), never of who asked before."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 LIDAR, CURRENT, COMPASS, COMPASS_FIXED, SLIP, ANALOG = range(6)
 """Streams."""
+
+_BLOCK = 512
 
 
 def generator(seed: int, stream: int, index: int = 0) -> np.random.Generator:
@@ -12,8 +13,31 @@ def generator(seed: int, stream: int, index: int = 0) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=[seed, stream], counter=[0, index, 0, 0]))
 
 
+class WhiteNoise:
+    """Standard normal noise of ``size`` channels, drawn by the block of neighbouring indices.
+
+    Args:
+        seed: of the world.
+        stream: one of the streams above.
+        size: channels.
+    """
+
+    def __init__(self, seed: int, stream: int, size: int = 1) -> None:
+        self._seed, self._stream, self._size = seed, stream, size
+        self._block = -1
+        self._rows: list[list[float]] = []
+
+    def at(self, index: int) -> list[float]:
+        """Values of an index (0 or more), one a channel."""
+        block, row = divmod(index, _BLOCK)
+        if block != self._block:
+            drawn = generator(self._seed, self._stream, block).standard_normal((_BLOCK, self._size))
+            self._block, self._rows = block, drawn.tolist()
+        return self._rows[row]
+
+
 class SlowNoise:
-    """Standard normal noise of ``size`` channels: drawn every ``period_ns``, straight lines between.
+    """White noise drawn every ``period_ns``, straight lines between.
 
     Args:
         seed: of the world.
@@ -23,19 +47,16 @@ class SlowNoise:
     """
 
     def __init__(self, seed: int, stream: int, size: int, period_ns: int) -> None:
-        self._seed, self._stream, self._size, self._period = seed, stream, size, period_ns
+        self._white = WhiteNoise(seed, stream, size)
+        self._period = period_ns
         self._slot = -1
-        self._ends: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.zeros(size), np.zeros(size))
+        self._ends: tuple[list[float], list[float]] = ([], [])
 
     def at(self, elapsed_ns: int) -> list[float]:
         """Values at a time since the world's start, one a channel."""
         slot, rest = divmod(elapsed_ns, self._period)
         if slot != self._slot:
-            self._ends = (self._draw(slot), self._draw(slot + 1))
+            self._ends = self._white.at(slot), self._white.at(slot + 1)
             self._slot = slot
-        before, after = self._ends
-        values: list[float] = (before + (after - before) * (rest / self._period)).tolist()
-        return values
-
-    def _draw(self, slot: int) -> NDArray[np.float64]:
-        return generator(self._seed, self._stream, slot).standard_normal(self._size)
+        part = rest / self._period
+        return [before + (after - before) * part for before, after in zip(*self._ends, strict=True)]

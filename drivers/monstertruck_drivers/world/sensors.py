@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.base import CompassReading, MotorReading, PulseSource
 from monstertruck_drivers.world.config import BatteryConfig, CompassConfig, LidarConfig, MotorConfig
-from monstertruck_drivers.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, generator
+from monstertruck_drivers.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
 from monstertruck_drivers.world.truck_plant import TruckPlant
 
 STEPS = 769
@@ -94,7 +94,8 @@ class SimulatedMotor:
     """``MotorPlant``: the shaft in the controller's own sign."""
 
     def __init__(self, plant: TruckPlant, config: MotorConfig, seed: int | None) -> None:
-        self._plant, self._config, self._seed = plant, config, seed
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, CURRENT) if seed is not None else None
         self._sign = -1.0 if config.inverted else 1.0
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
@@ -106,9 +107,8 @@ class SimulatedMotor:
         """State at ``time_ns``."""
         self._plant.advance(time_ns)
         shaft, current = self._plant.shaft, self._plant.current
-        if self._seed is not None:
-            noise = generator(self._seed, CURRENT, self._plant.slot(time_ns, 1_000_000))
-            current += self._config.current_noise * noise.standard_normal()
+        if self._noise is not None:
+            current += self._config.current_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[0]
         return MotorReading(
             turns=self._sign * shaft.turns,
             rpm=self._sign * shaft.rpm,
@@ -122,7 +122,8 @@ class SimulatedServos:
     """``ServoPlant``: both steering servos, and the battery at the analog input."""
 
     def __init__(self, plant: TruckPlant, config: BatteryConfig, seed: int | None) -> None:
-        self._plant, self._config, self._seed = plant, config, seed
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, ANALOG) if seed is not None else None
 
     def attach(self, pulses: PulseSource) -> None:
         """Name the controller whose pulses move the servos."""
@@ -138,9 +139,8 @@ class SimulatedServos:
             return 0.0
         self._plant.advance(time_ns)
         volts = self._plant.battery.analog_volts
-        if self._seed is not None:
-            noise = generator(self._seed, ANALOG, self._plant.slot(time_ns, 1_000_000))
-            volts += self._config.analog_noise * noise.standard_normal()
+        if self._noise is not None:
+            volts += self._config.analog_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[0]
         return max(0.0, volts)
 
 
@@ -152,28 +152,29 @@ class SimulatedCompass:
     """
 
     def __init__(self, plant: TruckPlant, config: CompassConfig, seed: int | None) -> None:
-        self._plant, self._config, self._seed = plant, config, seed
-        self._phases, self._bias = np.zeros(2), np.zeros(2)
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, COMPASS, 3) if seed is not None else None
+        self._phases, self._bias = [0.0, 0.0], [0.0, 0.0]
         self._deviation = 0.0
         if seed is not None:
             fixed = generator(seed, COMPASS_FIXED)
-            self._phases = fixed.uniform(0, 2 * pi, 2)
-            self._bias = radians(config.tilt_bias_deg) * fixed.uniform(-1, 1, 2)
+            self._phases = fixed.uniform(0, 2 * pi, 2).tolist()
+            self._bias = (radians(config.tilt_bias_deg) * fixed.uniform(-1, 1, 2)).tolist()
             self._deviation = radians(config.deviation_deg)
 
     def deviation(self, heading: float) -> float:
         """Fixed heading error, rad: a one-cycle and a two-cycle wave, together at most the configured amplitude."""
         one, two = heading + self._phases[0], 2 * heading + self._phases[1]
-        return self._deviation * float(0.6 * sin(one) + 0.4 * sin(two))
+        return self._deviation * (0.6 * sin(one) + 0.4 * sin(two))
 
     def compass(self, time_ns: int) -> CompassReading:
         """Reading at ``time_ns``."""
         self._plant.advance(time_ns)
         config = self._config
-        noise = np.zeros(3)
-        if self._seed is not None:
-            slot = self._plant.slot(time_ns, 10_000_000)
-            noise = radians(config.noise_deg) * generator(self._seed, COMPASS, slot).standard_normal(3)
+        noise = [0.0, 0.0, 0.0]
+        if self._noise is not None:
+            sigma = radians(config.noise_deg)
+            noise = [sigma * value for value in self._noise.at(self._plant.slot(time_ns, 10_000_000))]
         pitch, roll = self._plant.attitude
         heading = config.north_yaw - self._plant.yaw
         heading += self.deviation(heading) + noise[0]

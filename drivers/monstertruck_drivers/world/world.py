@@ -1,5 +1,6 @@
 """One simulated world: map, obstacles, truck and the physics of its four devices."""
 
+from math import hypot
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,9 @@ from monstertruck_drivers.world.sensors import SimulatedCompass, SimulatedLidar,
 from monstertruck_drivers.world.terrain import load_profile, profile_path, rocking
 from monstertruck_drivers.world.truck_plant import Pose, TruckPlant, TruthState
 from monstertruck_runtime.errors import InputError
+
+_ROOM = 0.05
+"""Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""
 
 
 class World:
@@ -41,6 +45,8 @@ class World:
         self._truck = config.truck
         self._obstacles: tuple[Obstacle, ...] = ()
         self._discs, self._segments = discs_and_segments(())
+        self._free: Pose | None = None
+        """Pose with free room around."""
         if self._overlap(place.map.cells != FREE, start) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
         self._occupied = place.map.cells == OCCUPIED
@@ -91,17 +97,33 @@ class World:
     def _set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
         self._obstacles = obstacles
         self._discs, self._segments = discs_and_segments(obstacles)
+        self._free = None
 
     def _contact(self, x: float, y: float, yaw: float) -> float:
-        depth = self._overlap(self._occupied, (x, y, yaw))
+        pose = (x, y, yaw)
+        if self._free is not None and self._way(self._free, pose) < _ROOM:
+            return 0.0
+        self._free = pose if self._depth(pose, _ROOM) == 0.0 else None
+        return 0.0 if self._free else self._depth(pose)
+
+    def _way(self, a: Pose, b: Pose) -> float:
+        """No point of the footprint is further from its place at the other pose than this, m."""
+        return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * hypot(self._truck.length, self._truck.width) / 2
+
+    def _depth(self, pose: Pose, room: float = 0.0) -> float:
+        """How deep the footprint, grown by ``room`` all around, reaches into things, m."""
+        depth = self._overlap(self._occupied, pose, room)
         if self._obstacles:
-            footprint = Box(x, y, self._truck.length, self._truck.width, yaw)
+            x, y, yaw = pose
+            footprint = Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
             depth += sum(penetration(footprint, obstacle) for obstacle in self._obstacles)
         return depth
 
-    def _overlap(self, solid: NDArray[np.bool_], pose: Pose) -> float:
+    def _overlap(self, solid: NDArray[np.bool_], pose: Pose, room: float = 0.0) -> float:
         (x, y, yaw), (x0, y0), truck = pose, self.map.origin, self._truck
-        depth: float = grid_penetration(solid, self.map.resolution, x - x0, y - y0, yaw, truck.length, truck.width)
+        depth: float = grid_penetration(
+            solid, self.map.resolution, x - x0, y - y0, yaw, truck.length + 2 * room, truck.width + 2 * room
+        )
         return depth
 
     def _cast(

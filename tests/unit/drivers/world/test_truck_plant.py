@@ -285,3 +285,27 @@ def test_battery_reaches_the_analog_input_and_can_be_exchanged(field):
     assert driver.world.servos.analog_volts(5, driver.now) == pytest.approx(truth.supply_v / 10, abs=0.001)
     assert truth.supply_v < 22.2
     assert driver.world.motor.reading(driver.now).supply_v == truth.supply_v
+
+
+def test_contact_is_tested_whenever_something_is_near(field):
+    """Free room that is known spares tests, never a contact."""
+    world = field(walls=[(0.85, -2, 0.9, 2), (-2, 0.3, 2, 0.35)]).world
+    t = np.linspace(0, 20, 3000)
+    poses = np.stack([0.5 + 0.2 * np.sin(t), 0.1 * np.cos(0.7 * t), 0.3 * t], axis=1).tolist()
+    depths = [world._contact(*pose) for pose in poses]
+    assert depths == [world._depth(tuple(pose)) for pose in poses]
+    assert 300 < np.count_nonzero(depths) < 2700
+
+
+def test_an_obstacle_put_beside_the_truck_is_felt_at_once(field):
+    world = field().world
+    assert world._contact(0.0, 0.0, 0.0) == 0.0
+    world.add(0, Disc(0.3, 0.0, 0.1))
+    assert world._contact(0.0, 0.0, 0.0) == pytest.approx(0.1 - (0.3 - 0.235))
+
+
+@pytest.mark.parametrize(
+    ("charge", "cell"), [(-0.1, 3.27), (0.0, 3.27), (0.025, 3.44), (0.5, 3.84), (1.0, 4.2), (1.1, 4.2)]
+)
+def test_rest_voltage_is_straight_between_the_tables_points(charge, cell):
+    assert rest_voltage(charge) == pytest.approx(6 * cell)
