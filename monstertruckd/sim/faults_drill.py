@@ -49,9 +49,10 @@ def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
 class _Drill:
     """One run of one scenario."""
 
-    def __init__(self, scenario: Scenario, rig: VirtualRig) -> None:
+    def __init__(self, scenario: Scenario, rig: VirtualRig, driven: float) -> None:
         self.scenario = scenario
         self.rig = rig
+        self.driven = driven
         self.clock = rig.clock
         self.station = Station(rig)
         self.stage = Stage(rig, self.station)
@@ -73,7 +74,7 @@ class _Drill:
             await self._until(lambda: self.ready() and self.armable(), "the truck to be ready")
             if not self.stands:
                 await self.drive()
-                await self.clock.sleep(3.0)
+                await self.clock.sleep(self.driven)
             self.injected = self.clock.now()
             scenario.inject(self.stage)
             await self.clock.sleep(scenario.lead)
@@ -172,7 +173,7 @@ class _Drill:
 
     def _reaction(self, **more: Any) -> Reaction:
         stopped = self._gate_stops()
-        bytes_at = stop_bytes(self.wire, self.injected)
+        bytes_at = None if self.stands else stop_bytes(self.wire, self.injected)
         still = self._standstill()
         return Reaction(
             fault=self.scenario.name,
@@ -252,20 +253,23 @@ def _unready(table: HealthTable) -> dict[str, Reason]:
     return {row.name: row.reason for row in table.services if row.state is not ServiceState.READY}
 
 
-async def measure(scenario: Scenario, config: SimulatedTruckConfig, clock: VirtualClock) -> Reaction:
+async def measure(
+    scenario: Scenario, config: SimulatedTruckConfig, clock: VirtualClock, driven: float = 3.0
+) -> Reaction:
     """Run one scenario.
 
     Args:
         scenario: what to do.
         config: of the truck; recorder and map are left out unless the scenario's overlay has them.
         clock: of the running virtual loop.
+        driven: seconds at speed before the fault; shifts it against the ticks and exchanges it meets.
 
     Raises:
         NoAnswerError: the truck did not come to drive in the first place.
     """
     plain = with_overlay(config, {"recorder": None, "map": None})
     rig = VirtualRig(with_overlay(plain, scenario.overlay), clock)
-    drill = _Drill(scenario, rig)
+    drill = _Drill(scenario, rig, driven)
     reaction = None
     try:
         async with rig.running():

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Final
 
-from monstertruck_schemas.reasons import Reason
 from monstertruckd.sim.faults import AT_REST, Expect, Reaction, Scenario
 
 STOP_AFTER_DETECTION: Final = 0.05
@@ -102,16 +101,16 @@ def _afterwards(scenario: Scenario, got: Reaction) -> Iterator[str]:
 COLUMNS: Final = ("fault", "detected", "stop bytes", "standstill", "metres", "reason", "back")
 
 
-def cells(reaction: Reaction) -> tuple[str, ...]:
+def cells(scenario: Scenario, reaction: Reaction) -> tuple[str, ...]:
     """One row of the table: seconds from the fault (``back``: from its end), metres."""
-    reason = reaction.reason or next(iter(reaction.seen), None)
+    told = scenario.seen[-1:] or sorted(set(scenario.down.values())) or [reaction.reason or "-"]
     return (
         reaction.fault,
         _seconds(reaction.detected_after_s),
         _seconds(reaction.stop_bytes_after_s),
         _seconds(reaction.standstill_after_s),
         f"{reaction.metres:.3f}",
-        reason.value if isinstance(reason, Reason) else "-",
+        ", ".join(told),
         _seconds(reaction.recovered_after_s),
     )
 

@@ -158,6 +158,19 @@ async def test_line_faults():
         assert await port.device.read() == b"heard"
 
 
+async def test_all_that_arrives_can_be_listened_to():
+    port = await plugged()
+    heard: list[tuple[bool, bytes]] = []
+    port.device.on_bytes = lambda to_device, data: heard.append((to_device, data))
+    async with await port.open() as link:
+        link.write(b"ping")
+        port.device.write(b"pong")
+        port.device.faults.deaf = port.device.faults.stalled = True
+        link.write(b"lost")
+        port.device.write(b"lost")
+    assert heard == [(True, b"ping"), (False, b"pong")]
+
+
 async def test_serial_port_over_a_pty(tmp_path: Path):
     pty = PtyPort(tmp_path / "dev")
     port = SerialPort(tmp_path / "dev")
