@@ -25,6 +25,12 @@ log = logging.getLogger(__name__)
 
 _FULL: Final = {errno.ENOSPC, errno.EDQUOT}
 
+_BATCH: Final = 256
+"""Messages handed to the thread together; each hand-over makes both threads wait for the interpreter."""
+
+_BATCH_SECONDS: Final = 0.05
+"""A batch is handed over after this time even if it is not full."""
+
 FailureSink = Callable[[Reason, str], None]
 
 
@@ -65,8 +71,11 @@ class Recorder:
         self._metadata = dict(metadata or {})
         self._digest = digest
         self._deterministic = deterministic
-        self._queue: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
-        self._room = threading.Semaphore(config.queue_size)
+        self._batch: list[Entry] = []
+        self._queue: queue.SimpleQueue[list[Entry] | None] = queue.SimpleQueue()
+        self._written = 0
+        """Counted by the thread alone."""
+        self._progress = threading.Event()
         self._sequences = {topic.name: 0 for topic in TOPICS}
         self._recording = False
         self._ended = False
@@ -91,6 +100,7 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._recording = False
+        self._hand_over()
         self._queue.put(None)
         await asyncio.shield(self._done)
 
@@ -106,14 +116,20 @@ class Recorder:
             return
         sequence = self._sequences[topic.name]
         self._sequences[topic.name] = sequence + 1
-        if not self._recording or not self._room.acquire(blocking=self._deterministic):
+        if self._deterministic and self._full:
+            self._wait_for_room()
+        if not self._recording or self._full:
             self._drops += 1
             return
         self._messages += 1
         self._bytes += len(payload)
         if self._digest is not None:
             self._digest.update(topic.name, stamp, payload)
-        self._queue.put(Entry(topic, self._clock.now(), stamp, sequence, payload))
+        if not self._batch and not self._deterministic:
+            self._loop.call_later(_BATCH_SECONDS, self._hand_over)
+        self._batch.append(Entry(topic, self._clock.now(), stamp, sequence, payload))
+        if len(self._batch) >= _BATCH:
+            self._hand_over()
 
     def health(self, seq: int) -> RecorderHealth:
         """State of the recording; counts are of messages and payload bytes handed to the writer."""
@@ -129,6 +145,23 @@ class Recorder:
             drops=self._drops,
             reason=self._reason,
         )
+
+    @property
+    def _full(self) -> bool:
+        return self._messages - self._written >= self._config.queue_size
+
+    def _wait_for_room(self) -> None:
+        self._hand_over()
+        while True:
+            self._progress.clear()
+            if not (self._recording and self._full):
+                return
+            self._progress.wait()
+
+    def _hand_over(self) -> None:
+        if self._batch:
+            self._queue.put(self._batch)
+            self._batch = []
 
     def _run(self, start: int) -> None:
         """The thread."""
@@ -160,21 +193,23 @@ class Recorder:
         wait = None if self._deterministic else self._config.chunk_seconds / 2
         while True:
             try:
-                entry = self._queue.get(timeout=wait)
+                batch = self._queue.get(timeout=wait)
             except queue.Empty:
                 writer.tick(self._clock.now())
                 continue
-            if entry is None:
+            if batch is None:
                 self._ended = True
                 return
-            self._room.release()
-            writer.write(entry)
+            for entry in batch:
+                writer.write(entry)
+                self._written += 1
+                self._progress.set()
             self._path = writer.path
 
     def _fail(self, reason: Reason, text: str) -> None:
         self._recording = False
         self._reason = reason
         self._loop.call_soon_threadsafe(self._on_failure, reason, text)
-        while not self._ended:  # nobody may wait for room that never comes
+        self._progress.set()  # nobody may wait for room that never comes
+        while not self._ended:
             self._ended = self._queue.get() is None
-            self._room.release()
