@@ -34,6 +34,13 @@ class Counter:
         return self.steps
 
 
+class Hanging:
+    """Never comes back from its first step."""
+
+    def step(self, inputs):
+        time.sleep(600)
+
+
 def broken():
     msg = "no model file"
     raise OSError(msg)

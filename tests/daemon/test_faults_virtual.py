@@ -38,6 +38,12 @@ def test_a_fault_ends_as_it_should(name: str):
     assert shortcomings(scenario, drill(scenario)) == []
 
 
+def test_a_worker_that_really_hangs_is_killed_and_driving_goes_on(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("monstertruckd.map_service.TARGET", "tests.worker_kit:Hanging")
+    scenario = BY_NAME["map worker hangs"]
+    assert shortcomings(scenario, drill(scenario)) == []
+
+
 def test_a_reaction_that_is_too_late_or_wrong_is_seen():
     scenario = BY_NAME["lidar: unplugged"]
     assert shortcomings(scenario, drill(Scenario("nothing happens", lambda _: None, Expect.STOP))) != []
