@@ -115,9 +115,8 @@ def render(
     pen.text((left, 50 * scale), subtitle, fill=_FAINT, font=_font(16))
     _scale_bar(pen, frame, sheet.width - left, bottom)
     _legend(pen, left, bottom, [(name, style) for name, style, _ in drawn])
-    final = sheet.resize((sheet.width // scale, sheet.height // scale), Image.Resampling.LANCZOS)
     data = io.BytesIO()
-    final.save(data, "PNG", optimize=True)
+    sheet.reduce(scale).save(data, "PNG")
     return data.getvalue()
 
 

@@ -54,7 +54,7 @@ class OccupancyRaster:
             return
         ends = self._cells(points)
         seen = self._cells(_beams(origin, points, self.cell / 2))
-        self._cover(np.vstack([ends, seen]))
+        self._cover(ends, self._cells(origin))  # no beam leaves the rectangle around them
         hit = np.zeros(self._hits.shape, dtype=bool)
         hit[tuple((ends - self._corner).T[::-1])] = True
         through = np.zeros(self._hits.shape, dtype=bool)
@@ -71,9 +71,11 @@ class OccupancyRaster:
     def _cells(self, points: Floats) -> NDArray[np.int64]:
         return np.floor(points / self.cell).astype(np.int64)
 
-    def _cover(self, cells: NDArray[np.int64]) -> None:
-        """Grow until ``cells`` are inside."""
-        low, high = cells.min(axis=0), cells.max(axis=0) + 1
+    def _cover(self, ends: NDArray[np.int64], origin: NDArray[np.int64]) -> None:
+        """Grow until the cells of the beams' ends and origin are inside."""
+        columns, rows = ends.T
+        low = np.minimum((columns.min(), rows.min()), origin)
+        high = np.maximum((columns.max(), rows.max()), origin) + 1
         size = np.array(self._hits.shape[::-1])
         if size.any():
             if (low >= self._corner).all() and (high <= self._corner + size).all():
