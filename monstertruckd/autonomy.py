@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Self
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryService
-from monstertruck_estimation.transforms import TransformService, mount
+from monstertruck_estimation.transforms import TransformService, compose, invert, mount
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_planners.behave.stabiliser import StabiliserService
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import Clock
@@ -19,6 +20,8 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import Geometry, TruckConfig
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
+
+SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +46,20 @@ class Body:
 
 def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
     """Transforms always; odometry where the truck can drive and steer."""
-    mounts = [
-        mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
+    mounts = {
+        role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
         for role, m in ((role, device.mount) for role, device in config.devices.present().items())
-        if role in ("lidar", "compass")
-    ]
+        if role in SENSOR_FRAMES
+    }
+    joints = mounts.pop("stabiliser", None)
+    if joints is not None and "lidar" in mounts:
+        mounts["lidar"] = compose(invert(joints), mounts["lidar"])
     yield TransformService(
-        mounts, clock, bus.subscribe(topics.ODOMETRY, latest()), bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION)
+        list(mounts.values()),
+        clock,
+        bus.subscribe(topics.ODOMETRY, latest()),
+        bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION),
+        joints=None if joints is None else (joints, bus.subscribe(topics.STABILISER, latest())),
     )
     if config.devices.drive is None or config.devices.steering is None:
         return
@@ -66,7 +76,7 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
 
 
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
-    """Path source and tracker where one is configured; the map's picture."""
+    """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
         drawn = load_path(config.path.file, closed=config.path.closed) if config.path is not None else None
         yield PathService(
@@ -91,6 +101,13 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             drive=bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER),
             tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
             events=bus.event_sink(),
+        )
+    if config.devices.stabiliser is not None and config.devices.compass is not None:
+        yield StabiliserService(
+            config.levelling,
+            clock,
+            bus.subscribe(topics.COMPASS, latest()),
+            bus.publisher(topics.PLAN_STABILISER, Writer.PLANNER),
         )
     if config.map is not None and config.devices.lidar is not None:
         yield MapService(

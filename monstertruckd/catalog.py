@@ -6,15 +6,13 @@ Modules are loaded on use, so that listing kinds, checking a configuration and `
 import importlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from monstertruck_drivers.base import Emulator
-from monstertruck_drivers.link import Port
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
 
-Probe = Callable[[Port, Clock], Awaitable[dict[str, Any]]]
+Probe = Callable[..., Awaitable[dict[str, Any]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +21,16 @@ class Kind:
 
     name: str
     role: str
-    """Place in the configuration's ``devices``."""
+    """Place in the configuration's ``devices``, or ``monitors``."""
     package: str
     driver: str
     emulator: str
     config: str
     baud: int
+    """Of its serial line; 0 = has none."""
     doc: str
+    asked: Literal["port", "path", "machine"] = "port"
+    """What ``probe`` takes: an open port and the clock, the path of a node, or nothing."""
 
     def driver_class(self) -> type[Any]:
         """Class of the driver (a ``Service``)."""
@@ -44,7 +45,7 @@ class Kind:
         return cast("type[Schema]", self._load("config", self.config))
 
     def probe(self) -> Probe:
-        """Coroutine function that identifies a device."""
+        """Coroutine function that identifies a device; its arguments depend on ``asked``."""
         return cast("Probe", self._load("probe", "probe"))
 
     def _load(self, module: str, attribute: str) -> Any:
@@ -81,6 +82,60 @@ KINDS = (
         "MaestroConfig",
         115200,
         "Pololu Micro Maestro 6 servo controller with battery input",
+    ),
+    Kind(
+        "ax12",
+        "stabiliser",
+        "monstertruck_drivers.ax12",
+        "Ax12Driver",
+        "Ax12Bus",
+        "Ax12Config",
+        1_000_000,
+        "Two Dynamixel AX-12A on a USB2Dynamixel",
+    ),
+    Kind(
+        "webcam",
+        "camera",
+        "monstertruck_drivers.webcam",
+        "WebcamDriver",
+        "WebcamEmulator",
+        "WebcamConfig",
+        115200,
+        "V4L2 camera with motion JPEG",
+        asked="path",
+    ),
+    Kind(
+        "iio",
+        "battery",
+        "monstertruck_drivers.battery",
+        "IioBatteryDriver",
+        "IioEmulator",
+        "IioConfig",
+        0,
+        "Battery voltage by a converter of Linux Industrial-IO",
+        asked="machine",
+    ),
+    Kind(
+        "link_quality",
+        "link",
+        "monstertruck_drivers.link_quality",
+        "LinkQualityDriver",
+        "NetworkEmulator",
+        "LinkQualityConfig",
+        0,
+        "Wi-Fi and Ethernet links of the computer",
+        asked="machine",
+    ),
+    Kind(
+        "host_health",
+        "host",
+        "monstertruck_drivers.host_health",
+        "HostHealthDriver",
+        "HostEmulator",
+        "HostHealthConfig",
+        0,
+        "Load, heat, memory and disk of the computer",
+        asked="machine",
     ),
     Kind(
         "os4000",

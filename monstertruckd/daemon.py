@@ -26,10 +26,11 @@ from monstertruckd.autonomy import Body, build_estimation, build_planners
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
+from monstertruckd.cabling import Cabling, Computer
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.validate import resolved
 from monstertruckd.config.yaml_tree import Tree
-from monstertruckd.devices import build_drivers, serial_ports
+from monstertruckd.devices import build_drivers, build_monitors
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
@@ -38,7 +39,7 @@ from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
 
 ACTUATORS = ("drive", "steering")
-SENSORS = ("lidar", "compass")
+SENSORS = ("lidar", "compass", "stabiliser", "camera")
 VERSIONS = {"monstertruckd": __version__, "python": platform.python_version(), "machine": platform.machine()}
 
 
@@ -48,7 +49,8 @@ class Daemon:
     Args:
         config: what it is.
         clock: its time.
-        ports: where its devices hang, by role; default: the configured serial ports.
+        ports: where devices hang, by role, instead of the configured ports.
+        computer: whose USB tree, kernel files and disk it uses; default: the configured one's.
         tree: origins of the configuration's values, kept with the log.
         seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
@@ -60,6 +62,7 @@ class Daemon:
         clock: Clock,
         *,
         ports: Mapping[str, Port] | None = None,
+        computer: Computer | None = None,
         tree: Tree | None = None,
         seed: int | None = None,
     ) -> None:
@@ -71,8 +74,12 @@ class Daemon:
         self._rng = np.random.default_rng(seed)
         self._tree = tree
         self._events = self.bus.event_sink()
-        self._board = HealthBoard(clock, self.bus.publisher(topics.HEALTH, Writer.DAEMON), self._events)
-        self._drivers = build_drivers(config.devices, ports or serial_ports(config.devices), clock, self.bus)
+        self._computer = computer or Computer.at(config.machine, clock)
+        self._cabling = Cabling(config, self._computer, self.bus, ports or {})
+        self._board = HealthBoard(
+            clock, self.bus.publisher(topics.HEALTH, Writer.DAEMON), self._events, self._cabling.waiting
+        )
+        self._drivers = build_drivers(config, self._cabling, clock, self.bus)
         self._body = Body.of(config.geometry)
         self.gate = self._build_gate()
         self.recorder = self._build_recorder()
@@ -97,6 +104,8 @@ class Daemon:
             self._start(gate, self.gate, OnBug.EXIT)
             self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
             self._start_devices(sensors, SENSORS, OnBug.FAIL)
+            for service in build_monitors(self.config, self._computer, self.clock, self.bus):
+                self._start(sensors, service)
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body):
@@ -117,6 +126,8 @@ class Daemon:
                 bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events)
             )
             self._start(bus_scope, self._board)
+            if self._cabling.service is not None:
+                self._start(bus_scope, self._cabling.service)
             yield
 
     @asynccontextmanager

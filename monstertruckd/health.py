@@ -1,5 +1,7 @@
 """Health of every service as a topic, and real time against the daemon's own."""
 
+from collections.abc import Callable
+
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
@@ -20,14 +22,27 @@ class HealthBoard:
     """Collects every service's state, publishes the table on change and once a second.
 
     The first loss and the recovery of a service are events; repeated failures of one outage are not.
+
+    Args:
+        clock: time.
+        out: the table.
+        events: losses and recoveries.
+        waiting: what keeps the service of that name from starting, in words; None = nothing.
     """
 
     name = "health"
 
-    def __init__(self, clock: Clock, out: Publisher[HealthTable], events: EventSink) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        out: Publisher[HealthTable],
+        events: EventSink,
+        waiting: Callable[[str], str | None] = lambda _: None,
+    ) -> None:
         self._clock = clock
         self._out = out
         self._events = events
+        self._waiting = waiting
         self._rows: dict[str, ServiceHealth] = {}
         self._down: set[str] = set()
 
@@ -47,7 +62,12 @@ class HealthBoard:
 
     def rows(self) -> tuple[ServiceHealth, ...]:
         """All services, in the order in which they first reported."""
-        return tuple(self._rows.values())
+        return tuple(self._with_reason(row) for row in self._rows.values())
+
+    def _with_reason(self, row: ServiceHealth) -> ServiceHealth:
+        if row.state is not ServiceState.STARTING or (why := self._waiting(row.name)) is None:
+            return row
+        return row.model_copy(update={"detail": why})
 
     async def run(self, ready: Ready) -> None:
         """Publish the table once a second."""

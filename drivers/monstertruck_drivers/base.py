@@ -115,6 +115,14 @@ class AttitudeSource(Protocol):
         ...
 
 
+class JointSource(Protocol):
+    """The joints of a mount: a pitch joint on the body, a roll joint on it, the device on the roll joint."""
+
+    def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """True pitch and roll, rad, REP 103, at rising instants of the last second; each (n,)."""
+        ...
+
+
 class ViewSource(Protocol):
     """What a camera sees."""
 

@@ -9,7 +9,12 @@ import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
 
-DeviceArgument = Annotated[str, typer.Argument(help="Kind or role: lidar, drive, steering, compass.")]
+DeviceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; probe: battery, link, host."
+    ),
+]
 
 
 def emulate(
@@ -36,16 +41,26 @@ def emulate(
 
 def probe(
     device: DeviceArgument,
-    port: Annotated[Path, typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar.")],
+    port: Annotated[
+        Path | None,
+        typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar; of a camera also a pattern."),
+    ] = None,
     baud: Annotated[int | None, typer.Option(help="Bits per second; default: the device's own.")] = None,
 ) -> None:
     """Handshake with a device and print its identity, state and first samples as JSON. Moves nothing."""
     from monstertruck_drivers.link import SerialPort
+    from monstertruck_runtime.errors import InputError
     from monstertruckd.catalog import find_kind
 
     kind = find_kind(device)
+    if kind.asked == "port" and port is None:
+        raise InputError(f"{device}: say where it hangs with --port")
 
     async def main(clock: Clock) -> dict[str, Any]:
+        if port is None:
+            return await kind.probe()()
+        if kind.asked == "path":
+            return await kind.probe()(str(port))
         return await kind.probe()(SerialPort(port, baud or kind.baud), clock)
 
-    typer.echo(json.dumps(run_wall(main), indent=2))
+    typer.echo(json.dumps(run_wall(main), indent=2, default=str))

@@ -7,7 +7,7 @@ import typer
 
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruckd import __version__
-from monstertruckd.cli import demo, devices, kinematics, live, logs, robot
+from monstertruckd.cli import demo, devices, kinematics, live, logs, robot, usb
 
 app = typer.Typer(
     name="monstertruckd",
@@ -41,6 +41,8 @@ app.command("echo")(live.echo)
 app.command("replay")(logs.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)
+app.command("usb")(usb.usb)
+app.command("find-port")(usb.find_port)
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 

@@ -2,15 +2,23 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
+from monstertruck_drivers.ax12.config import Ax12Config
+from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.host_health.config import HostHealthConfig
+from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
+from monstertruck_drivers.usb.tree import place
+from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
@@ -30,6 +38,17 @@ class PortConfig(Schema):
     """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
     baud: Annotated[int, Field(ge=4800, le=1_000_000)] = 115200
     """Bits per second; USB-CDC devices ignore it"""
+
+
+def _way(port: Any) -> str:
+    """Which of the two ways to name a port ``port`` is; not a key of either, so that complaints find their line."""
+    by_hub = isinstance(port, UsbPortConfig) or (isinstance(port, dict) and "hub" in port)
+    return "port by hub" if by_hub else "port by path"
+
+
+AnyPort = Annotated[
+    Annotated[PortConfig, Tag("port by path")] | Annotated[UsbPortConfig, Tag("port by hub")], Discriminator(_way)
+]
 
 
 class Mount(Schema):
@@ -57,10 +76,15 @@ class Mount(Schema):
 class Device(Schema, Generic[C]):
     """One device: its port, its mount, its driver."""
 
-    port: PortConfig
+    port: AnyPort
     mount: Mount = Mount()
     restart: RestartPolicy = RestartPolicy(max_delay=0.5)
     driver: C
+
+    @property
+    def kind(self) -> str:
+        """What the driver's settings say it is."""
+        return str(vars(self.driver)["kind"])
 
 
 class Devices(Schema):
@@ -70,6 +94,9 @@ class Devices(Schema):
     drive: Device[EposConfig] | None = None
     steering: Device[MaestroConfig] | None = None
     compass: Device[Os4000Config] | None = None
+    stabiliser: Device[Ax12Config] | None = None
+    """Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"""
+    camera: Device[WebcamConfig] | None = None
 
     def present(self) -> dict[str, Device[Schema]]:
         """The devices that are configured, by role."""
@@ -77,12 +104,23 @@ class Devices(Schema):
 
     @model_validator(mode="after")
     def _one_port_each(self) -> Self:
-        taken: dict[Path, str] = {}
+        taken: dict[str, str] = {}
         for role, device in self.present().items():
-            if other := taken.get(device.port.path):
-                raise ValueError(f"{other} and {role} share the port {device.port.path}; every device needs its own")
-            taken[device.port.path] = role
+            port = device.port
+            where = place(port.device) if isinstance(port, UsbPortConfig) else str(port.path)
+            if other := taken.get(where):
+                raise ValueError(f"{other} and {role} share the port {where}; every device needs its own")
+            taken[where] = role
         return self
+
+
+class Monitors(Schema):
+    """What is read from the computer itself, without a port; what is left out is not watched."""
+
+    battery: IioConfig | None = None
+    """Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input"""
+    link: LinkQualityConfig | None = None
+    host: HostHealthConfig | None = None
 
 
 class Geometry(Schema):
@@ -150,6 +188,12 @@ class TruckConfig(Schema):
     """Name of this robot in every key"""
     geometry: Geometry = Geometry()
     devices: Devices
+    monitors: Monitors = Monitors()
+    usb: UsbConfig = UsbConfig()
+    machine: Path = Path("/")
+    """Folder with the computer's proc, sys and dev; the simulated one's is elsewhere"""
+    levelling: StabiliserConfig = StabiliserConfig()
+    """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
     odometry: OdometryConfig = OdometryConfig()
     tracker: PurePursuitConfig | None = None
@@ -164,6 +208,11 @@ class TruckConfig(Schema):
     def _complete(self) -> Self:
         if self.tracker is not None and (self.devices.drive is None or self.devices.steering is None):
             raise ValueError("a tracker needs the devices drive and steering")
+        steering = self.devices.steering
+        if self.monitors.battery is not None and steering is not None and steering.driver.battery is not None:
+            raise ValueError(
+                "monitors.battery and devices.steering.driver.battery both measure the battery; set the other one null"
+            )
         if self.devices.drive is not None:
             self._check_braking(self.devices.drive.driver)
         return self

@@ -71,13 +71,18 @@ def _summary(lap: Lap, folder: Path, truth: Path, p99: float, worst: float) -> S
 
 
 def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
-    """A configuration that includes ``config``, hangs its devices on ptys and puts all output into ``folder``."""
+    """A configuration that includes ``config``, hangs its devices on ptys and puts all output into ``folder``.
+
+    Devices by hub and port stay there: their hubs are those of an emulated computer.
+    """
     given = load_tree(config).data
     here = folder.resolve()
+    by_path = (role for role, device in given.get("devices", {}).items() if device and "hub" not in device["port"])
     overlay: dict[str, Any] = {
         "include": str(config.resolve()),
         "version": 1,
-        "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in given.get("devices", {})},
+        "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in by_path},
+        "machine": str(here / "machine"),
         "zenoh": {"listen": [endpoint]},
         "recorder": {"directory": str(here / "logs")},
         "state_directory": str(here / "state"),

@@ -108,7 +108,7 @@ class GateConfig(Schema):
     battery: SensorLimit = SensorLimit(stale_after=2.0, critical=False)
     max_latency: Positive = 0.4
     """Greatest distance between a sample's stamp and its arrival, s; beyond it the sample is not a good one."""
-    tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = ("recorder",)
+    tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = ("recorder", "camera", "link", "host", "usb")
     """Services whose failure does not stop the truck."""
 
     tick_stall: Positive = 0.15

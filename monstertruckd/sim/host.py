@@ -4,16 +4,23 @@ import asyncio
 import gc
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
+from monstertruck_drivers.link import EmulatedPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.truck import Monitors, PortConfig
 from monstertruckd.config.validate import load_config
+from monstertruckd.sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.console import Emulated, FaultConsole
 from monstertruckd.sim.robot import SimulatedRobot
@@ -47,16 +54,45 @@ class TruthLog:
 
 
 async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
-    """Serve the devices of ``config_file`` behind ptys at their configured paths until SIGTERM or SIGINT.
+    """Serve the devices of ``config_file`` behind ptys at their configured ports until SIGTERM or SIGINT.
 
     Faults are read from standard input, each line beginning with the device's role.
+
+    Raises:
+        InputError: the configuration has hubs or monitors, but names no place for the emulated computer.
     """
     config, _ = load_config(config_file, SimulatedTruckConfig)
+    with TemporaryDirectory(prefix="monstertruck-") as folder, _shown(config, Path(folder)):
+        await _serve(clock, config, Path(folder), truth)
+
+
+@contextmanager
+def _shown(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
+    """Let ``machine`` lead to the emulated computer, where the daemon needs one."""
+    if not hangs_by_hub(config.devices) and config.monitors == Monitors():
+        yield
+        return
+    link = config.machine
+    if link.exists() and not link.is_symlink():
+        raise InputError(f"machine: {link} exists: expected the name of a link to be made to the emulated computer")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder, target_is_directory=True)
+    try:
+        yield
+    finally:
+        link.unlink(missing_ok=True)
+
+
+async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth: Path | None) -> None:
     devices = config.devices.present()
-    ports = {role: PtyPort(device.port.path) for role, device in devices.items()}
-    for device in devices.values():
-        device.port.path.parent.mkdir(parents=True, exist_ok=True)
-    robot = SimulatedRobot(config.sim, config.devices, clock, ports)
+    cables: dict[str, EmulatedPort] = {}
+    for role, device in devices.items():
+        path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cables[role] = PtyPort(path)
+    ports = EmulatedComputer(folder, config.devices, cables).ports
+    robot = SimulatedRobot(config.sim, config, clock, ports, folder)
     log = TruthLog(robot.world, clock)
     emulated = {role: Emulated(robot.emulators[role], ports[role]) for role in devices}
     stop = asyncio.Event()

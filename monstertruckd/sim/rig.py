@@ -3,11 +3,16 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
+from monstertruck_runtime.threads import inline
 from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.daemon import Daemon
+from monstertruckd.sim.computer import EmulatedComputer
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.console import Emulated
 from monstertruckd.sim.host import TruthLog
@@ -28,18 +33,29 @@ class VirtualRig:
         self.clock = clock
         self.began = clock.now()
         """Start of the world, ns."""
+        self._folder = TemporaryDirectory(prefix="monstertruck-")
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
-        self.robot = SimulatedRobot(config.sim, config.devices, clock, self.ports)
+        self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports)
+        self.robot = SimulatedRobot(
+            config.sim, config, clock, self.computer.ports, self.computer.folder, offload=inline
+        )
         self.world = self.robot.world
         self.truth = TruthLog(self.world, clock)
-        self.daemon = Daemon(config, clock, ports=self.ports, tree=tree, seed=config.sim.seed)
+        by_path = {
+            role: port
+            for role, port in self.ports.items()
+            if not isinstance(config.devices.present()[role].port, UsbPortConfig)
+        }
+        self.daemon = Daemon(
+            config, clock, ports=by_path, computer=self.computer.computer(clock), tree=tree, seed=config.sim.seed
+        )
         self.bus = self.daemon.bus
         self._stop = asyncio.Event()
         self._daemon_task: asyncio.Task[None] | None = None
 
     def device(self, role: str) -> Emulated:
         """Emulator and port of one role, to make it fail."""
-        return Emulated(self.robot.emulators[role], self.ports[role])
+        return Emulated(self.robot.emulators[role], self.computer.ports[role])
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["VirtualRig"]:
@@ -62,6 +78,7 @@ class VirtualRig:
                 for task in around:
                     task.cancel()
                 await asyncio.wait(around)
+                self._folder.cleanup()
 
     @property
     def daemon_ended(self) -> bool:

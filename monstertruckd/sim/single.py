@@ -5,18 +5,21 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
 from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_drivers.world.config import WorldConfig
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
 from monstertruckd.catalog import find_kind
 from monstertruckd.sim.console import Emulated
-from monstertruckd.sim.robot import EPOS_BAUD
+from monstertruckd.sim.robot import LINE_BAUD, stabiliser_bus
 
 
 @asynccontextmanager
@@ -24,7 +27,7 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
     """Serve ``device`` (kind or role) behind the symlink ``link`` while the context lasts.
 
     Raises:
-        InputError: unknown device.
+        InputError: unknown device, or one without a port.
     """
     world = World(WorldConfig(), seed)
     port = PtyPort(link)
@@ -36,9 +39,15 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
             emulator = Os4000Emulator(clock, world.compass, seed=seed)
         case "drive":
             emulator = EposEmulator(clock, world.motor, seed=seed)
-            port.device.baud = EPOS_BAUD
-        case _:
+        case "stabiliser":
+            emulator = stabiliser_bus(Ax12Config(), clock, seed)
+        case "camera":
+            emulator = WebcamEmulator(clock, world.view, usb=port)
+        case "steering":
             emulator = MaestroEmulator(clock, world.servos, seed=seed)
+        case role:
+            raise InputError(f"{role}: the computer's own files, no device on a port; simulate emulates them")
+    port.device.baud = LINE_BAUD.get(find_kind(device).role)
     task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")
     port.plug()
     try:

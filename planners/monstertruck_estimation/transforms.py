@@ -15,6 +15,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.sensor import StabiliserFeedback
 from monstertruck_schemas.state import Odometry, Transform, Transforms
 
 Quaternion = tuple[float, float, float, float]
@@ -209,6 +210,8 @@ class TransformService:
         odometry: pose of base in odom.
         out: where the tree goes.
         rate: messages per second.
+        joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Whatever it carries
+            has it for parent; until the angles are known it counts as level.
     """
 
     name = "transforms"
@@ -220,12 +223,16 @@ class TransformService:
         odometry: Subscription[Odometry],
         out: Publisher[Transforms],
         rate: float = 10.0,
+        joints: tuple[Transform, Subscription[StabiliserFeedback]] | None = None,
     ) -> None:
         self._clock = clock
         self._odometry = odometry
         self._out = out
         self._rate = rate
+        self._joints = joints
         self._tree = FrameTree([planar("map", "odom", FIXED, (0.0, 0.0, 0.0)), *mounts])
+        if joints is not None:
+            self._tree.put(joints[0])
 
     def lookup(self, parent: str, child: str) -> Transform:
         """Newest pose of ``child`` in ``parent``; see ``FrameTree.lookup``."""
@@ -248,3 +255,10 @@ class TransformService:
         if odometry is not None:
             pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
             self._tree.put(planar("odom", "base", odometry.stamp, pose))
+        if self._joints is None:
+            return
+        centre, feedback = self._joints[0], self._joints[1].latest
+        if feedback is not None and feedback.pitch is not None and feedback.roll is not None:
+            turn = quaternion_from_rpy(feedback.roll, feedback.pitch, 0.0)
+            rotation = multiply(centre.rotation, turn)
+            self._tree.put(centre.model_copy(update={"stamp": feedback.stamp, "rotation": rotation}))

@@ -86,6 +86,12 @@ class Mailbox(Generic[M]):
             raise RuntimeError(msg)
         return self._unread.popleft()
 
+    def drain(self) -> list[M]:
+        """Everything unread, oldest first, without waiting."""
+        unread = list(self._unread)
+        self._unread.clear()
+        return unread
+
     def close(self) -> None:
         """End the subscription; unread messages are gone and iteration ends. Closing twice is harmless."""
         if self._closed:

@@ -30,6 +30,8 @@ class LaserScan(Message):
     """Shape (n,), m; +inf where the beam has no valid return (see ``codes``)."""
     codes: UInt8Array
     """Shape (n,); 255 = valid, otherwise the sensor's own error code (devices' manual)."""
+    tilt: Annotated[float, Field(ge=0)] | None = None
+    """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = nobody measures it."""
 
     @property
     def angle_increment(self) -> float:

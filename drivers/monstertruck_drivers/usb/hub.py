@@ -89,6 +89,17 @@ class HubCoordinator:
         slots = ((role, self._slots.get(device)) for device, role in self._roles.items())
         return frozenset(role for role, slot in slots if slot is not None and self._waits(slot))
 
+    def waits_for(self, role: str) -> str | None:
+        """What keeps the device of ``role`` from starting, in words; None if it may start."""
+        port = self._ports.get(role)
+        slot = self._slots.get(port.device) if port is not None else None
+        if port is None or slot is None or not self._waits(slot):
+            return None
+        if slot.held_until > self._clock.now():
+            return f"held after over-current at {place(port.device)}"
+        outage = self._outage_of(port.device)
+        return f"waits for hub {outage.hub if outage is not None else parent_of(port.device)}"
+
     def _waits(self, slot: _Slot) -> bool:
         return slot.free_at is None or max(slot.free_at, slot.held_until) > self._clock.now()
 

@@ -164,6 +164,15 @@ class LidarConfig(Schema):
         return self
 
 
+class CameraConfig(Schema):
+    """Webcam that looks forward."""
+
+    x: float = 0.18
+    """Mount before the geometric centre, m."""
+    reach: Positive = 30.0
+    """Nothing farther away is drawn, m."""
+
+
 class Iron(Schema):
     """Magnetic error of the truck's own metal: measured = soft * true + hard, per device axis x, y, z."""
 
@@ -231,5 +240,6 @@ class WorldConfig(Schema):
     truck: TruckConfig = TruckConfig()
     battery: BatteryConfig = BatteryConfig()
     lidar: LidarConfig = LidarConfig()
+    camera: CameraConfig = CameraConfig()
     compass: CompassConfig = CompassConfig()
     tilt: TiltConfig = GroundTilt()

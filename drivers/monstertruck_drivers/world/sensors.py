@@ -6,8 +6,8 @@ from math import atan2, cos, degrees, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import CompassReading, MotorReading, PulseSource
-from monstertruck_drivers.world.config import BatteryConfig, CompassConfig, LidarConfig, MotorConfig
+from monstertruck_drivers.base import CompassReading, JointSource, MotorReading, PulseSource
+from monstertruck_drivers.world.config import BatteryConfig, CameraConfig, CompassConfig, LidarConfig, MotorConfig
 from monstertruck_drivers.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
 from monstertruck_drivers.world.truck_plant import TruckPlant
 
@@ -21,6 +21,8 @@ _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 _LEVEL = 1e-4
 
 Vector = tuple[float, float, float]
+Beams = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Directions: components x, y, z, each (n,)."""
 Caster = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float], NDArray[np.float64]]
 """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing."""
 
@@ -30,10 +32,12 @@ class SimulatedLidar:
 
     Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
     as a maker's accuracy covers nearly all readings. A tilted beam meets level ground or passes over walls of finite
-    height; walls are upright and the ground is taken as level around the truck.
+    height; walls are upright and the ground is taken as level around the truck. Joints of a mount turn it about its own
+    centre.
     """
 
     def __init__(self, plant: TruckPlant, cast: Caster, config: LidarConfig, seed: int | None) -> None:
+        self.joints: JointSource | None = None
         self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
         self._valid = (np.arange(STEPS) >= config.first_step) & (np.arange(STEPS) <= config.last_step)
 
@@ -44,27 +48,24 @@ class SimulatedLidar:
         sweep is extrapolated.
         """
         self._plant.advance(time_ns)
-        x, y, yaw, pitch, roll = self._plant.poses(time_ns + _BEAM_DELAYS)
+        times = time_ns + _BEAM_DELAYS
+        x, y, yaw, pitch, roll = self._plant.poses(times)
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
-        if max(np.abs(pitch).max(), np.abs(roll).max()) < _LEVEL:
+        if self.joints is None and max(np.abs(pitch).max(), np.abs(roll).max()) < _LEVEL:
             ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range)
         else:
-            ranges = self._tilted(xs, ys, yaw, pitch, roll)
+            beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
+            if self.joints is not None:
+                beams = _turned(beams, *self.joints.angles(times))
+            ranges = self._tilted(xs, ys, yaw, _turned(beams, pitch, roll))
         return self._measure(ranges, time_ns)
 
     def _tilted(
-        self,
-        xs: NDArray[np.float64],
-        ys: NDArray[np.float64],
-        yaw: NDArray[np.float64],
-        pitch: NDArray[np.float64],
-        roll: NDArray[np.float64],
+        self, xs: NDArray[np.float64], ys: NDArray[np.float64], yaw: NDArray[np.float64], beams: Beams
     ) -> NDArray[np.float64]:
+        """Ranges along beams whose directions are given in the truck's level frame."""
         config = self._config
-        c, s = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES)
-        forward = np.cos(pitch) * c + np.sin(pitch) * np.sin(roll) * s
-        left = np.cos(roll) * s
-        up = -np.sin(pitch) * c + np.cos(pitch) * np.sin(roll) * s
+        forward, left, up = beams
         level = np.hypot(forward, left)
         ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), config.max_range) / level
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -88,6 +89,21 @@ class SimulatedLidar:
         millimetres[~seen] = NO_RETURN
         millimetres[lost] = FAILED
         return millimetres
+
+
+class SimulatedView:
+    """``ViewSource``: what stands around the camera, which looks forward and stays level."""
+
+    def __init__(self, plant: TruckPlant, cast: Caster, config: CameraConfig) -> None:
+        self._plant, self._cast, self._config = plant, cast, config
+
+    def ranges(self, time_ns: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
+        self._plant.advance(time_ns)
+        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
+        ahead = self._config.x
+        xs, ys = np.full(len(angles), x + ahead * cos(yaw)), np.full(len(angles), y + ahead * sin(yaw))
+        return self._cast(xs, ys, yaw + angles, self._config.reach)
 
 
 class SimulatedMotor:
@@ -198,6 +214,13 @@ class SimulatedCompass:
             iron.soft_y * field[1] + iron.hard_y + self._config.motor_field * self._plant.current,
             iron.soft_z * field[2] + iron.hard_z,
         )
+
+
+def _turned(beams: Beams, pitch: NDArray[np.float64], roll: NDArray[np.float64]) -> Beams:
+    """``_to_level`` for many vectors, each turned by angles of its own."""
+    x, y, z = beams
+    y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
+    return np.cos(pitch) * x + np.sin(pitch) * z, y, np.cos(pitch) * z - np.sin(pitch) * x
 
 
 def _to_body(v: Vector, pitch: float, roll: float) -> Vector:

@@ -1,4 +1,4 @@
-"""One simulated world: map, obstacles, truck and the physics of its four devices."""
+"""One simulated world: map, obstacles, truck and the physics of its devices."""
 
 from math import hypot
 from pathlib import Path
@@ -6,13 +6,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import AttitudeSource, MotorPlant, RangeSource, ServoPlant
+from monstertruck_drivers.base import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
 from monstertruck_drivers.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_drivers.world.config import SinusoidTilt, TiltConfig, WorldConfig
 from monstertruck_drivers.world.maps import FREE, OCCUPIED, load_map
 from monstertruck_drivers.world.obstacles import Box, Obstacle, discs_and_segments, penetration
 from monstertruck_drivers.world.raycast import cast_rays, grid_penetration
-from monstertruck_drivers.world.sensors import SimulatedCompass, SimulatedLidar, SimulatedMotor, SimulatedServos
+from monstertruck_drivers.world.sensors import (
+    SimulatedCompass,
+    SimulatedLidar,
+    SimulatedMotor,
+    SimulatedServos,
+    SimulatedView,
+)
 from monstertruck_drivers.world.terrain import load_profile, profile_path, rocking
 from monstertruck_drivers.world.truck_plant import Pose, TruckPlant, TruthState
 from monstertruck_runtime.errors import InputError
@@ -52,7 +58,9 @@ class World:
         self._occupied = place.map.cells == OCCUPIED
         self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiled now rather than within somebody's deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
-        self.lidar: RangeSource = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
+        self._lidar = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
+        self.lidar: RangeSource = self._lidar
+        self.view: ViewSource = SimulatedView(self._plant, self._cast, config.camera)
         self.motor: MotorPlant = SimulatedMotor(self._plant, config.truck.motor, noise_seed)
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
@@ -66,6 +74,10 @@ class World:
         """What is really the case at ``time_ns`` (or at the newest instant asked for, if that is later)."""
         self._plant.advance(time_ns)
         return self._plant.truth()
+
+    def carry_lidar(self, joints: JointSource) -> None:
+        """Put the lidar onto a mount with joints."""
+        self._lidar.joints = joints
 
     def add(self, time_ns: int, obstacle: Obstacle) -> None:
         """Put something into the world: seen by the lidar, stops the truck."""

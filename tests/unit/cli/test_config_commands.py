@@ -34,7 +34,7 @@ def test_json_output_has_values_and_origins(monkeypatch: pytest.MonkeyPatch, cap
     assert run(monkeypatch, "check-config", "--json", str(ROOT / "configs" / "demo.yaml")) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["config"]["geometry"]["wheelbase"] == 0.32
-    assert shown["origins"]["geometry.wheelbase"].endswith("truck.yaml:6")
+    assert shown["origins"]["geometry.wheelbase"].endswith("chassis.yaml:6")
 
 
 TRUCK = """version: 1

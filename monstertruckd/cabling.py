@@ -1,0 +1,116 @@
+"""Where the devices hang: from the configuration's ports, by path or by hub and port, to what drivers open."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from monstertruck_drivers.link import Port, SerialPort
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.hub import HubCoordinator
+from monstertruck_drivers.usb.machine import Machine
+from monstertruck_drivers.usb.port import HubNode, HubPort
+from monstertruck_drivers.usb.power import PortPower
+from monstertruck_drivers.usb.service import UsbService
+from monstertruck_drivers.usb.sysfs import Sysfs
+from monstertruck_drivers.usb.watch import NoWatcher, Watcher, open_watcher
+from monstertruck_drivers.webcam.path_source import PathSource
+from monstertruck_drivers.webcam.rendered_source import RenderedSource
+from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
+from monstertruck_runtime.clock import Clock
+from monstertruck_schemas import topics
+from monstertruck_schemas.topics import Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import AnyPort, TruckConfig
+
+ROOT = Path("/")
+
+
+@dataclass(frozen=True, slots=True)
+class Computer:
+    """The computer the daemon runs on; an emulated one stands in for it in simulations."""
+
+    machine: Machine
+    """Its USB tree."""
+    root: Path = ROOT
+    """Folder with its proc and sys."""
+    watch: Callable[[], Watcher] = open_watcher
+    """Opens the source of USB announcements."""
+
+    @classmethod
+    def at(cls, root: Path, clock: Clock) -> Self:
+        """The real computer, or the one another process emulates in the folder ``root``, which announces nothing."""
+        machine = Machine(clock, Sysfs(root / "sys"), root / "dev")
+        return cls(machine, root, open_watcher if root == ROOT else NoWatcher)
+
+
+class Cabling:
+    """Ports of all devices. Those by hub and port share one coordinator, and a service that watches the tree.
+
+    Args:
+        config: the ports.
+        computer: whose ports they are.
+        bus: where tree and events go.
+        given: ports by role that replace the configured ones.
+    """
+
+    def __init__(self, config: TruckConfig, computer: Computer, bus: Bus, given: Mapping[str, Port]) -> None:
+        self._ports: dict[str, AnyPort] = {role: device.port for role, device in config.devices.present().items()}
+        self._given = given
+        self._machine = computer.machine
+        self._events = bus.event_sink()
+        places = {
+            role: port for role, port in self._ports.items() if role not in given and isinstance(port, UsbPortConfig)
+        }
+        self._hubs = HubCoordinator(config.usb, places, self._machine.clock, self._events)
+        self._power = PortPower(config.usb.power, self._machine, self._events)
+        self.service: UsbService | None = None
+        """Watches the tree; None where no device hangs by hub and port."""
+        if places:
+            out = bus.publisher(topics.USB, Writer.DAEMON)
+            self.service = UsbService(config.usb, self._machine, self._hubs, computer.watch(), out, self._events)
+
+    def port(self, role: str) -> Port:
+        """Serial port of a device."""
+        port = self._ports[role]
+        if role in self._given:
+            return self._given[role]
+        if isinstance(port, UsbPortConfig):
+            return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
+        return SerialPort(port.path, port.baud)
+
+    def camera(self, role: str) -> FrameSource:
+        """Where a camera's pictures come from."""
+        port = self._ports[role]
+        if role in self._given:
+            return RenderedSource(self._given[role], self._machine.clock)
+        if isinstance(port, UsbPortConfig):
+            return HubCamera(HubNode(port, self._machine, self._hubs, role, "video4linux"), self._machine)
+        return PathSource(str(port.path), self._machine.clock)
+
+    def waiting(self, role: str) -> str | None:
+        """What the device of ``role`` waits for before it may start; None if it does not wait."""
+        return self._hubs.waits_for(role)
+
+
+class HubCamera:
+    """The camera at a hub's port, whatever its node is at the moment.
+
+    Args:
+        node: finds it.
+        machine: where it is.
+    """
+
+    def __init__(self, node: HubNode, machine: Machine) -> None:
+        self.name = node.name
+        self._node = node
+        self._machine = machine
+
+    async def open(self, mode: Mode, buffers: int) -> FrameStream:
+        """Wait for the camera's turn, find its node, start it; see ``FrameSource``."""
+        path = self._machine.dev / (await self._node.resolve()).name
+        port = self._machine.serial(path, 115200)
+        if isinstance(port, SerialPort):
+            return await PathSource(str(path), self._machine.clock).open(mode, buffers)
+        # Only what is emulated in this process leads from a camera's node to a port.
+        return await RenderedSource(port, self._machine.clock).open(mode, buffers)

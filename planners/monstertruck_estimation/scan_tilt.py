@@ -1,0 +1,98 @@
+"""How far a scan's plane was from the horizontal: the body's tilt composed with the joints of the lidar's mount.
+
+Body R = Ry(pitch) Rx(roll) in a level frame, mount M = Ry(a) Rx(b) on the body: the plane's normal is R M z, and the
+tilt is its angle to the vertical, acos(u . M z) with u = R^T z = (-sin p, sin r cos p, cos r cos p) the body's view of
+up. Compass and joints are told at other instants than scans, so both are taken at the middle of the scan.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import Publisher
+from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
+
+STALE: Final = SECOND // 4
+"""Nanoseconds over which angles are extended beyond the newest reading."""
+KEPT: Final = 16
+UNKNOWN: Final = math.pi / 2
+"""Tilt of a scan whose mount or body does not tell its angles: nothing shall trust it."""
+
+Angles = tuple[float, float]
+
+
+def plane_tilt(roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: float = 0.0) -> float:
+    """Angle between the lidar's plane and the horizontal, rad; arguments in rad, REP 103."""
+    x, y = math.sin(joint_pitch) * math.cos(joint_roll), -math.sin(joint_roll)
+    z = math.cos(joint_pitch) * math.cos(joint_roll)
+    up = -math.sin(pitch) * x + math.cos(pitch) * (math.sin(roll) * y + math.cos(roll) * z)
+    return math.acos(min(max(up, -1.0), 1.0))
+
+
+class Track:
+    """Recent values of two angles, read at any instant between and shortly after them."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[int, Angles]] = deque(maxlen=KEPT)
+
+    def extend(self, points: Iterable[tuple[int, Angles]]) -> None:
+        """Take newer readings: stamp, ns, and angles."""
+        self._points.extend(points)
+
+    def at(self, time_ns: int) -> Angles | None:
+        """On the straight line through the two readings around ``time_ns``, or the newest two; None = unknown."""
+        if not self._points or time_ns - self._points[-1][0] > STALE:
+            return None
+        if len(self._points) == 1:
+            return self._points[0][1]
+        after = next((i for i, (stamp, _) in enumerate(self._points) if i and stamp >= time_ns), len(self._points) - 1)
+        (begin, old), (end, new) = self._points[after - 1], self._points[after]
+        share = (time_ns - begin) / max(end - begin, 1)
+        if not 0 <= end - begin <= STALE or share < 0:
+            return new
+        return old[0] + share * (new[0] - old[0]), old[1] + share * (new[1] - old[1])
+
+
+class TiltStamper:
+    """Publisher of scans that adds their ``tilt``.
+
+    Args:
+        out: where scans go.
+        compass: the body's tilt.
+        joints: of the mount; None = the lidar is fixed to the body.
+    """
+
+    def __init__(
+        self, out: Publisher[LaserScan], compass: Mailbox[Attitude], joints: Mailbox[StabiliserFeedback] | None
+    ) -> None:
+        self._out = out
+        self._compass = compass
+        self._feedback = joints
+        self._body = Track()
+        self._mount = Track()
+
+    def next_seq(self) -> int:
+        """Sequence number for the next scan."""
+        return self._out.next_seq()
+
+    def put(self, message: LaserScan) -> None:
+        """Publish a scan with the tilt its plane had in its middle."""
+        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
+        if self._feedback is not None:
+            self._mount.extend(
+                (f.stamp, (f.pitch, f.roll))
+                for f in self._feedback.drain()
+                if f.pitch is not None and f.roll is not None
+            )
+        middle = message.stamp + round(message.time_increment * len(message.ranges) / 2 * SECOND)
+        self._out.put(message.model_copy(update={"tilt": self._tilt(middle)}))
+
+    def _tilt(self, time_ns: int) -> float | None:
+        body = self._body.at(time_ns)
+        if self._feedback is None:
+            return None if body is None else plane_tilt(*body)
+        joints = self._mount.at(time_ns)
+        return UNKNOWN if body is None or joints is None else plane_tilt(*body, *joints)
