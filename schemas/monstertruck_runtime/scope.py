@@ -21,7 +21,7 @@ class Scope:
         self.failures: list[BaseException] = []
         self._owner = owner
         self._tasks: list[asyncio.Task[None]] = []
-        self._interrupted = False
+        self.interrupted = False
         self._ending = False
 
     def start(self, name: str, service: Coroutine[Any, Any, None]) -> None:
@@ -31,21 +31,30 @@ class Scope:
         self._tasks.append(task)
 
     async def end(self) -> bool:
-        """End all services, newest first; returns True if it was a failure that interrupted the owner."""
+        """End all services, newest first and each completely, whatever cancels the owner meanwhile.
+
+        Returns:
+            True if the owner was cancelled meanwhile by somebody else, who must still hear of it.
+        """
         self._ending = True
+        disturbed = False
         for task in reversed(self._tasks):
             task.cancel()
-            await asyncio.wait([task])
-        if self._interrupted:
+            while not task.done():
+                try:
+                    await asyncio.wait([task])
+                except asyncio.CancelledError:
+                    disturbed = True
+        if self.interrupted:
             self._owner.uncancel()
-        return self._interrupted
+        return disturbed
 
     def _done(self, task: asyncio.Task[None]) -> None:
         if task.cancelled() or (error := task.exception()) is None:
             return
         self.failures.append(error)
-        if not self._interrupted and not self._ending:
-            self._interrupted = True
+        if not self.interrupted and not self._ending:
+            self.interrupted = True
             self._owner.cancel()
 
 
@@ -61,12 +70,15 @@ async def scope(name: str) -> AsyncIterator[Scope]:
     try:
         yield opened
     except BaseException as error:
-        interrupted = await opened.end()
+        disturbed = await opened.end()
+        own = opened.interrupted and isinstance(error, asyncio.CancelledError)
+        if not own:
+            raised.append(error)
         if not opened.failures:
             raise
-        if not (interrupted and isinstance(error, asyncio.CancelledError)):
-            raised.append(error)
     else:
-        await opened.end()
+        disturbed = await opened.end()
     if opened.failures:
         raise BaseExceptionGroup(f"scope {name}", [*raised, *opened.failures])
+    if disturbed:
+        raise asyncio.CancelledError

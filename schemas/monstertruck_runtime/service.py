@@ -74,6 +74,8 @@ async def supervise(
 ) -> None:
     """Run ``service`` again and again by ``policy`` until cancelled, reporting its health.
 
+    A service that returns, or ends by somebody else's cancellation, is as much a bug as an unexpected exception.
+
     Args:
         service: what to run.
         policy: delays and budget.
@@ -83,7 +85,7 @@ async def supervise(
         on_bug: whether an exception outside the error tree is raised or fails this service alone.
 
     Raises:
-        Exception: a bug, when ``on_bug`` is ``EXIT``.
+        RuntimeError: a bug, when ``on_bug`` is ``EXIT``.
     """
     session = _Session(service.name, clock, report)
     restarts: deque[int] = deque()
@@ -92,19 +94,22 @@ async def supervise(
         session.start()
         try:
             await service.run(session.ready)
-        except asyncio.CancelledError:
-            session.tell(ServiceState.STOPPED)
-            raise
         except TruckError as error:
             lost = error
-        except Exception:
+        except (Exception, asyncio.CancelledError) as error:
+            if isinstance(error, asyncio.CancelledError) and _asked_to_end():
+                session.tell(ServiceState.STOPPED)
+                raise
             session.tell(ServiceState.FAILED, Reason.INTERNAL, "unexpected exception, see the log")
             log.exception("%s: bug", service.name)
             if on_bug is OnBug.EXIT:
-                raise
+                raise RuntimeError(f"{service.name} failed") from error
             return
         else:
-            session.tell(ServiceState.STOPPED)
+            session.tell(ServiceState.FAILED, Reason.INTERNAL, "ended by itself")
+            log.error("%s: bug: ended by itself", service.name)
+            if on_bug is OnBug.EXIT:
+                raise RuntimeError(f"{service.name} ended by itself")
             return
 
         detail = str(lost) or type(lost).__name__
@@ -124,6 +129,12 @@ async def supervise(
         session.tell(ServiceState.BACKOFF, lost.reason, detail)
         await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
         delay = min(delay * policy.factor, policy.max_delay)
+
+
+def _asked_to_end() -> bool:
+    """Whether it is this task that was cancelled, not something it waited for."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 class _Session:

@@ -72,3 +72,54 @@ def test_cancelling_the_owner_ends_everything_in_order():
 
     run_virtual(main)
     assert log == ["gate", "bus"]
+
+
+def test_a_second_failure_while_ending_leaves_nothing_running():
+    log: list[str] = []
+
+    async def fail_after(seconds: float) -> None:
+        await asyncio.sleep(seconds)
+        raise ZeroDivisionError
+
+    async def daemon() -> None:
+        async with scope("actuators") as actuators:
+            actuators.start("drive", until_cancelled("drive", log))
+            async with scope("gate") as gate:
+                gate.start("gate", fail_after(1.5))
+                async with scope("planners") as planners:
+                    planners.start("map", until_cancelled("map", log, linger=2.0))
+                    planners.start("tracker", fail_after(1.0))
+                    await asyncio.Event().wait()
+
+    async def main(_: VirtualClock) -> int:
+        with pytest.raises(BaseExceptionGroup):
+            await daemon()
+        task = asyncio.current_task()
+        assert task is not None
+        assert task.cancelling() == 0
+        return len(asyncio.all_tasks())
+
+    assert run_virtual(main) == 1
+    assert log == ["map", "drive"]
+
+
+def test_a_cancellation_while_ending_reaches_the_owner():
+    log: list[str] = []
+
+    async def daemon() -> None:
+        async with scope("outer") as outer:
+            outer.start("bus", until_cancelled("bus", log))
+            async with scope("inner") as inner:
+                inner.start("gate", until_cancelled("gate", log, linger=1.0))
+            log.append("went on")
+            await asyncio.Event().wait()
+
+    async def main(_: VirtualClock) -> None:
+        task = asyncio.create_task(daemon())
+        await asyncio.sleep(0.5)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_virtual(main)
+    assert log == ["gate", "bus"]

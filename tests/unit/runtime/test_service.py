@@ -53,7 +53,7 @@ def run(*scripts: Callable[[Ready], object], policy: RestartPolicy = STEADY, on_
 def test_lost_sessions_are_tried_again_with_growing_capped_delays():
     health, starts = run(lost, lost, lost, lost, lost, lambda ready: ready())
     assert starts == pytest.approx([0, 1, 3, 7, 12, 17])
-    assert [row.state for row in health[-3:]] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
+    assert [row.state for row in health[-3:]] == [ServiceState.STARTING, ServiceState.READY, ServiceState.FAILED]
     assert health[-1].restarts == 5
     assert {row.reason for row in health if row.state is ServiceState.BACKOFF} == {Reason.DEVICE_LOST}
     assert all(row.detail == "cable" for row in health if row.state is ServiceState.BACKOFF)
@@ -96,8 +96,28 @@ def test_a_bug_fails_an_ordinary_service_alone():
 
 
 def test_a_bug_in_a_critical_service_is_raised():
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(RuntimeError, match="scripted failed"):
         run(bug, on_bug=OnBug.EXIT)
+
+
+def test_returning_is_a_bug():
+    health, _ = run(lambda ready: ready())
+    assert (health[-1].state, health[-1].detail) == (ServiceState.FAILED, "ended by itself")
+    with pytest.raises(RuntimeError, match="ended by itself"):
+        run(lambda ready: ready(), on_bug=OnBug.EXIT)
+
+
+def test_somebody_elses_cancellation_is_a_bug():
+    async def awaits_a_cancelled_future(ready: Ready) -> None:
+        ready()
+        future = asyncio.get_running_loop().create_future()
+        future.cancel()
+        await future
+
+    health, _ = run(awaits_a_cancelled_future)
+    assert health[-1].state is ServiceState.FAILED
+    with pytest.raises(RuntimeError):
+        run(awaits_a_cancelled_future, on_bug=OnBug.EXIT)
 
 
 def test_cancellation_is_reported_and_passes():
