@@ -39,6 +39,7 @@ FRONT_STEP: Final = 384
 GREATEST_MM: Final = 5600
 PROCESSING: Final = 1_500_000
 """Nanoseconds from the last step to the first byte."""
+DEFAULT_BAUD: Final = 19200
 ANSWER_DELAY: Final = 0.0005
 """Seconds from a request to its answer."""
 CATCH_UP: Final = 5
@@ -162,7 +163,7 @@ class HokuyoEmulator:
 
     def _power_up(self) -> None:
         self._scip2 = self._adjusting = self._laser = self._verifying = self._deaf = False
-        self._baud = 19200
+        self._baud = DEFAULT_BAUD
         self._next_baud: int | None = None
         self._order = None
         self._skipped = 0
@@ -351,7 +352,7 @@ class HokuyoEmulator:
             "LASR": "ON" if self._laser else "OFF",
             "SCSP": "Initial(600[rpm])<-Default setting by user",
             "MESM": "CLASSIC" if self._laser else "IDLE",
-            "SBPS": f"{self._baud}[bps]",
+            "SBPS": f"{self._baud}[bps]" + ("<-Default setting by user" if self._baud == DEFAULT_BAUD else ""),
             "TIME": f"{self._counter(self._time()):06X}",
             "STAT": "Laser malfunction." if self._laser_broken else "Sensor works well.",
         }
@@ -370,7 +371,7 @@ class HokuyoEmulator:
         return "00", []
 
     def _rs(self, text: str, tag: str) -> tuple[str, list[bytes]]:
-        self._adjusting, self._timer_zero, self._next_baud = False, self._time(), 19200
+        self._adjusting, self._timer_zero, self._next_baud = False, self._time(), DEFAULT_BAUD
         return self._qt(text, tag)
 
     def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:

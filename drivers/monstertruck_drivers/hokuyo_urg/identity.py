@@ -70,7 +70,8 @@ SCIP1_PARAMETERS: Final = Parameters("URG-04LX", 20, 4095, 1024, 44, 725, 384, 6
 def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
     """``KEY:value;`` lines as a mapping.
 
-    A wrong sum on SERI is accepted (some units send it so), and II leaves what follows ``<-`` out of its sum.
+    A wrong sum on SERI is accepted (some units send it so), and one that leaves out what follows ``<-`` (some models'
+    II).
 
     Raises:
         ProtocolError: another line with a wrong sum, or not of this form.
@@ -90,11 +91,11 @@ def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
 
 
 def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
-    """Lines ``KEY:value;`` as firmware 3.1 sends them: the ``;`` and what follows ``<-`` are left out of the sum."""
+    """Lines ``KEY:value;`` as firmware 3.1 sends them: the ``;`` is left out of the sum."""
     lines = []
     for key, value in fields.items():
         text = f"{key}:{value}".encode("latin-1")
-        lines.append(text + b";" + bytes((line_sum(text.partition(b"<-")[0]),)))
+        lines.append(text + b";" + bytes((line_sum(text),)))
     return lines
 
 
