@@ -1,7 +1,7 @@
 """Runs one scenario and watches it."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event
-from monstertruck_schemas.health import HealthTable, ServiceState
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
@@ -109,7 +109,7 @@ class _Drill:
 
     def ready(self) -> bool:
         """Every service works."""
-        return bool(self.health) and all(row.state is ServiceState.READY for row in self.health[-1].services)
+        return bool(self.health) and not _unready(self.health[-1:])
 
     def armable(self) -> bool:
         """Nothing stops the truck but that nobody armed it."""
@@ -123,8 +123,9 @@ class _Drill:
 
     async def _until(self, condition: Callable[[], bool], what: str, order: Order | None = None) -> None:
         if not await self._waits(condition, PATIENCE, order):
-            held = ", ".join(self.gate[-1].reasons) if self.gate else ""
-            raise NoAnswerError(f"{self.scenario.name}: waited for {what}; held by {held or 'nothing'}")
+            held: list[str] = [*self.gate[-1].reasons] if self.gate else []
+            held += [f"{row.name}: {row.detail or row.state}" for row in _unready(self.health[-1:])]
+            raise NoAnswerError(f"{self.scenario.name}: waited for {what}; held by {', '.join(held) or 'nothing'}")
 
     async def _waits(self, condition: Callable[[], bool], seconds: float, order: Order | None = None) -> bool:
         end = self.clock.now() + round(seconds * SECOND)
@@ -209,14 +210,13 @@ class _Drill:
         return None
 
     def _lost(self) -> int | None:
-        return next((table.stamp for table in self._tables() if _unready(table)), None)
+        return next((table.stamp for table in self._tables() if _unready([table])), None)
 
     def _down(self) -> dict[str, tuple[Reason, ...]]:
         down: dict[str, dict[Reason, None]] = {}
-        for table in self._tables():
-            for name, reason in _unready(table).items():
-                if reason is not Reason.OK:
-                    down.setdefault(name, {})[reason] = None
+        for row in _unready(self._tables()):
+            if row.reason is not Reason.OK:
+                down.setdefault(row.name, {})[row.reason] = None
         return {name: tuple(reasons) for name, reasons in down.items()}
 
     def _tables(self) -> list[HealthTable]:
@@ -249,8 +249,8 @@ class _Drill:
         return max((abs(v) for t, _, _, v in self.truth if since <= t <= until), default=0.0)
 
 
-def _unready(table: HealthTable) -> dict[str, Reason]:
-    return {row.name: row.reason for row in table.services if row.state is not ServiceState.READY}
+def _unready(tables: Iterable[HealthTable]) -> list[ServiceHealth]:
+    return [row for table in tables for row in table.services if row.state is not ServiceState.READY]
 
 
 async def measure(

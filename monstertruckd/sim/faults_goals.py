@@ -103,7 +103,7 @@ COLUMNS: Final = ("fault", "detected", "stop bytes", "standstill", "metres", "re
 
 def cells(scenario: Scenario, reaction: Reaction) -> tuple[str, ...]:
     """One row of the table: seconds from the fault (``back``: from its end), metres."""
-    told = scenario.seen[-1:] or sorted(set(scenario.down.values())) or [reaction.reason or "-"]
+    told: list[str] = [*scenario.seen[-1:]] or sorted(set(scenario.down.values())) or [reaction.reason or "-"]
     return (
         reaction.fault,
         _seconds(reaction.detected_after_s),
