@@ -38,6 +38,10 @@ class Link:
         self._buffer = bytearray()
         self._lost: str | None = None
         self._waiter: asyncio.Future[None] | None = None
+        self._due: float | None = None
+        """Loop time at which the present wait has lasted too long."""
+        self._alarm: asyncio.TimerHandle | None = None
+        """Rings at ``_due`` or earlier; outlives its wait, because the next one most likely needs it as well."""
 
     # What the transport calls
 
@@ -54,6 +58,9 @@ class Link:
         if self._lost is None:
             self._lost = why
             self._wake()
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
 
     # What the user calls
 
@@ -72,26 +79,39 @@ class Link:
             raise DeviceLostError(f"{self.name}: {self._lost}")
         self._transmit(data)
 
-    async def read(self) -> bytes:
+    async def read(self, within: float | None = None) -> bytes:
         """Everything received so far, at least one byte.
+
+        Args:
+            within: seconds to wait for it; None = for ever.
 
         Raises:
             DeviceLostError: the link is down and its buffer is empty.
+            TimeoutError: nothing came in time.
         """
-        while not self._buffer:
-            await self._more()
+        if not self._buffer:
+            due = _due(within)
+            while not self._buffer:
+                await self._more(due)
         data = bytes(self._buffer)
         self._buffer.clear()
         return data
 
-    async def exactly(self, count: int) -> bytes:
+    async def exactly(self, count: int, within: float | None = None) -> bytes:
         """Read ``count`` bytes; bytes beyond stay buffered.
+
+        Args:
+            count: how many.
+            within: seconds to wait for the last one; None = for ever.
 
         Raises:
             DeviceLostError: the link went down before they came.
+            TimeoutError: they did not come in time; those that did stay buffered.
         """
-        while len(self._buffer) < count:
-            await self._more()
+        if len(self._buffer) < count:
+            due = _due(within)
+            while len(self._buffer) < count:
+                await self._more(due)
         data = bytes(self._buffer[:count])
         del self._buffer[:count]
         return data
@@ -133,16 +153,34 @@ class Link:
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
-    async def _more(self) -> None:
+    async def _more(self, due: float | None = None) -> None:
+        """Wait until something comes; a time limit is one timer for many waits, set anew only when it rings."""
         if self._lost is not None:
             raise DeviceLostError(f"{self.name}: {self._lost}")
         if self._waiter is not None:
             raise RuntimeError(f"{self.name}: two readers")
-        self._waiter = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        self._waiter, self._due = loop.create_future(), due
+        if due is not None and (self._alarm is None or self._alarm.when() > due):
+            self._set_alarm(loop, due)
         try:
             await self._waiter
         finally:
-            self._waiter = None
+            self._waiter = self._due = None
+
+    def _set_alarm(self, loop: asyncio.AbstractEventLoop, due: float) -> None:
+        if self._alarm is not None:
+            self._alarm.cancel()
+        self._alarm = loop.call_at(due, self._ring, loop)
+
+    def _ring(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._alarm = None
+        if self._due is None or self._waiter is None:
+            return
+        if loop.time() < self._due:
+            self._set_alarm(loop, self._due)
+        elif not self._waiter.done():
+            self._waiter.set_exception(TimeoutError())
 
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done():
@@ -151,6 +189,10 @@ class Link:
 
 def _nothing() -> None:
     return None
+
+
+def _due(within: float | None) -> float | None:
+    return None if within is None else asyncio.get_running_loop().time() + within
 
 
 class Port(Protocol):
@@ -256,22 +298,26 @@ class DeviceEnd:
         """A host opened the port (or closed it: None)."""
         self._deliver = deliver
 
-    async def read(self) -> bytes:
-        """Bytes from the host, at least one; waits for ever while nothing is plugged in or open."""
-        return await self._received.read()
+    async def read(self, within: float | None = None) -> bytes:
+        """Bytes from the host, at least one; waits for ever while nothing is plugged in or open.
 
-    def write(self, data: bytes) -> None:
-        """Send to the host, through baud pacing and line faults."""
+        Raises:
+            TimeoutError: nothing came ``within`` that many seconds.
+        """
+        return await self._received.read(within)
+
+    def write(self, data: bytes, after: float = 0.0) -> None:
+        """Send to the host ``after`` seconds, through baud pacing and line faults."""
         for chunk in self.faults.corrupt(data):
-            self._out_free = self._paced(self._out_free, len(chunk), partial(self._emit, chunk))
+            self._out_free = self._paced(self._out_free, len(chunk), partial(self._emit, chunk), after)
 
     def take(self, data: bytes) -> None:
         """Bytes from the host enter the line."""
         self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
 
-    def _paced(self, free: float, count: int, act: Callable[[], None]) -> float:
+    def _paced(self, free: float, count: int, act: Callable[[], None], after: float = 0.0) -> float:
         """Act when ``count`` bytes are through; ``free`` is when those before them are, the result when these are."""
-        delay = self.faults.delay
+        delay = self.faults.delay + after
         loop = asyncio.get_running_loop()
         if self.baud is None and delay <= 0 and free <= loop.time():
             act()

@@ -220,9 +220,9 @@ class EposEmulator:
 
     async def _exchange(self, end: DeviceEnd, opcode: int) -> None:
         if self._due("busy"):
-            await self._send(end, bytes((REFUSED,)))
+            self._send(end, bytes((REFUSED,)))
             return
-        await self._acknowledge(end)
+        self._acknowledge(end)
         head = await self._within(end, 1)
         body = head + await self._within(end, body_size(head[0]))
         try:
@@ -230,15 +230,15 @@ class EposEmulator:
         except FrameError:
             request = None
         if request is None or len(request.words) > MAX_WORDS or self._due("refuse"):
-            await self._send(end, bytes((REFUSED,)))
+            self._send(end, bytes((REFUSED,)))
             return
         self.frames.append((self._clock.now(), request))
         if opcode == Opcode.NMT:
-            await self._acknowledge(end)
+            self._acknowledge(end)
             self._network(request)
             return
         reply = self._execute(request)
-        await self._acknowledge(end)
+        self._acknowledge(end)
         await self._reply(end, reply)
 
     async def _reply(self, end: DeviceEnd, reply: Frame) -> None:
@@ -250,19 +250,18 @@ class EposEmulator:
         body = reply.body
         if self._due("flip"):
             body = body[:-3] + bytes((body[-3] ^ 0x10,)) + body[-2:]
-        await self._send(end, body)
+        self._send(end, body)
         if (await self._within(end, 1))[0] == REFUSED and self.repeat_refused:
-            await self._send(end, reply.body)
+            self._send(end, reply.body)
             await self._within(end, 1)
 
-    async def _acknowledge(self, end: DeviceEnd) -> None:
+    def _acknowledge(self, end: DeviceEnd) -> None:
         if self._due("stray"):
             end.write(bytes((STRAY,)))
-        await self._send(end, bytes((READY,)))
+        self._send(end, bytes((READY,)))
 
-    async def _send(self, end: DeviceEnd, data: bytes) -> None:
-        await self._clock.sleep(TURN_AROUND)
-        end.write(data)
+    def _send(self, end: DeviceEnd, data: bytes) -> None:
+        end.write(data, TURN_AROUND)
 
     async def _within(self, end: DeviceEnd, count: int) -> bytes:
         """Bytes of a frame; a pause of ``FRAME_TIMEOUT`` raises ``TimeoutError``."""
@@ -270,8 +269,7 @@ class EposEmulator:
 
     async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
         while len(self._inbox) < count:
-            async with asyncio.timeout(pause):
-                data = await end.read()
+            data = await end.read(pause)
             if self._power and not self._silent and self._clock.now() >= self._booted_at:
                 self.received.append((self._clock.now(), data))
                 self._inbox += data

@@ -276,8 +276,7 @@ class Exchanger:
 
     async def _exactly(self, count: int, timeout: float) -> bytes:
         try:
-            async with self._clock.deadline(timeout):
-                return await self._link.exactly(count)
+            return await self._link.exactly(count, timeout)
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
 

@@ -39,6 +39,47 @@ async def test_a_reader_wakes_when_enough_bytes_came():
         assert await waiting == b"abcd"
 
 
+def test_each_wait_has_its_own_time_limit():
+    async def main(clock: VirtualClock) -> list[float]:
+        port = await plugged()
+        gave_up = []
+        async with await port.open() as link:
+            for within in (0.5, 0.2, 0.3):
+                begin = clock.now()
+                port.device.write(b"a")
+                with pytest.raises(TimeoutError):
+                    await link.exactly(2, within)
+                gave_up.append((clock.now() - begin) / SECOND)
+                assert await link.read(within) == b"a"
+            for _ in range(4):  # answers in time put the limit off, however often
+                port.device.write(b"b", after=0.2)
+                assert await link.read(0.3) == b"b"
+            begin = clock.now()
+            with pytest.raises(TimeoutError):
+                await link.read(0.3)
+            gave_up.append((clock.now() - begin) / SECOND)
+            with pytest.raises(TimeoutError):
+                await port.device.read(0.1)
+        return gave_up
+
+    assert run_virtual(main) == pytest.approx([0.5, 0.2, 0.3, 0.3], abs=1e-6)
+
+
+def test_a_wait_without_limit_outlasts_the_limits_before_it():
+    async def main(clock: VirtualClock) -> bytes:
+        port = await plugged()
+        async with await port.open() as link:
+            port.device.write(b"a")
+            waiting = asyncio.create_task(link.exactly(2, 0.1))
+            await clock.sleep(0.05)
+            port.device.write(b"b")
+            await waiting
+            port.device.write(b"late", after=5.0)
+            return await link.read()
+
+    assert run_virtual(main) == b"late"
+
+
 async def test_until_gives_up_on_endless_garbage():
     port = await plugged()
     async with await port.open() as link:
