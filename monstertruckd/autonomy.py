@@ -1,8 +1,9 @@
 """Builds what thinks: estimation and planners of a configuration, each with its ends of the bus."""
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
@@ -120,3 +121,22 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             tracker=bus.subscribe(topics.TRACKER, latest()),
             events=bus.event_sink(),
         )
+
+
+def calibration(config: TruckConfig, linkage: SteeringPolynomials) -> dict[str, Any]:
+    """Everything that was measured on this very truck, for the log."""
+    devices = config.devices
+    values: dict[str, Any] = {
+        "wheel_radius_m": config.geometry.wheel_radius,
+        "drive_ratio": config.geometry.drive_ratio,
+        "linkage": dataclasses.asdict(linkage),
+        "mounts": {role: device.mount.model_dump() for role, device in devices.present().items()},
+    }
+    if devices.drive is not None:
+        values["drive_inverted"] = devices.drive.driver.inverted
+    if devices.steering is not None:
+        steering = devices.steering.driver
+        values |= {"front_servo": steering.front.model_dump(), "rear_servo": steering.rear.model_dump()}
+        if steering.battery is not None:
+            values["battery"] = steering.battery.model_dump()
+    return values

@@ -114,6 +114,7 @@ def check(arguments: list[str]) -> int:
     tools = VENV / "bin"
     pytest = tools / "pytest"
     steps: list[tuple[Path, list[str]]] = [
+        (Path(find_uv()), ["lock", "--check", "--quiet", "--system-certs"]),
         (tools / "ruff", ["check", "."]),
         (tools / "ruff", ["format", "--check", "."]),
         (tools / "mypy", []),

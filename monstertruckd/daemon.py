@@ -15,14 +15,16 @@ import numpy as np
 
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
 from monstertruck_schemas import topics
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd import __version__
-from monstertruckd.autonomy import Body, build_estimation, build_planners
+from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
@@ -136,6 +138,7 @@ class Daemon:
             yield
             return
         async with self.recorder as recorder:
+            self._board.report(ServiceHealth(name=recorder.name, state=ServiceState.READY, since=self.clock.now()))
             tap = self.bus.tap(
                 lambda topic, message, data: recorder.record(topic, message.stamp, data),
                 (topic for topic in TOPICS if topic.logged),
@@ -144,6 +147,13 @@ class Daemon:
                 yield
             finally:
                 tap.close()
+
+    def _recorder_failed(self, reason: Reason, text: str) -> None:
+        self._board.report(
+            ServiceHealth(
+                name="recorder", state=ServiceState.FAILED, since=self.clock.now(), reason=reason, detail=text
+            )
+        )
 
     def _start(
         self, where: Scope, service: Service, on_bug: OnBug = OnBug.FAIL, policy: RestartPolicy | None = None
@@ -176,7 +186,7 @@ class Daemon:
 
     def _build_gate(self) -> GateService:
         config, bus = self.config, self.bus
-        latch: Latch = EstopLatch(config.state_directory / "estop") if self._seed is None else MemoryLatch()
+        latch = self._build_latch()
         nonce = secrets.token_hex(8) if self._seed is None else self._rng.bytes(8).hex()
         lidar = config.devices.lidar
         gate = Gate(
@@ -209,6 +219,17 @@ class Daemon:
             latch,
         )
 
+    def _build_latch(self) -> Latch:
+        if self._seed is not None:
+            return MemoryLatch()
+        latch = EstopLatch(self.config.state_directory / "estop")
+        try:
+            latch.prepare()
+        except OSError as error:
+            msg = f"state_directory: an emergency stop could not be remembered: {error}"
+            raise ConfigError(msg) from error
+        return latch
+
     def _build_recorder(self) -> Recorder | None:
         if self.config.recorder is None:
             return None
@@ -216,9 +237,10 @@ class Daemon:
         return Recorder(
             self.config.recorder,
             self.clock,
-            lambda reason, text: self._events(reason, Severity.ERROR, "recorder", text),
+            self._recorder_failed,
             attachments={
                 "config": resolved(self.config),
+                "calibration": calibration(self.config, self._body.linkage),
                 "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
                 "versions": VERSIONS,
             },

@@ -1,5 +1,6 @@
 """The picture of the path over the scan map: feeds the renderer's worker, saves what it draws."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ from monstertruckd.workers.actor import WorkerActor
 
 TARGET = "monstertruckd.workers.map_render:MapRenderer"
 SPACING = 0.02
-"""Metres between two remembered poses of the driven path."""
+"""Metres between two remembered poses of the driven path, at first."""
+REMEMBERED = 2000
+"""Poses after which every other one is forgotten and the spacing doubles."""
 
 
 class MapService:
@@ -57,6 +60,7 @@ class MapService:
         self._tracker = tracker
         self._events = events
         self._driven: list[tuple[float, float, float]] = []
+        self._spacing = SPACING
 
     async def run(self, ready: Ready) -> None:
         """Feed the worker until cancelled.
@@ -87,8 +91,13 @@ class MapService:
         if scan is None or odometry is None:
             return []
         pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
-        if not self._driven or np.hypot(pose[0] - self._driven[-1][0], pose[1] - self._driven[-1][1]) > SPACING:
+        if not self._driven or math.dist(pose[:2], self._driven[-1][:2]) > self._spacing:
             self._driven.append(pose)
+            if len(self._driven) > REMEMBERED:
+                self._driven = self._driven[::2]
+                self._spacing *= 2
+        if scan.tilt is not None and scan.tilt > self._config.max_tilt:
+            return []
         return [(pose, scan_points(scan, self._mount))]
 
     def _picture(self, outcome: Reason) -> dict[str, Any]:

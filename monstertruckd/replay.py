@@ -38,8 +38,11 @@ def replay_log(log: Path, robot: str, endpoint: str, speed: float, topics: Colle
         await bridge.open()
         serving = asyncio.Event()
         task = asyncio.create_task(bridge.run(_set(serving)))
+        waiting = asyncio.create_task(serving.wait())
         try:
-            await serving.wait()
+            await asyncio.wait([waiting, task], return_when=asyncio.FIRST_COMPLETED)
+            if task.done():
+                task.result()
             count = 0
             for entry in reader:
                 topic = BY_NAME.get(entry.topic)
@@ -50,10 +53,12 @@ def replay_log(log: Path, robot: str, endpoint: str, speed: float, topics: Colle
                 count += 1
             return count
         finally:
-            task.cancel()
-            await asyncio.wait([task])
+            for job in (waiting, task):
+                job.cancel()
+            await asyncio.wait([waiting, task])
 
-    return run_replay(main, start=start, real_offset=0, rate=speed)
+    offset = int(reader.metadata().get("run", {}).get("real_offset_ns", 0))
+    return run_replay(main, start=start, real_offset=offset, rate=speed)
 
 
 def _set(event: asyncio.Event) -> Ready:

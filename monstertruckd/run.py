@@ -7,10 +7,14 @@ import logging
 import signal
 from pathlib import Path
 
+from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.errors import PortBusyError
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import TOPICS
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
+from monstertruckd.logging_queue import start_logging
 
 log = logging.getLogger(__name__)
 
@@ -21,18 +25,19 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     Raises:
         ConfigError: the configuration was refused.
         BusyError: another daemon runs this robot or holds the endpoint.
+        PortBusyError: another process holds an actuator's port.
     """
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO, format="%(levelname)-7s %(name)s: %(message)s"
-    )
-    faulthandler.enable()
     config, tree = load_truck(config_file)
+    faulthandler.enable()
+    listener = start_logging(verbose=verbose)
 
     async def main(clock: Clock) -> None:
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         daemon = Daemon(config, clock, tree=tree)
+        for topic in TOPICS:
+            wire.schema(topic)  # built once, before the control tick would wait for it
         # A full collection over everything loaded so far takes tens of milliseconds: take it out of the heap's view.
         gc.collect()
         gc.freeze()
@@ -40,7 +45,18 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
 
     try:
         run_wall(main)
-    except BaseExceptionGroup:
+    except BaseExceptionGroup as group:
+        if (busy := _first(group.subgroup(PortBusyError))) is not None:
+            raise busy from None
         log.exception("ended by a bug; the actuators were told to stop")
         return Reason.INTERNAL
+    finally:
+        listener.stop()
     return Reason.OK
+
+
+def _first(error: BaseException | None) -> BaseException | None:
+    """First plain exception in a tree of groups."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error

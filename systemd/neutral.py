@@ -2,8 +2,9 @@
 
     python3 neutral.py /dev/truck/drive [NODE]
 
-Needs nothing but Python's standard library and the codec beside it. Exit code 0 once the controller has accepted
-both commands, 1 if it did not within five seconds.
+NODE must equal ``devices.drive.driver.node`` of the configuration (default 1); the line runs at 38400 baud, as the
+controller is delivered. Needs nothing but Python's standard library and the codec beside it. Exit code 0 once the
+controller has accepted both commands, 1 if it did not within five seconds, for whatever reason.
 """
 
 import os
@@ -16,7 +17,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
 
-from monstertruck_drivers.epos.protocol import Frame, stop_frames
+from monstertruck_drivers.epos.protocol import Frame, FrameError, decode_body, stop_frames
 
 PATIENCE = 5.0
 FRAME_TIMEOUT = 0.55
@@ -24,10 +25,12 @@ FRAME_TIMEOUT = 0.55
 BRAKING = 0.4
 """Seconds from full speed to rest, with room to spare."""
 OKAY = b"O"
+ANSWER = 0x00
+"""Opcode of every answer."""
 
 
-class NoAnswerError(Exception):
-    """The controller stayed silent or answered something else."""
+class NotStoppedError(Exception):
+    """The controller stayed silent, answered something else, or refused."""
 
 
 def main(arguments: list[str]) -> int:
@@ -37,7 +40,7 @@ def main(arguments: list[str]) -> int:
     while time.monotonic() < give_up:
         try:
             stop(port, node)
-        except (OSError, termios.error, NoAnswerError) as error:
+        except (OSError, termios.error, FrameError, NotStoppedError) as error:
             print(f"neutral: {port}: {error}", file=sys.stderr)
             time.sleep(FRAME_TIMEOUT)
         else:
@@ -51,7 +54,8 @@ def stop(port: str, node: int) -> None:
 
     Raises:
         OSError: the port cannot be used.
-        NoAnswerError: the controller did not accept a command.
+        NotStoppedError: the controller did not accept a command.
+        FrameError: an answer was damaged.
     """
     line = os.open(port, os.O_RDWR | os.O_NOCTTY)
     try:
@@ -74,17 +78,19 @@ def exchange(line: int, frame: Frame) -> None:
     expect(line, OKAY)
     os.write(line, frame.body)
     expect(line, OKAY)
-    expect(line, b"\x00")
+    expect(line, bytes([ANSWER]))
     os.write(line, OKAY)
-    words = receive(line, 1)[0] + 1
-    receive(line, 2 * words + 2)
+    length = receive(line, 1)
+    answer = decode_body(ANSWER, length + receive(line, 2 * (length[0] + 1) + 2))
     os.write(line, OKAY)
+    if code := answer.words[0] | answer.words[1] << 16:
+        raise NotStoppedError(f"refused with error 0x{code:08X}")
 
 
 def expect(line: int, wanted: bytes) -> None:
     """Read one byte that must be ``wanted``."""
     if (got := receive(line, 1)) != wanted:
-        raise NoAnswerError(f"expected {wanted!r}, got {got!r}")
+        raise NotStoppedError(f"expected {wanted!r}, got {got!r}")
 
 
 def receive(line: int, count: int) -> bytes:
@@ -92,7 +98,7 @@ def receive(line: int, count: int) -> bytes:
     data = b""
     while len(data) < count:
         if not select.select([line], [], [], 0.25)[0]:
-            raise NoAnswerError("no answer")
+            raise NotStoppedError("no answer")
         data += os.read(line, count - len(data))
     return data
 

@@ -41,7 +41,7 @@ class EstopLatch:
     """Latch in a file. Existing means latched, so a damaged or empty file stops rather than drives.
 
     Args:
-        path: the file; its directory is made on the first emergency stop.
+        path: the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,6 +57,17 @@ class EstopLatch:
         except OSError:
             return True
         return True
+
+    def prepare(self) -> None:
+        """Make sure that it can be stored later.
+
+        Raises:
+            OSError: its directory cannot be made or written.
+        """
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        draft = self._path.with_name(self._path.name + ".new")
+        draft.write_bytes(b"")
+        draft.unlink()
 
     def store(self, engaged: bool) -> None:
         """Create or remove the file, atomically and synced to the disk.

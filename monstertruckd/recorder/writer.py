@@ -1,5 +1,6 @@
 """What the recorder's thread does: chunks, rotation, quota. Synchronous; driven by log times alone."""
 
+import dataclasses
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,6 +35,8 @@ class LogWriter:
         self._attachments = attachments
         self._metadata = metadata
         self._folder = LogFolder(Path(config.directory))
+        self._retained: dict[str, Entry] = {}
+        """Newest of every retained topic: the head of the next file, so that each file stands alone."""
         self._file = self._open(start)
         self._synced = start
 
@@ -61,6 +64,10 @@ class LogWriter:
             self._file.finish()
             self._file = self._open(entry.log_time)
             self._synced = entry.log_time
+            for kept in self._retained.values():
+                self._file.add(dataclasses.replace(kept, log_time=entry.log_time))
+        if entry.topic.retained:
+            self._retained[entry.topic.name] = entry
         self._file.add(entry)
 
     def tick(self, now: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceMismatchError, TruckError
+from monstertruck_runtime.errors import DeviceMismatchError, PortBusyError, TruckError
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -86,6 +86,7 @@ async def supervise(
 
     Raises:
         RuntimeError: a bug, when ``on_bug`` is ``EXIT``.
+        PortBusyError: another process holds its port at the very first start, when ``on_bug`` is ``EXIT``.
     """
     session = _Session(service.name, clock, report)
     restarts: deque[int] = deque()
@@ -112,6 +113,10 @@ async def supervise(
                 raise RuntimeError(f"{service.name} ended by itself")
             return
 
+        if isinstance(lost, PortBusyError) and on_bug is OnBug.EXIT and session.starts == 1:
+            # Two daemons must not lie in wait for each other's actuators.
+            session.tell(ServiceState.FAILED, lost.reason, str(lost))
+            raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
         # The first failure of an outage is news, its repetitions are not.
         log.log(logging.WARNING if session.ready_at is not None else logging.DEBUG, "%s: %s", service.name, detail)
@@ -144,11 +149,11 @@ class _Session:
         self._name = name
         self._clock = clock
         self._report = report
-        self._starts = 0
+        self.starts = 0
         self.ready_at: int | None = None
 
     def start(self) -> None:
-        self._starts += 1
+        self.starts += 1
         self.ready_at = None
         self.tell(ServiceState.STARTING)
 
@@ -164,7 +169,7 @@ class _Session:
                 name=self._name,
                 state=state,
                 since=self._clock.now(),
-                restarts=self._starts - 1,
+                restarts=self.starts - 1,
                 reason=reason,
                 detail=detail,
             )

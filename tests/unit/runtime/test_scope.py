@@ -111,6 +111,7 @@ def test_a_cancellation_while_ending_reaches_the_owner():
             outer.start("bus", until_cancelled("bus", log))
             async with scope("inner") as inner:
                 inner.start("gate", until_cancelled("gate", log, linger=1.0))
+                await asyncio.sleep(0.1)
             log.append("went on")
             await asyncio.Event().wait()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError
+from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError, PortBusyError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.service import OnBug, RestartPolicy, supervise
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -98,6 +98,19 @@ def test_a_bug_fails_an_ordinary_service_alone():
 def test_a_bug_in_a_critical_service_is_raised():
     with pytest.raises(RuntimeError, match="scripted failed"):
         run(bug, on_bug=OnBug.EXIT)
+
+
+def busy(_: Ready) -> None:
+    raise PortBusyError("held by another process")
+
+
+def test_a_critical_service_does_not_lie_in_wait_for_a_busy_port():
+    with pytest.raises(PortBusyError, match="scripted: held"):
+        run(busy, on_bug=OnBug.EXIT)
+    with pytest.raises(PortBusyError):
+        run(busy, on_bug=OnBug.EXIT)
+    _, starts = run(lost, busy, lost, lambda ready: ready(), on_bug=OnBug.FAIL)
+    assert len(starts) == 4, "ordinary services try on"
 
 
 def test_returning_is_a_bug():
