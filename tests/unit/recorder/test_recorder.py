@@ -155,6 +155,20 @@ def test_rotation_by_duration_makes_files_that_stand_alone(config, failures):
     assert sequences == list(range(125))
 
 
+def test_a_rotated_file_begins_with_the_newest_retained_messages(config, failures):
+    config = config.model_copy(update={"rotate_seconds": 1.0})
+
+    async def main(clock):
+        async with Recorder(config, clock, failures, deterministic=True) as recorder:
+            for payload in (b"old", b"new"):
+                recorder.record(t.CLOCK, clock.now(), payload)
+            await drive(recorder, clock, 2.5)
+
+    run_virtual(main)
+    heads = [[(m.topic, m.payload) for m in open_log(path)][0] for path in logs(config)[1:]]
+    assert heads == [("state/clock", b"new")] * 2
+
+
 def test_rotation_by_size(config, failures):
     config = config.model_copy(update={"rotate_bytes": 40_000})
     record(config, 3.0, failures)
