@@ -173,6 +173,8 @@ class MapRender(Schema):
     """Seconds after which a silent worker is killed"""
     period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
     """Seconds between two scans it is given"""
+    max_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = math.radians(3)
+    """Scans whose plane was tilted more than this are left out, rad: over 5 m they are 0.26 m off"""
     picture: Path | None = None
     """PNG file drawn whenever a path has come to its end"""
 

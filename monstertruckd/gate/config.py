@@ -102,6 +102,9 @@ class GateConfig(Schema):
     """Seconds without a driver whose wishes can be carried out, after which the truck disarms."""
 
     scan: SensorLimit = SensorLimit(stale_after=0.25)
+    scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.35
+    """A scan whose plane was tilted more than this is no good sample: within the gate's reach of half a metre it looks
+    0.2 m over or under what it should see, rad."""
     drive: SensorLimit = SensorLimit(stale_after=0.2)
     steering: SensorLimit = SensorLimit(stale_after=0.25)
     attitude: SensorLimit = SensorLimit(stale_after=0.25)

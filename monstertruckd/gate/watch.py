@@ -65,8 +65,8 @@ class Watch:
         self._tilt = _Tilt(config.tilt)
 
     def observe_scan(self, scan: LaserScan) -> bool:
-        """Take a scan; False if it is not a good sample."""
-        if self._good(scan):
+        """Take a scan; False if it is not a good sample, by its age or by the tilt of its plane."""
+        if self._good(scan) and (scan.tilt is None or scan.tilt <= self._config.scan_tilt):
             self.scan = scan
         return self.scan is scan
 
