@@ -4,6 +4,7 @@ import asyncio
 import errno
 import logging
 import queue
+import subprocess
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
-from monstertruckd.logs.recover import recover_directory
+from monstertruckd.logs.repair import start_repair
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.file import Entry
@@ -38,7 +39,8 @@ class Recorder:
     """Records while its ``async with`` body runs; leaving it finishes the log.
 
     A disk that is full or refuses ends the recording: ``on_failure`` is called once, later messages count as
-    drops, and nothing is raised, because driving goes on. Unfinished logs in the folder are repaired meanwhile.
+    drops, and nothing is raised, because driving goes on. Unfinished logs in the folder are repaired meanwhile by
+    a process of their own.
 
     Args:
         config: where and how.
@@ -165,15 +167,12 @@ class Recorder:
 
     def _run(self, start: int) -> None:
         """The thread."""
-        stop = threading.Event()
-        repair = threading.Thread(
-            target=recover_directory, args=(Path(self._config.directory), stop), name="log-repair", daemon=True
-        )
+        repair: subprocess.Popen[bytes] | None = None
         try:
             try:
                 with LogWriter(self._config, self._attachments, self._metadata, start) as writer:
                     self._path = writer.path
-                    repair.start()
+                    repair = start_repair(Path(self._config.directory))
                     self._write(writer)
             except OSError as error:
                 reason = Reason.DISK_FULL if error.errno in _FULL else Reason.RECORDING_FAILED
@@ -182,9 +181,9 @@ class Recorder:
                 log.exception("recorder: bug")
                 self._fail(Reason.INTERNAL, f"recording stopped: {error!r}")
         finally:
-            stop.set()
-            if repair.ident is not None:
-                repair.join()
+            if repair is not None:
+                repair.terminate()
+                repair.wait()
             self._loop.call_soon_threadsafe(self._done.set_result, None)
 
     def _write(self, writer: LogWriter) -> None:

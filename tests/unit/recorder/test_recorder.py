@@ -165,7 +165,7 @@ def test_a_rotated_file_begins_with_the_newest_retained_messages(config, failure
             await drive(recorder, clock, 2.5)
 
     run_virtual(main)
-    heads = [[(m.topic, m.payload) for m in open_log(path)][0] for path in logs(config)[1:]]
+    heads = [next((m.topic, m.payload) for m in open_log(path)) for path in logs(config)[1:]]
     assert heads == [("state/clock", b"new")] * 2
 
 
