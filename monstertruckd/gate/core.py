@@ -84,6 +84,10 @@ class Gate:
         self._watch = Watch(config, drivetrain)
         self._obstacles = ObstacleGuard(config, steering, footprint, lidar)
         self._motion = Motion(config, steering)
+        self._servos = (0.0, 0.0), linkage.servo_from_axles(0.0, 0.0)
+        """Axle angles and their servo angles at the last tick."""
+        self._measured = (0.0, 0.0)
+        """Axle angles by the newest steering feedback."""
         self._events = EventLog(config.event_interval)
         self._mode = GateMode.ESTOPPED if latched else GateMode.DISARMED
         self._holder: Source | None = None
@@ -126,6 +130,8 @@ class Gate:
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the newest steering feedback."""
         self._watch.observe_steering(feedback)
+        if self._watch.steering is feedback:
+            self._measured = self._axles(feedback)
 
     def observe_battery(self, battery: Battery) -> None:
         """Take the newest battery reading."""
@@ -339,8 +345,8 @@ class Gate:
         if not self._watch.scan_fresh(now):
             return
         arcs = [(self._motion.front, self._motion.rear)]
-        if self._watch.steering is not None and self._watch.steering_fresh(now):
-            arcs.append(self._axles(self._watch.steering))
+        if self._watch.steering_fresh(now):
+            arcs.append(self._measured)
         free = self._obstacles.free_distance(direction, tuple(arcs))
         allowed = self._obstacles.allowed_speed(free, now)
         crawl = self._config.obstacle.crawl
@@ -392,7 +398,9 @@ class Gate:
         motion, holder = self._motion, self._holder
         wheel_speed = motion.wheel_speed
         travelling = max(abs(self._watch.speed(now) or 0.0), abs(wheel_speed))
-        front_servo, rear_servo = self._linkage.servo_from_axles(motion.front, motion.rear)
+        if self._servos[0] != (motion.front, motion.rear):
+            self._servos = (motion.front, motion.rear), self._linkage.servo_from_axles(motion.front, motion.rear)
+        front_servo, rear_servo = self._servos[1]
         return GateOutput(
             action=self._action(now, reasons),
             speed=wheel_speed,

@@ -48,6 +48,7 @@ class ObstacleGuard:
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._way(config.speed, delay, config.obstacle.deceleration)
+        self._distances = np.linspace(0.0, self._reach, POSES)
 
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
@@ -73,10 +74,9 @@ class ObstacleGuard:
         return self._free
 
     def _free_way(self, direction: float, front: float, rear: float) -> float:
-        distances = np.linspace(0.0, self._reach, POSES)
-        poses = swept_poses(self._steering, front, rear, direction * distances)
+        poses = swept_poses(self._steering, front, rear, direction * self._distances)
         contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.beside)
-        return math.inf if contact is None else float(distances[contact - 1])
+        return math.inf if contact is None else float(self._distances[contact - 1])
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Speed from which the truck still stops comfortably within ``free`` metres, m/s."""

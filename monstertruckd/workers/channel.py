@@ -15,8 +15,7 @@ def send(end: socket.socket, message: Any) -> None:
         OSError: the other end is gone, or the socket's time-out passed.
     """
     data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
-    end.sendall(_LENGTH.pack(len(data)))
-    end.sendall(data)
+    end.sendall(_LENGTH.pack(len(data)) + data)
 
 
 def receive(end: socket.socket) -> Any:

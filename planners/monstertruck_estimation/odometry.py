@@ -111,6 +111,8 @@ class DeadReckoning:
         self._linkage = linkage
         self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
         self._covariance: Array = np.zeros((3, 3))
+        self._slip = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2
+        self._drift = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
         self._drive: DriveFeedback | None = None
         self._steered = False
         self._angles = (0.0, 0.0)
@@ -152,10 +154,9 @@ class DeadReckoning:
         twist = self._steering.body_twist(self._speed, front, rear)
         way = abs(self._speed) * dt
         self._driven += way
-        config = self._config
-        noise = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2 * way / dt**2
         by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
-        moved = by_pose @ self._covariance @ by_pose.T + by_twist @ np.diag(noise) @ by_twist.T
+        slipped = by_twist * (self._slip * way / dt**2) @ by_twist.T
+        moved = by_pose @ self._covariance @ by_pose.T + slipped
         self._covariance = (moved + moved.T) / 2
         self._pose = integrate(self._pose, *twist, dt)
 
@@ -190,11 +191,9 @@ class DeadReckoning:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
         if self._drive is None:
             return None
-        config = self._config
         age = max((now - self._drive.stamp) / SECOND, 0.0)
         twist = self._twist()
-        x, y, yaw = integrate(self._pose, *twist, min(age, config.max_prediction))
-        noise = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
+        x, y, yaw = integrate(self._pose, *twist, min(age, self._config.max_prediction))
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
         swing = np.array(((1.0, 0.0, self._pose[1] - y), (0.0, 1.0, x - self._pose[0]), (0.0, 0.0, 1.0)))
         sources = ["drive"]
@@ -205,8 +204,8 @@ class DeadReckoning:
         return Estimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
-            pose_covariance=swing @ self._covariance @ swing.T + noise * age**2,
-            twist_covariance=noise,
+            pose_covariance=swing @ self._covariance @ swing.T + self._drift * age**2,
+            twist_covariance=self._drift,
             age=age,
             sources=tuple(sources),
         )
@@ -262,7 +261,8 @@ class OdometryService:
         self._drive = drive
         self._steering = steering
         self._compass = compass
-        self._out = (("odom", odometry), ("map", pose))
+        self._odometry = odometry
+        self._pose = pose
         self._rate = rate
         self._seen: tuple[object, object, object] = (None, None, None)
 
@@ -276,8 +276,9 @@ class OdometryService:
             now = self._clock.now()
             estimate = self._reckoning.estimate(now)
             if estimate is not None:
-                for frame, out in self._out:
-                    out.put(_message(estimate, frame, now, out.next_seq()))
+                message = _message(estimate, now, self._odometry.next_seq())
+                self._odometry.put(message)
+                self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
     def _take(self) -> None:
         steering, drive = self._steering.latest, self._drive.latest
@@ -292,14 +293,14 @@ class OdometryService:
             self._reckoning.observe_attitude(compass)
 
 
-def _message(estimate: Estimate, frame: str, now: int, seq: int) -> Odometry:
+def _message(estimate: Estimate, now: int, seq: int) -> Odometry:
     x, y, yaw = estimate.pose
     vx, vy, wz = estimate.twist
     return Odometry(
         stamp=now,
         received=now,
         seq=seq,
-        frame=frame,
+        frame="odom",
         pose=Pose2D(x=x, y=y, yaw=yaw),
         twist=Twist2D(vx=vx, vy=vy, wz=wz),
         pose_covariance=estimate.pose_covariance.ravel(),

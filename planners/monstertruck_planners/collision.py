@@ -113,6 +113,23 @@ def clearance_to_points(footprint: Footprint, poses: Array, points: Array) -> Ar
     return np.asarray(rectangle_distance(footprint, poses, points).min(axis=1))
 
 
+def points_near(points: Array, poses: Array, reach: float) -> Array:
+    """Those points that are not surely further than ``reach`` from all poses.
+
+    Args:
+        points: shape (n, 2).
+        poses: shape (m, 3), same frame.
+        reach: m.
+
+    Returns:
+        Shape (k, 2).
+    """
+    low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+    x, y = points[:, 0], points[:, 1]
+    near: Array = points[(x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])]
+    return near
+
+
 def first_contact(footprint: Footprint, poses: Array, points: Array, margin: float = 0.0) -> int | None:
     """Index of the first pose at which the moving footprint comes within ``margin`` of a point.
 
@@ -128,9 +145,7 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     Returns:
         The index, at least 1, or None when all poses are free.
     """
-    reach = footprint.circumscribed_radius + margin
-    low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
-    near = points[((points >= low) & (points <= high)).all(axis=1)]
+    near = points_near(points, poses, footprint.circumscribed_radius + margin)
     if len(near) == 0:
         return None
     distance = rectangle_distance(footprint, poses, near)

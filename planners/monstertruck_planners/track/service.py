@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, clearance_to_points, scan_points
+from monstertruck_planners.collision import Footprint, clearance_to_points, points_near, scan_points
 from monstertruck_planners.track.line import Line, Progress
 from monstertruck_planners.track.pure_pursuit import Command, PurePursuit, PurePursuitConfig, TruckState
 from monstertruck_runtime.clock import SECOND, Clock
@@ -139,7 +139,7 @@ class TrackerService:
         return self._line is not None and self._progress == self._line.start
 
     def _clearance(self, pose: Odometry, now: int) -> float:
-        """Least clearance of the poses ahead on the path, in the newest scan."""
+        """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
         scan = None if self._scan is None else self._scan.latest
         if scan is None or self._line is None or now - scan.received > SCAN_STALE * SECOND:
             return math.inf
@@ -149,7 +149,8 @@ class TrackerService:
         poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
         if scan is not self._scanned:
             self._scanned, self._points = scan, scan_points(scan, self._lidar)
-        return float(clearance_to_points(self._footprint, poses, self._points).min())
+        near = points_near(self._points, poses, self._footprint.circumscribed_radius + self._config.slow_clearance)
+        return float(clearance_to_points(self._footprint, poses, near).min())
 
     def _ask(self, command: Command, nonce: str, now: int) -> None:
         self._drive.put(

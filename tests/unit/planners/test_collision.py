@@ -11,6 +11,7 @@ from monstertruck_planners.collision import (
     Footprint,
     clearance_to_points,
     first_contact,
+    points_near,
     rectangle_distance,
     scan_points,
     swept_poses,
@@ -224,3 +225,14 @@ def test_bad_grids_are_refused():
     for cells, resolution in ((np.zeros((0, 4), bool), 0.05), (np.zeros(4, bool), 0.05), (np.zeros((4, 4), bool), 0.0)):
         with pytest.raises(InputError, match="grid"):
             DistanceField(cells, resolution)
+
+
+def test_points_near_holds_every_point_within_reach():
+    rng = np.random.default_rng(3)
+    footprint = Footprint()
+    poses = rng.uniform(-1, 1, (6, 3))
+    points = rng.uniform(-3, 3, (500, 2))
+    near = points_near(points, poses, footprint.circumscribed_radius + 0.2)
+    assert 0 < len(near) < len(points)
+    every = rectangle_distance(footprint, poses, points).min(axis=0)
+    assert {*map(tuple, points[every <= 0.2])} <= {*map(tuple, near)}
