@@ -84,6 +84,7 @@ class Daemon:
         self._drivers = build_drivers(config, self._cabling, clock, self.bus)
         self._body = Body.of(config.geometry)
         self.gate = self._build_gate()
+        self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.recorder = self._build_recorder()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -205,8 +206,8 @@ class Daemon:
             config.gate.rate,
             self.clock,
             GateInputs(
-                requests=(bus.subscribe(topics.REQ_DRIVE, fifo(16)), bus.subscribe(topics.PLAN_DRIVE, fifo(16))),
-                orders=bus.subscribe(topics.REQ_CONTROL, fifo(16)),
+                requests=bus.subscribe(topics.REQ_DRIVE, fifo(16)),
+                wishes=bus.subscribe(topics.PLAN_DRIVE, fifo(16)),
                 scan=bus.subscribe(topics.SCAN, latest()),
                 attitude=bus.subscribe(topics.COMPASS, latest()),
                 drive=bus.subscribe(topics.DRIVE, latest()),

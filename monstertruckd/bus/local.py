@@ -1,7 +1,7 @@
 """In-process hand-over: one write end per topic, any number of read ends, messages passed by reference.
 
-Everything happens on the event loop. A message reaches its readers in the order in which they subscribed; then
-the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all of them.
+Everything happens on the event loop. A message reaches listeners at once, then its readers in the order in which they
+subscribed; then the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all of them.
 """
 
 import math
@@ -67,6 +67,7 @@ class Bus:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._claimed: set[str] = set()
+        self._listeners: defaultdict[str, list[Callable[[Any], object]]] = defaultdict(list)
         self._readers: defaultdict[str, list[Mailbox[Any]]] = defaultdict(list)
         self._taps: defaultdict[str, list[Tap]] = defaultdict(list)
         self._retained: dict[str, tuple[Topic[Any], Any]] = {}
@@ -107,6 +108,10 @@ class Bus:
         if (newest := self.newest(topic)) is not None:
             mailbox.put(newest)
         return mailbox
+
+    def listen(self, topic: Topic[M], listener: Callable[[M], object]) -> None:
+        """Call ``listener``, which must not block, with every message of ``topic``: no queue, so none is ever lost."""
+        self._listeners[topic.name].append(listener)
 
     def newest(self, topic: Topic[M]) -> M | None:
         """Newest message of a retained topic; None before the first, and for every other topic."""
@@ -153,10 +158,12 @@ class Bus:
         self._drops += count
 
     def hand_over(self, topic: Topic[M], message: M) -> None:
-        """Deliver to readers, then to taps; called by the topic's own write end."""
+        """Deliver to listeners, readers and taps; called by the topic's own write end."""
         name = topic.name
         if topic.retained:
             self._retained[name] = (topic, message)
+        for listener in self._listeners[name]:
+            listener(message)
         for mailbox in tuple(self._readers[name]):
             mailbox.put(message)
         taps = tuple(self._taps[name])

@@ -71,10 +71,10 @@ class Rpc:
             return True, json.dumps(await self.call(name, _parse(payload)), allow_nan=False).encode()
         except TruckError as error:
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
-            return False, _failure(reason, str(error))
+            return False, failure(reason, str(error))
         except Exception:
             log.exception("rpc %s: bug", name)
-            return False, _failure(Reason.INTERNAL, Reason.INTERNAL.text)
+            return False, failure(Reason.INTERNAL, Reason.INTERNAL.text)
 
 
 def topic_rows(robot: str) -> list[dict[str, Any]]:
@@ -103,7 +103,7 @@ def _parse(payload: bytes) -> dict[str, Any]:
         return {}
     try:
         value = json.loads(payload)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         msg = f"payload is not JSON: {error}"
         raise InputError(msg) from None
     if not isinstance(value, dict):
@@ -112,5 +112,6 @@ def _parse(payload: bytes) -> dict[str, Any]:
     return value
 
 
-def _failure(reason: Reason, text: str) -> bytes:
+def failure(reason: Reason, text: str) -> bytes:
+    """Error reply as JSON."""
     return json.dumps({"reason": reason.value, "text": text}).encode()

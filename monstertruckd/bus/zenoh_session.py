@@ -7,7 +7,8 @@ Opening and closing block, so a thread does them.
 import asyncio
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
 
@@ -15,25 +16,25 @@ import zenoh
 from zenoh import ext
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import BusyError, ConfigError, InputError
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic, Writer, alive_key, rpc_key
+from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.rpc import Rpc, topic_rows
+from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 
 log = logging.getLogger(__name__)
 
-MAX_REQUEST = 262_144
-"""Bytes of the largest request; decoding more would stall the control tick."""
 MAX_CALLS = 16
 """Remote calls served at once."""
-_DEPTH = 64
+MAX_WAITING_CALLS = 64
+MAX_CALL = 16_384
+"""Bytes of the largest payload of a call."""
 _SCHEMA_PREFIX = "schema/"
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
 _SCHEMA_MEDIA = {
@@ -61,10 +62,8 @@ class ZenohBridge:
         self._config = config
         self._clock = clock
         self._rpc = rpc
-        self._event = bus.event_sink()
         self._session: zenoh.Session | None = None
         self._held: dict[str, bytes] = {}
-        self._refusals: dict[str, tuple[int, int]] = {}
         rpc.register("topics", self._topics)
 
     async def open(self) -> None:
@@ -94,19 +93,32 @@ class ZenohBridge:
             await self.open()
             assert self._session is not None
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            hop = ThreadHop(partial(_guarded, failed), _DEPTH, self._bus.add_drops)
+            guard = partial(_guarded, failed)
             publishers = await in_thread(partial(self._declare_publishers, self._session))
             tap = self._bus.tap(
                 partial(self._send, publishers), (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE)
             )
             try:
                 async with asyncio.TaskGroup() as calls:
-                    try:
-                        with await in_thread(partial(self._declare_inputs, self._session, hop, calls)):
+                    with ExitStack() as inputs:
+                        intakes = [
+                            inputs.enter_context(closing(Intake(topic, self._bus, self._clock, guard, self.name)))
+                            for topic in TOPICS
+                            if topic.writer is Writer.OUTSIDE
+                        ]
+                        active: set[asyncio.Task[None]] = set()
+                        queries: ThreadHop[zenoh.Query] = inputs.enter_context(
+                            closing(
+                                ThreadHop(
+                                    lambda query: guard(partial(self._serve, query, calls, active)),
+                                    MAX_WAITING_CALLS,
+                                    self._bus.add_drops,
+                                )
+                            )
+                        )
+                        with await in_thread(partial(self._declare_inputs, self._session, intakes, queries)):
                             ready()
                             await failed
-                    finally:
-                        hop.close()
             finally:
                 tap.close()
         finally:
@@ -146,22 +158,18 @@ class ZenohBridge:
         }
 
     def _declare_inputs(
-        self, session: zenoh.Session, hop: ThreadHop[Callable[[], None]], calls: asyncio.TaskGroup
+        self, session: zenoh.Session, intakes: Sequence[Intake], queries: ThreadHop[zenoh.Query]
     ) -> zenoh.LivelinessToken:
         """Subscribers and queryables; last the token that says so, which lives as long as its object."""
         remote = zenoh.Locality.REMOTE
-        active: set[asyncio.Task[None]] = set()
+        for intake in intakes:
+            key = intake.topic.key(self._robot)
+            session.declare_subscriber(key, partial(_on_request, intake), allowed_origin=remote)
         for topic in TOPICS:
             key = topic.key(self._robot)
-            if topic.writer is Writer.OUTSIDE:
-                session.declare_subscriber(key, partial(self._on_request, hop, topic), allowed_origin=remote)
-            elif topic.retained:
+            if topic.retained:
                 session.declare_queryable(key, partial(self._on_get, topic, key), allowed_origin=remote)
-        session.declare_queryable(
-            rpc_key(self._robot, "**"),
-            lambda query: hop.put(partial(self._serve, query, calls, active)),
-            allowed_origin=remote,
-        )
+        session.declare_queryable(rpc_key(self._robot, "**"), partial(_on_call, queries), allowed_origin=remote)
         return session.liveliness().declare_token(alive_key(self._robot))
 
     def _send(
@@ -170,34 +178,6 @@ class ZenohBridge:
         if topic.retained:
             self._held[topic.name] = data
         publishers[topic.name](data)
-
-    # Requests: from Zenoh's threads onto the loop
-
-    def _on_request(self, hop: ThreadHop[Callable[[], None]], topic: Topic[Any], sample: zenoh.Sample) -> None:
-        size = len(sample.payload)
-        data = sample.payload.to_bytes() if size <= MAX_REQUEST else None
-        hop.put(partial(self._take, topic, data, size))
-
-    def _take(self, topic: Topic[Any], data: bytes | None, size: int) -> None:
-        if data is None:
-            self._refuse(topic, f"{topic.name}: request of {size} bytes, at most {MAX_REQUEST} are taken")
-            return
-        try:
-            message = wire.decode(topic, data)
-        except InputError as error:
-            self._refuse(topic, str(error))
-        else:
-            self._bus.inject(topic, message)
-
-    def _refuse(self, topic: Topic[Any], text: str) -> None:
-        """Report bad input, at most once a second per topic: a flood of garbage must not become one of events."""
-        now = self._clock.now()
-        reported, count = self._refusals.get(topic.name, (-SECOND, 0))
-        count += 1
-        if now - reported >= SECOND:
-            self._event(Reason.BAD_INPUT, Severity.WARNING, self.name, text, count=count)
-            reported, count = now, 0
-        self._refusals[topic.name] = reported, count
 
     # Queries
 
@@ -208,8 +188,7 @@ class ZenohBridge:
 
     def _serve(self, query: zenoh.Query, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
         if len(active) >= MAX_CALLS:
-            with query:
-                query.reply_err(b'{"reason": "busy", "text": "too many calls at once"}', encoding="application/json")
+            _refuse(query, Reason.BUSY, "too many calls at once")
             return
         task = calls.create_task(self._answer(query))
         active.add(task)
@@ -241,6 +220,24 @@ class ZenohBridge:
 
     async def _topics(self, _payload: dict[str, Any]) -> dict[str, Any]:
         return {"topics": topic_rows(self._robot)}
+
+
+def _on_request(intake: Intake, sample: zenoh.Sample) -> None:
+    payload = sample.payload
+    intake.take(len(payload), payload.to_bytes)
+
+
+def _on_call(queries: ThreadHop[zenoh.Query], query: zenoh.Query) -> None:
+    size = 0 if query.payload is None else len(query.payload)
+    if size > MAX_CALL:
+        _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
+    else:
+        queries.put(query)
+
+
+def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:
+    with query:
+        query.reply_err(failure(reason, text), encoding="application/json")
 
 
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Callable[[bytes], None]:

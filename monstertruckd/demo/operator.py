@@ -63,6 +63,7 @@ class LocalOperator:
             role=self._role,
             lease=lease,
             nonce=self._gate.latest.nonce,
+            gate_stamp=self._gate.latest.stamp,
             order=order,
         )
         self._bus.inject(topics.REQ_CONTROL, request)

@@ -98,6 +98,10 @@ class GateConfig(Schema):
     """Measured speed below which the truck is at rest, m/s."""
 
     leases: Leases = Leases()
+    max_request_age: Positive = 0.5
+    """A request that may set the truck in motion counts only if its sender knew a gate state not older than this, s."""
+    remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Sources outside the robot that may drive as trackers."""
     disarm_after: Positive = 1.5
     """Seconds without a driver whose wishes can be carried out, after which the truck disarms."""
 

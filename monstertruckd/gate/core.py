@@ -30,7 +30,7 @@ from monstertruckd.gate.events import EventLog
 from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.output import GateOutput
-from monstertruckd.gate.sources import DRIVERS, OPERATORS, Source, Sources
+from monstertruckd.gate.sources import OPERATORS, Key, Source, Sources
 from monstertruckd.gate.watch import Judgement, Watch
 
 URGENT: Final = frozenset(
@@ -80,7 +80,7 @@ class Gate:
         self._config = config
         self._drivetrain = drivetrain
         self._linkage = linkage
-        self._sources = Sources(nonce, config.leases)
+        self._sources = Sources(nonce, config)
         self._watch = Watch(config, drivetrain)
         self._obstacles = ObstacleGuard(config, steering, footprint, lidar)
         self._motion = Motion(config, steering)
@@ -144,22 +144,26 @@ class Gate:
     # Requests
 
     def request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request; returns OK, or the reason why it does not move the truck now."""
-        reason = self._sources.authenticate(request)
-        if reason is Reason.OK and request.role not in DRIVERS:
-            reason = Reason.BAD_ROLE
+        """Take a drive request from outside; returns OK, or the reason why it does not move the truck now."""
+        return self._consider(request, now, self._sources.admit_request(request, now), inside=False)
+
+    def wish(self, request: DriveRequest, now: int) -> Reason:
+        """Take a drive request of the robot's own planners; returns what ``request`` does."""
+        return self._consider(request, now, self._sources.admit_wish(request), inside=True)
+
+    def _consider(self, request: DriveRequest, now: int, admission: Reason, *, inside: bool) -> Reason:
+        if admission is not Reason.OK:
+            return self._refuse(now, admission, request)
         wrong = {n: v for n in ("speed", "front", "rear") if not math.isfinite(v := getattr(request, n))}
-        if reason is Reason.OK and wrong:
+        if wrong:
             text = ", ".join(f"{name} is {value}" for name, value in wrong.items()) + ": expected finite numbers"
             return self._refuse(now, Reason.NOT_FINITE, request, text)
-        if reason is not Reason.OK:
-            return self._refuse(now, reason, request)
-        source = self._sources.add(request, now)
+        source = self._sources.add(request, now, inside=inside)
         if self._mode is GateMode.ESTOPPED:
             return self._refuse(now, Reason.ESTOPPED, request)
         if self._mode is GateMode.DISARMED:
             return self._refuse(now, Reason.DISARMED, request)
-        reason = self._sources.standing(source, now, self._holder_name())
+        reason = self._sources.standing(source, now, self._holder_key())
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._watch.judge(now), now)), Reason.OK)
@@ -174,7 +178,7 @@ class Gate:
             return self._estop(request, now)
         if request.order is Order.STOP:
             return self._give_up(request, now)
-        reason = self._sources.authenticate(request)
+        reason = self._sources.admit_order(request, now)
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         if request.order is Order.DISARM:
@@ -286,7 +290,7 @@ class Gate:
         if self._mode not in ACTIVE:
             return
         self._disarm_at_rest |= not DISARMING.isdisjoint(blocks)
-        driver = None if blocks else self._sources.driver(now, self._holder_name())
+        driver = None if blocks else self._sources.driver(now, self._holder_key())
         if self._mode is GateMode.DRIVING:
             if driver is None:
                 if not blocks:
@@ -306,7 +310,7 @@ class Gate:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
     def _take(self, now: int, driver: Source) -> None:
-        if self._holder_name() != driver.request.source:
+        if self._holder_key() != driver.key:
             role = driver.request.role
             self._sources.claim(role)
             values = {"role": role.value}
@@ -375,6 +379,9 @@ class Gate:
             if reason not in self._known:
                 text = f"{reason.text}: {', '.join(self._watch.failed)}" if reason is Reason.SERVICE_FAILED else ""
                 self._events.tell(now, reason, Severity.WARNING, text, values, always=always)
+
+    def _holder_key(self) -> Key | None:
+        return None if self._holder is None else self._holder.key
 
     def _holder_name(self) -> str | None:
         return None if self._holder is None else self._holder.request.source

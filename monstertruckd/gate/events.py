@@ -2,11 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+
+MAX_TOLD: Final = 64
+"""Different events that are told within one interval: sources may invent any number of names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,10 @@ class EventLog:
             always: a transition: never left out.
         """
         key = (reason, source)
+        if key not in self._told and len(self._told) >= MAX_TOLD:
+            self._told = {other: told for other, told in self._told.items() if now - told[0] < self._interval}
+            if len(self._told) >= MAX_TOLD and not always:
+                return
         last, repeated = self._told.get(key, (now - self._interval, 0))
         if not always and now - last < self._interval:
             self._told[key] = (last, repeated + 1)

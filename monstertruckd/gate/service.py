@@ -29,11 +29,12 @@ LATCH_RETRY: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """What the gate reads. Requests come as FIFOs, sensors by their newest message."""
+    """What the gate reads: requests as FIFOs, sensors by their newest message. Orders come by ``control``."""
 
-    requests: tuple[Subscription[DriveRequest], ...]
-    """``req/drive`` and ``plan/drive``."""
-    orders: Subscription[ControlRequest]
+    requests: Subscription[DriveRequest]
+    """``req/drive``."""
+    wishes: Subscription[DriveRequest]
+    """``plan/drive``."""
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
     drive: Subscription[DriveFeedback]
@@ -102,7 +103,7 @@ class GateService:
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Reason:
-        """Carry out an order at once, for callers that want the answer; see ``Gate.control``."""
+        """Carry out an order at once, before any queue could lose it; see ``Gate.control``."""
         return self._gate.control(order, self._clock.now())
 
     def shut_down(self) -> None:
@@ -113,9 +114,8 @@ class GateService:
         """Tick until cancelled; the last commands are neutral, whatever ends it."""
         try:
             async with asyncio.TaskGroup() as group:
-                for requests in self._inputs.requests:
-                    group.create_task(self._take_requests(requests), name="gate requests")
-                group.create_task(self._take_orders(), name="gate orders")
+                group.create_task(self._take_requests(), name="gate requests")
+                group.create_task(self._take_wishes(), name="gate wishes")
                 group.create_task(self._keep_latch(), name="gate latch")
                 await self._tick_for_ever(ready)
         finally:
@@ -133,13 +133,13 @@ class GateService:
             self._publish(self._gate.tick(now), now)
             ready()
 
-    async def _take_requests(self, requests: Subscription[DriveRequest]) -> None:
+    async def _take_requests(self) -> None:
         while True:
-            self._gate.request(await requests.next(), self._clock.now())
+            self._gate.request(await self._inputs.requests.next(), self._clock.now())
 
-    async def _take_orders(self) -> None:
+    async def _take_wishes(self) -> None:
         while True:
-            self._gate.control(await self._inputs.orders.next(), self._clock.now())
+            self._gate.wish(await self._inputs.wishes.next(), self._clock.now())
 
     def _publish(self, output: GateOutput, now: int) -> None:
         drive, steering = self._outputs.drive, self._outputs.steering

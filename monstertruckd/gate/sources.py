@@ -3,6 +3,9 @@
 Rules:
 
 - A request counts only with this run's nonce and a sequence number above the newest one of its source and kind.
+- What may set the truck in motion must show that its sender knew the gate's state of a moment ago: then it cannot have
+  waited long in some queue. That is the robot's own clock, so no other one has to be trusted.
+- Operators ask from outside, the tracker from inside; a tracker off board only if the configuration names it.
 - The source of the highest role with a live lease drives; among equals the one that drives already.
 - Control passes upwards at once, downwards only after a new ARM order: once a role has driven, or has ordered a
   stop, lower roles are refused until somebody arms the truck again. So a tracker never goes on by itself after an
@@ -10,13 +13,14 @@ Rules:
 - After a STOP order every source must show a neutral request, or fall silent, before it may drive again.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Request, Role
-from monstertruckd.gate.config import Leases
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Request, Role
+from monstertruckd.gate.config import GateConfig
 
 PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
 """Greater wins."""
@@ -27,7 +31,12 @@ OPERATORS: Final = frozenset({Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
 DRIVERS: Final = OPERATORS | {Role.TRACKER}
 
 MAX_SOURCES: Final = 64
-"""Names remembered per run; more are refused, so that junk can neither fill the memory nor forget a sequence."""
+"""Names remembered for each kind of request; the one heard least recently is forgotten for a new one."""
+
+SETTING_OFF: Final = frozenset({Order.ARM, Order.RESET})
+"""Orders after which the truck may move: they must be recent."""
+
+Key = tuple[bool, str]
 
 NEUTRAL: Final = 1e-3
 """Requested speeds below this one are a stick at rest, m/s."""
@@ -40,8 +49,15 @@ class Source:
     request: DriveRequest
     deadline: int
     """End of its lease, ns."""
+    inside: bool = False
+    """It is one of the robot's own planners."""
     held: bool = False
     """Must show a neutral request before it may drive."""
+
+    @property
+    def key(self) -> Key:
+        """What tells it from all others: nobody outside can speak for a planner by taking its name."""
+        return self.inside, self.request.source
 
     @property
     def neutral(self) -> bool:
@@ -54,57 +70,107 @@ class Source:
         return PRIORITY[self.request.role]
 
 
+class Sequences:
+    """Newest sequence number of each source of one kind of requests."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, int] = {}
+
+    def accept(self, request: Request, nonce: str, keep: Collection[str] = ()) -> Reason:
+        """OK, or why the request does not belong to this run; an accepted sequence number is used up.
+
+        Args:
+            request: what was asked.
+            nonce: what it must carry.
+            keep: sources that must not be forgotten; with all places taken by them a new one is refused.
+        """
+        source = request.source
+        if request.nonce != nonce:
+            return Reason.BAD_NONCE
+        if request.seq <= self._newest.get(source, -1):
+            return Reason.BAD_SEQUENCE
+        if source not in self._newest and len(self._newest) >= MAX_SOURCES:
+            oldest = next((name for name in self._newest if name not in keep), None)
+            if oldest is None:
+                return Reason.BUSY
+            del self._newest[oldest]
+        self._newest.pop(source, None)
+        self._newest[source] = request.seq
+        return Reason.OK
+
+
+def freshness(request: Request, now: int, limit: float) -> Reason:
+    """OK, or LEASE_EXPIRED for a request whose sender's newest gate state is older than ``limit`` s, or not told."""
+    known = request.gate_stamp
+    return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
+
+
 class Sources:
     """All requests of this run.
 
     Args:
         nonce: what requests must carry.
-        leases: longest lease of each role.
+        config: leases, ages and the trackers off board.
     """
 
-    def __init__(self, nonce: str, leases: Leases) -> None:
+    def __init__(self, nonce: str, config: GateConfig) -> None:
         self.nonce = nonce
-        self._leases = leases
-        self._sequences: dict[tuple[type[Request], str], int] = {}
-        self._drive: dict[str, Source] = {}
+        self._config = config
+        self._wishes = Sequences()
+        self._requests = Sequences()
+        self._orders = Sequences()
+        self._drive: dict[Key, Source] = {}
         self._floor = 0
 
-    def authenticate(self, request: Request) -> Reason:
-        """OK, or why the request does not belong to this run; an accepted sequence number is used up."""
-        if request.nonce != self.nonce:
-            return Reason.BAD_NONCE
-        key = (type(request), request.source)
-        if request.seq <= self._sequences.get(key, -1):
-            return Reason.BAD_SEQUENCE
-        if key not in self._sequences and len(self._sequences) >= MAX_SOURCES:
-            return Reason.BUSY
-        self._sequences[key] = request.seq
-        return Reason.OK
+    def admit_request(self, request: DriveRequest, now: int) -> Reason:
+        """OK, or why a drive request from outside does not count."""
+        if request.role not in OPERATORS and not (
+            request.role is Role.TRACKER and request.source in self._config.remote_trackers
+        ):
+            return Reason.BAD_ROLE
+        alive = {source.request.source for source in self.live(now) if not source.inside}
+        reason = self._requests.accept(request, self.nonce, alive)
+        return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
-    def add(self, request: DriveRequest, now: int) -> Source:
-        """Start or renew the lease of an authentic request of a driving role."""
-        lease = min(request.lease, self._leases.of(request.role))
-        before = self._drive.get(request.source)
-        source = Source(request, now + round(lease * SECOND))
+    def admit_wish(self, request: DriveRequest) -> Reason:
+        """OK, or why a drive request of the robot's own planners does not count."""
+        if request.role is not Role.TRACKER:
+            return Reason.BAD_ROLE
+        return self._wishes.accept(request, self.nonce)
+
+    def admit_order(self, request: ControlRequest, now: int) -> Reason:
+        """OK, or why an order does not count."""
+        reason = self._orders.accept(request, self.nonce)
+        if reason is Reason.OK and request.order in SETTING_OFF:
+            reason = freshness(request, now, self._config.max_request_age)
+        return reason
+
+    def add(self, request: DriveRequest, now: int, *, inside: bool) -> Source:
+        """Start or renew the lease of an admitted request."""
+        lease = min(request.lease, self._config.leases.of(request.role))
+        key = (inside, request.source)
+        before = self._drive.get(key)
+        source = Source(request, now + round(lease * SECOND), inside)
         source.held = before is not None and before.held and now <= before.deadline and not source.neutral
-        self._drive[request.source] = source
+        self._drive = {other: it for other, it in self._drive.items() if now <= it.deadline}
+        self._drive[key] = source
         return source
 
     def live(self, now: int) -> list[Source]:
         """Sources whose lease runs."""
         return [source for source in self._drive.values() if now <= source.deadline]
 
-    def driver(self, now: int, holder: str | None) -> Source | None:
+    def driver(self, now: int, holder: Key | None) -> Source | None:
         """The source that may drive now.
 
         Args:
             now: ns.
-            holder: name of the one driving already.
+            holder: key of the one driving already.
         """
         able = [source for source in self.live(now) if not source.held and source.rank >= self._floor]
-        return max(able, key=lambda source: (source.rank, source.request.source == holder), default=None)
+        return max(able, key=lambda source: (source.rank, source.key == holder), default=None)
 
-    def standing(self, source: Source, now: int, holder: str | None) -> Reason:
+    def standing(self, source: Source, now: int, holder: Key | None) -> Reason:
         """OK if this source drives or would drive, else why not."""
         if source.held:
             return Reason.NOT_ARMED_SPEED

@@ -48,7 +48,7 @@ class Station:
         """Send one request."""
         now = self._rig.clock.now()
         self._seq += 1
-        nonce = self._gate.latest.nonce if self._gate.latest is not None else ""
+        gate = self._gate.latest
         request = DriveRequest(
             stamp=now,
             received=now,
@@ -56,7 +56,8 @@ class Station:
             source="station",
             role=Role.STATION,
             lease=0.25,
-            nonce=nonce,
+            nonce=gate.nonce if gate is not None else "",
+            gate_stamp=gate.stamp if gate is not None else None,
             speed=speed,
             front=0.0,
         )

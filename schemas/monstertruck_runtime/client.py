@@ -247,6 +247,7 @@ class TruckClient:
             "role": self.role,
             "lease": lease,
             "nonce": state.nonce,
+            "gate_stamp": state.stamp,
         }
 
     # Zenoh

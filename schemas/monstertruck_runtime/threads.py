@@ -10,18 +10,27 @@ T = TypeVar("T")
 
 
 class ThreadHop(Generic[T]):
-    """Bounded queue from any thread to one loop; a burst costs the loop a single wake-up.
+    """Bounded queue from any thread to one loop, which takes one item per turn: a burst never holds up the others.
 
     Args:
         deliver: called on the loop for every item, in the order of ``put``.
-        depth: items that may wait; beyond that the oldest is lost.
+        depth: items that may wait; beyond that the oldest one of the lowest rank is lost.
         on_loss: told on the loop how many were lost since the last delivery.
+        rank: worth of an item; by default all are worth the same.
     """
 
-    def __init__(self, deliver: Callable[[T], None], depth: int, on_loss: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        deliver: Callable[[T], None],
+        depth: int,
+        on_loss: Callable[[int], None],
+        rank: Callable[[T], int] = lambda _: 0,
+    ) -> None:
         self._deliver = deliver
+        self._depth = depth
         self._on_loss = on_loss
-        self._items: deque[T] = deque(maxlen=depth)
+        self._rank = rank
+        self._items: deque[T] = deque()
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._scheduled = False
@@ -33,12 +42,14 @@ class ThreadHop(Generic[T]):
         with self._lock:
             if self._closed:
                 return
-            if len(self._items) == self._items.maxlen:
-                self._lost += 1
             self._items.append(item)
+            if len(self._items) > self._depth:
+                ranks = [self._rank(waiting) for waiting in self._items]
+                del self._items[ranks.index(min(ranks))]
+                self._lost += 1
             if not self._scheduled:
                 self._scheduled = True
-                self._loop.call_soon_threadsafe(self._drain)
+                self._loop.call_soon_threadsafe(self._take)
 
     def close(self) -> None:
         """Discard what waits and everything to come; to be called while the loop lives."""
@@ -46,15 +57,16 @@ class ThreadHop(Generic[T]):
             self._closed = True
             self._items.clear()
 
-    def _drain(self) -> None:
+    def _take(self) -> None:
         with self._lock:
-            self._scheduled = False
-            batch = list(self._items)
-            self._items.clear()
             lost, self._lost = self._lost, 0
+            item = self._items.popleft() if self._items else None
+            self._scheduled = bool(self._items)
+            if self._scheduled:
+                self._loop.call_soon(self._take)
         if lost:
             self._on_loss(lost)
-        for item in batch:
+        if item is not None:
             self._deliver(item)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationInfo, WithJsonSchema
 
 
 class Schema(BaseModel):
@@ -40,8 +40,18 @@ def _equal(a: object, b: object) -> bool:
 
 
 def _frozen_array(dtype: type[np.generic]) -> BeforeValidator:
-    def freeze(value: Any) -> NDArray[Any]:
-        array = np.asarray(value, dtype=dtype)
+    def freeze(value: Any, info: ValidationInfo) -> NDArray[Any]:
+        # What came in from outside is looked at first: numpy takes its time over strings and nested lists.
+        if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
+            msg = "expected a list of numbers"
+            raise ValueError(msg)
+        try:
+            array = np.asarray(value, dtype=dtype)
+        except (TypeError, OverflowError) as error:
+            raise ValueError(str(error)) from error
+        if array.ndim != 1:
+            msg = f"expected one dimension, got {array.ndim}"
+            raise ValueError(msg)
         if array.flags.writeable:
             array = array.copy() if isinstance(value, np.ndarray) else array
             array.flags.writeable = False

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Message, Pose2D
+from monstertruck_schemas.base import Message, Nanoseconds, Pose2D
 from monstertruck_schemas.plan import Path
 
 
@@ -34,6 +34,9 @@ class Request(Message):
     """Seconds this request stands; the gate caps it by its own limit for the role."""
     nonce: Annotated[str, Field(max_length=64)]
     """The robot's nonce from ``state/gate``."""
+    gate_stamp: Nanoseconds | None = None
+    """Stamp of the newest ``state/gate`` its sender had, on the robot's clock: what may set the truck in motion must
+    carry a recent one, so that a request that was long on its way moves nothing."""
 
 
 class DriveRequest(Request):

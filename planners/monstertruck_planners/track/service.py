@@ -115,7 +115,7 @@ class TrackerService:
         if gate.mode in ACTIVE:
             self._progress = command.progress
             if command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST:
-                self._ask(command, gate.nonce, now)
+                self._ask(command, gate, now)
         self._tell(command, self._line, now)
 
     def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
@@ -152,7 +152,7 @@ class TrackerService:
         near = points_near(self._points, poses, self._footprint.circumscribed_radius + self._config.slow_clearance)
         return float(clearance_to_points(self._footprint, poses, near).min())
 
-    def _ask(self, command: Command, nonce: str, now: int) -> None:
+    def _ask(self, command: Command, gate: GateState, now: int) -> None:
         self._drive.put(
             DriveRequest(
                 stamp=now,
@@ -161,7 +161,8 @@ class TrackerService:
                 source=self.name,
                 role=Role.TRACKER,
                 lease=self._config.lease,
-                nonce=nonce,
+                nonce=gate.nonce,
+                gate_stamp=gate.stamp,
                 speed=command.speed,
                 front=command.front,
                 rear=command.rear,

@@ -28,7 +28,7 @@ from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, TOPICS, Writ
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
-from monstertruckd.bus.zenoh_session import MAX_REQUEST, ZenohBridge
+from monstertruckd.bus.zenoh_session import MAX_CALL, ZenohBridge
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
 
@@ -167,7 +167,7 @@ async def test_requests_come_in_typed_and_stamped_by_the_robot():
     [
         (b"\xff\x00garbage", "req/drive"),
         (b"{}", "req/drive: stamp"),
-        (b"x" * (MAX_REQUEST + 1), f"request of {MAX_REQUEST + 1} bytes"),
+        (b"x" * 2049, "request of 2049 bytes, at most 2048"),
         (wire.encode(REQ_DRIVE, drive_request(0)).replace(b'"station"', b'"king"'), "req/drive: role"),
     ],
     ids=["garbage", "empty", "huge", "role"],
@@ -238,6 +238,23 @@ async def test_a_slow_call_does_not_hold_up_others_and_too_many_are_refused():
             assert await asyncio.to_thread(lambda: [bool(next(iter(w)).ok) for w in waiting]) == [True] * 16
             accepted = await asyncio.to_thread(ask, "topics")
     assert (refused, accepted) == ("busy", "ok")
+
+
+async def test_calls_with_huge_payloads_are_refused_before_anybody_parses_them():
+    async with running_robot() as robot:
+        with raw_session(robot.endpoint) as station:
+
+            def ask(payload: bytes) -> tuple[str, str]:
+                (reply,) = list(station.get("mt/truck/rpc/topics", payload=payload, timeout=2.0))
+                answer = json.loads((reply.ok or reply.err).payload.to_bytes())
+                return answer.get("reason", "ok"), answer.get("text", "")
+
+            huge = await asyncio.to_thread(ask, b'{"x": "' + b"x" * 10_000_000 + b'"}')
+            largest = await asyncio.to_thread(ask, b'{"x": "' + b"x" * (MAX_CALL - 9) + b'"}')
+            nested = await asyncio.to_thread(ask, b"[" * MAX_CALL)
+    assert huge == ("bad_input", f"payload of 10000009 bytes, at most {MAX_CALL} are taken")
+    assert largest[0] == "ok"
+    assert nested[0] == "bad_input"
 
 
 async def test_an_endpoint_in_use_is_refused_by_name():

@@ -115,14 +115,13 @@ class Rig:
         self._seq += 1
         return self._seq
 
-    def drive(self, speed=0.2, front=0.0, rear=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, **more):
-        fields = {**header(self.now, self.seq()), "nonce": NONCE, **more}
-        return self.gate.request(
-            DriveRequest(source=source, role=role, lease=lease, speed=speed, front=front, rear=rear, **fields), self.now
-        )
+    def drive(self, speed=0.2, front=0.0, rear=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, inside=False, **more):
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
+        request = DriveRequest(source=source, role=role, lease=lease, speed=speed, front=front, rear=rear, **fields)
+        return (self.gate.wish if inside else self.gate.request)(request, self.now)
 
     def order(self, order, source="ann", role=Role.GAMEPAD, **more):
-        fields = {**header(self.now, self.seq()), "nonce": NONCE, **more}
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
         return self.gate.control(ControlRequest(source=source, role=role, lease=1.0, order=order, **fields), self.now)
 
     def sense(self):

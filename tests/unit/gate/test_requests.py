@@ -2,13 +2,15 @@ import math
 
 import pytest
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.sources import MAX_SOURCES
 from tests.unit.gate.rig import Rig
 
-TRACK = {"source": "track", "role": Role.TRACKER}
+TRACKER = {"source": "track", "role": Role.TRACKER}
+TRACK = {**TRACKER, "inside": True}
 PAD = {"source": "pad", "role": Role.GAMEPAD}
 
 
@@ -55,12 +57,101 @@ def test_the_estop_role_cannot_drive():
     assert Rig().armed().drive(role=Role.ESTOP) is Reason.BAD_ROLE
 
 
-def test_junk_names_run_out():
+@pytest.mark.parametrize("kind", ["drive", "order"])
+def test_junk_names_lock_nobody_out(kind):
     rig = Rig().armed()
-    for i in range(MAX_SOURCES + 1):
-        last = rig.drive(source=f"junk{i}", role=Role.TRACKER)
+    for i in range(3 * MAX_SOURCES):
+        if kind == "drive":
+            rig.drive(source=f"junk{i}", role=Role.STATION, lease=0.01)
+            rig.tick()
+        else:
+            rig.order(Order.DISARM, source=f"junk{i}")
+    rig.tick(10)
+    rig.driver = None
+    rig.order(Order.ARM)
+    assert rig.drive(source="new") is Reason.OK
+    for order in (Order.DISARM, Order.ESTOP, Order.RESET, Order.ARM):
+        rig.tick(30)
+        assert rig.order(order, source="newer") is Reason.OK
+
+
+def test_the_source_heard_least_recently_is_forgotten_first():
+    rig = Rig().armed()
+    rig.order(Order.DISARM, source="early", seq=7)
+    rig.order(Order.DISARM, source="busy", seq=7)
+    for i in range(MAX_SOURCES - 2):
+        rig.order(Order.DISARM, source=f"junk{i}")
+    rig.order(Order.DISARM, source="busy", seq=8)
+    rig.order(Order.DISARM, source="one-more")
+    assert rig.order(Order.DISARM, source="busy", seq=8) is Reason.BAD_SEQUENCE
+    assert rig.order(Order.DISARM, source="early", seq=7) is Reason.OK
+
+
+def test_a_source_whose_lease_runs_is_not_forgotten():
+    rig = Rig().driving(source="ann")
+    seq = 10**6
+    rig.drive(source="ann", seq=seq)
+    for i in range(2 * MAX_SOURCES):
+        last = rig.drive(source=f"junk{i}", lease=0.25)
     assert last is Reason.BUSY
-    assert rig.drive(source="junk0", role=Role.TRACKER) is not Reason.BUSY
+    assert rig.drive(source="ann", seq=seq) is Reason.BAD_SEQUENCE
+    rig.tick()
+    assert rig.out.holder == "ann"
+
+
+def test_nobody_outside_drives_as_the_tracker():
+    rig = Rig().armed()
+    assert rig.drive(**TRACKER) is Reason.BAD_ROLE
+    assert rig.drive(**PAD, inside=True) is Reason.BAD_ROLE
+    rig.tick(2)
+    assert rig.out.mode is GateMode.ARMED
+    remote = Rig(remote_trackers=("track",)).armed()
+    assert remote.drive(**TRACKER) is Reason.OK
+    assert remote.drive(source="other", role=Role.TRACKER) is Reason.BAD_ROLE
+
+
+def test_a_planners_name_used_outside_changes_nothing_for_it():
+    rig = Rig().driving(**TRACK)
+    assert rig.drive(speed=0.0, source="track", role=Role.STATION, seq=10**9) is Reason.OK
+    assert rig.drive(**TRACK) is Reason.LOWER_PRIORITY  # authentic still, though a station took over
+    rig.tick()
+    assert rig.out.role is Role.STATION
+
+
+def test_a_request_that_was_long_on_its_way_moves_nothing():
+    rig = Rig().driving()
+    old = {"gate_stamp": rig.now - 6 * SECOND // 10}
+    assert rig.drive(**old) is Reason.LEASE_EXPIRED
+    assert rig.drive(gate_stamp=None) is Reason.LEASE_EXPIRED
+    assert rig.drive(gate_stamp=rig.now + SECOND) is Reason.LEASE_EXPIRED
+    rig.driver = old
+    rig.tick(20)
+    assert rig.out.mode is GateMode.STOPPING
+    rig.tick(100)
+    assert rig.out.mode is GateMode.DISARMED
+    rig.driver = None
+    old = {"gate_stamp": rig.now - 6 * SECOND // 10}
+    assert rig.order(Order.ARM, **old) is Reason.LEASE_EXPIRED
+    assert rig.order(Order.ESTOP, gate_stamp=None) is Reason.OK
+    assert rig.order(Order.RESET, **old) is Reason.LEASE_EXPIRED
+    assert rig.order(Order.RESET, gate_stamp=rig.now - 4 * SECOND // 10) is Reason.OK
+    assert rig.order(Order.DISARM, gate_stamp=None) is Reason.OK
+
+
+def test_planners_need_no_gate_stamp():
+    assert Rig().armed().drive(**TRACK, gate_stamp=None) is Reason.OK
+
+
+def test_a_flood_of_names_does_not_become_one_of_events():
+    rig = Rig().armed()
+    for i in range(1000):
+        rig.drive(source=f"junk{i}", role=Role.TRACKER)
+    rig.tick()
+    assert 1 <= len(rig.told(Reason.BAD_ROLE)) <= 64
+    rig.tick(60)
+    rig.drive(source="later", role=Role.TRACKER)
+    rig.tick()
+    assert rig.told(Reason.BAD_ROLE)[-1].values["by"] == "later"
 
 
 def test_the_gate_caps_leases_but_keeps_shorter_ones():
@@ -165,7 +256,7 @@ def test_an_operators_stop_keeps_the_tracker_out_until_armed_again():
 
 def test_a_trackers_own_stop_does_not_lock_it_out():
     rig = Rig().driving(**TRACK)
-    rig.order(Order.STOP, **TRACK)
+    rig.order(Order.STOP, **TRACKER)
     rig.tick(20)
     rig.drive(speed=0.0, **TRACK)
     rig.tick()

@@ -54,15 +54,13 @@ class Bench:
         self.clock = clock
         self.latch = latch or MemoryLatch()
         self.requests, self.wishes = Inbox(), Inbox()
-        self.orders, self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (
-            Inbox() for _ in range(7)
-        )
+        self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
         self.out = GateOutputs(Outbox(), Outbox(), Outbox())
         self.events = []
         self.readies = 0
         inputs = GateInputs(
-            (self.requests, self.wishes),
-            self.orders,
+            self.requests,
+            self.wishes,
             self.scan,
             self.attitude,
             self.drive,
@@ -92,13 +90,14 @@ class Bench:
 
     def order(self, order):
         now = self.clock.now()
-        self.orders.send(
+        return self.service.control(
             ControlRequest(
                 **header(now, len(self.events) + now),
                 source="ann",
                 role=Role.STATION,
                 lease=1,
                 nonce=NONCE,
+                gate_stamp=now,
                 order=order,
             )
         )
@@ -106,7 +105,16 @@ class Bench:
     def wish(self, inbox, role):
         now = self.clock.now()
         inbox.send(
-            DriveRequest(**header(now, now), source=role.value, role=role, lease=1, nonce=NONCE, speed=0.1, front=0.1)
+            DriveRequest(
+                **header(now, now),
+                source=role.value,
+                role=role,
+                lease=1,
+                nonce=NONCE,
+                gate_stamp=now,
+                speed=0.1,
+                front=0.1,
+            )
         )
 
     @asynccontextmanager
@@ -210,7 +218,9 @@ def test_the_deadman_line_falls_when_the_drive_is_silent_and_rises_with_its_voic
 def test_a_direct_order_is_answered():
     async def scenario(bench):
         now = bench.clock.now()
-        order = ControlRequest(**header(now), source="rpc", role=Role.TRACKER, lease=1.0, nonce=NONCE, order=Order.ARM)
+        order = ControlRequest(
+            **header(now), source="rpc", role=Role.TRACKER, lease=1.0, nonce=NONCE, gate_stamp=now, order=Order.ARM
+        )
         assert bench.service.control(order) is Reason.BAD_ROLE
 
     on_bench(scenario)

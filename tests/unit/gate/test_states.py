@@ -229,7 +229,7 @@ def test_arming_is_refused_while_moving_pushed_or_blocked():
 
 def test_a_waiting_tracker_does_not_hinder_arming():
     rig = Rig()
-    rig.driver = {"speed": 0.2, "source": "track", "role": Role.TRACKER}
+    rig.driver = {"speed": 0.2, "source": "track", "role": Role.TRACKER, "inside": True}
     rig.tick(5)
     assert rig.drive(**rig.driver) is Reason.DISARMED
     assert rig.order(Order.ARM, role=Role.STATION) is Reason.OK

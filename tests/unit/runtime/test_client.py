@@ -119,7 +119,7 @@ async def test_a_robot_that_never_answers_times_out():
 async def test_requests_carry_the_nonce_and_a_growing_sequence():
     async with running_robot() as robot:
         gate = robot.bus.publisher(GATE, Writer.GATE)
-        gate.put(gate_state(0, nonce="first"))
+        gate.put(gate_state(17, nonce="first"))
         boxes = [robot.bus.subscribe(topic, fifo(9)) for topic in (REQ_DRIVE, REQ_CONTROL, REQ_GOAL, REQ_PATH)]
         seqs = []
         for _run in range(2):
@@ -138,6 +138,7 @@ async def test_requests_carry_the_nonce_and_a_growing_sequence():
                 seqs += [drive.seq, order.seq, goal.seq, path.seq]
         assert (drive.speed, drive.front, drive.rear, drive.lease) == (0.5, 0.1, -0.1, 0.2)
         assert (drive.source, drive.role, drive.nonce) == ("ann@laptop", Role.KEYBOARD, "first")
+        assert {request.gate_stamp for request in (drive, order, goal, path)} == {17}
         assert order.order is Order.ARM
         assert (goal.frame, goal.goal.y) == ("map", 2.0)
         assert (path.frame, path.path.poses.tolist()) == ("odom", [0.0, 0.0, 0.0])

@@ -143,11 +143,22 @@ async def test_a_full_hop_loses_the_oldest_and_says_how_many():
     hop: ThreadHop[int] = ThreadHop(got.append, 3, lost.append)
     for i in range(5):
         hop.put(i)
-    await asyncio.sleep(0)
-    assert got == [2, 3, 4]
+    for taken in ([2], [2, 3], [2, 3, 4], [2, 3, 4]):  # one in each turn of the loop
+        await asyncio.sleep(0)
+        assert got == taken
     assert lost == [2]
     hop.put(5)
     hop.close()
     hop.put(6)
     await asyncio.sleep(0)
     assert got == [2, 3, 4]
+
+
+async def test_a_full_hop_loses_the_least_valuable_first():
+    got: list[int] = []
+    hop: ThreadHop[int] = ThreadHop(got.append, 3, lambda _: None, rank=lambda item: item // 10)
+    for i in (20, 1, 10, 2, 11, 3, 21, 4):
+        hop.put(i)
+    for _ in range(4):
+        await asyncio.sleep(0)
+    assert got == [20, 11, 21]

@@ -6,6 +6,7 @@ from pydantic import ValidationError
 
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.sensor import LaserScan
@@ -134,3 +135,20 @@ def test_sources_are_plain_names(source: str):
 def test_leases_are_bounded(lease: float):
     with pytest.raises(ValidationError):
         DriveRequest(**HEADER, source="a", role=Role.STATION, lease=lease, nonce="n", speed=0.0, front=0.0)
+
+
+@pytest.mark.parametrize(
+    "poses",
+    ["null", '"1"', '["1"]', "[{}]", "{}", "[[1, 2], [3]]", "[null]", "[1" + 400 * "0" + "]", "[true]", "1.5"],
+)
+def test_whatever_else_stands_for_an_array_is_a_validation_error(poses: str):
+    text = '{"stamp": 1, "received": 1, "seq": 1, "frame": "odom", "directions": [], "poses": ' + poses + "}"
+    with pytest.raises(ValidationError, match="poses"):
+        Path.model_validate_json(text)
+
+
+def test_arrays_have_one_dimension():
+    with pytest.raises(ValidationError, match="one dimension"):
+        Path(**HEADER, poses=np.zeros((2, 3)), directions=[])
+    with pytest.raises(ValidationError, match="poses"):
+        Path(**HEADER, poses=[{}], directions=[])

@@ -1,0 +1,228 @@
+"""Requests from threads of others: nothing they send may cost the loop its time or an emergency stop."""
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.base import Message, Pose2D
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
+from monstertruckd.bus.intake import DEPTH, LIMITS, Intake
+from monstertruckd.bus.local import Bus
+from tests.unit.gate.rig import make_gate
+
+HEADER: dict[str, Any] = {
+    "stamp": 1,
+    "received": 1,
+    "source": "a",
+    "role": Role.STATION,
+    "lease": 0.5,
+    "nonce": "run-1",
+    "gate_stamp": 1,
+}
+
+
+def order(what: Order, seq: int = 1, **more: Any) -> bytes:
+    return wire.encode(REQ_CONTROL, ControlRequest(**{**HEADER, "seq": seq, "order": what, **more}))
+
+
+def drive(seq: int) -> bytes:
+    return wire.encode(REQ_DRIVE, DriveRequest(**HEADER, seq=seq, speed=0.1, front=0.0))
+
+
+def path(poses: int, seq: int = 1) -> bytes:
+    rng = np.random.default_rng(1)
+    route = Path(
+        stamp=1,
+        received=1,
+        seq=1,
+        frame="odom",
+        poses=rng.uniform(-9999, 9999, 3 * poses),
+        directions=rng.choice([-1.0, 1.0], poses),
+        name="route",
+    )
+    return wire.encode(REQ_PATH, PathRequest(**HEADER, seq=seq, path=route))
+
+
+class Entrance:
+    """A bus with the intakes of all topics, used from a thread while the loop is busy elsewhere."""
+
+    def __init__(self) -> None:
+        clock = WallClock()
+        self.bus = Bus(clock)
+        self.events = self.bus.subscribe(EVENT, fifo(100))
+        self.intakes = {
+            topic.name: Intake(topic, self.bus, clock, _call, "zenoh")
+            for topic in (REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH)
+        }
+
+    def send(self, *requests: tuple[Topic[Any], bytes]) -> None:
+        """All of them arrive before the loop gets a turn."""
+
+        def run() -> None:
+            for topic, data in requests:
+                self.intakes[topic.name].take(len(data), lambda data=data: data)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        thread.join()
+
+    async def settle(self) -> None:
+        for _ in range(3 * DEPTH):
+            await asyncio.sleep(0)
+
+
+def _call(job: Callable[[], None]) -> None:
+    job()
+
+
+@pytest.mark.parametrize("urgent", [Order.ESTOP, Order.STOP])
+@pytest.mark.parametrize("place", ["first", "last", "middle"])
+async def test_an_emergency_stop_reaches_the_gate_through_any_flood(urgent: Order, place: str):
+    entrance = Entrance()
+    gate = make_gate()
+    taken: list[Order] = []
+
+    def take(request: ControlRequest) -> None:
+        taken.append(request.order)
+        gate.control(request, 1)
+
+    entrance.bus.listen(REQ_CONTROL, take)
+    bogus = [(REQ_CONTROL, order(Order.ARM, seq, nonce="bogus")) for seq in range(4 * DEPTH)]
+    position = {"first": 0, "last": len(bogus), "middle": len(bogus) // 2}[place]
+    bogus.insert(position, (REQ_CONTROL, order(urgent)))
+    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(4 * DEPTH)], *bogus, (REQ_PATH, path(2000)))
+    await entrance.settle()
+    assert urgent in taken
+    assert len(taken) == DEPTH
+    if urgent is Order.ESTOP:
+        assert gate.mode is GateMode.ESTOPPED
+
+
+async def test_a_flood_of_stops_does_not_push_out_an_emergency_stop():
+    entrance = Entrance()
+    taken: list[Order] = []
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
+    entrance.send((REQ_CONTROL, order(Order.ESTOP)), *[(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH))
+    await entrance.settle()
+    assert taken[0] is Order.ESTOP
+    entrance.send(*[(REQ_CONTROL, order(Order.ESTOP))] * (2 * DEPTH))
+    await entrance.settle()
+    assert taken[-1] is Order.ESTOP
+
+
+async def test_a_batch_is_taken_one_request_a_turn():
+    entrance = Entrance()
+    box = entrance.bus.subscribe(REQ_DRIVE, fifo(3))  # a reader that keeps up misses nothing
+    seen: list[int] = []
+
+    async def read() -> None:
+        while len(seen) < DEPTH:
+            seen.append((await box.next()).seq)
+
+    reading = asyncio.create_task(read())
+    await asyncio.sleep(0)
+    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(DEPTH)])
+    await asyncio.sleep(0)
+    assert len(seen) <= 1
+    await entrance.settle()
+    await reading
+    assert seen == list(range(DEPTH))
+
+
+async def test_a_path_of_two_thousand_poses_fits():
+    entrance = Entrance()
+    box = entrance.bus.subscribe(REQ_PATH, fifo(1))
+    entrance.send((REQ_PATH, path(2000)))
+    await entrance.settle()
+    assert len((await box.next()).path.directions) == 2000
+
+
+SHAPES = {
+    "lists": "[" + ",".join(["[]"] * 40_000) + "]",
+    "ragged": "[" + ",".join(["[1]"] * 30_000) + ",[1,2]]",
+    "objects": "[" + ",".join(["{}"] * 40_000) + "]",
+    "strings": "[" + ",".join(['"1"'] * 30_000) + "]",
+    "numbers": "[" + ",".join(["1"] * 60_000) + "]",
+    "keys": "{" + ",".join(f'"{i}":1' for i in range(12_000)) + "}",
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+async def test_wrong_shapes_are_refused_without_decoding_them(shape: str, monkeypatch: pytest.MonkeyPatch):
+    text = json.loads(path(2))
+    text["path"]["poses"] = "@"
+    data = json.dumps(text).replace('"@"', SHAPES[shape]).encode()
+    assert len(data) < LIMITS[REQ_PATH.name].size
+    entrance = Entrance()
+    monkeypatch.setattr(wire, "decode", lambda *_: pytest.fail("decoded"))
+    entrance.send((REQ_PATH, data))
+    await entrance.settle()
+    event = await entrance.events.next()
+    assert (event.reason, event.text) == (Reason.BAD_INPUT, "req/path: request of too many parts")
+
+
+async def test_what_cannot_be_an_array_is_refused_like_any_bad_input():
+    entrance = Entrance()
+    text = json.loads(path(2))
+    text["path"]["poses"] = [{}]
+    entrance.send((REQ_PATH, json.dumps(text).encode()))
+    await entrance.settle()
+    event = await entrance.events.next()
+    assert event.reason is Reason.BAD_INPUT
+    assert "expected a list of numbers" in event.text
+
+
+async def test_what_is_too_large_is_not_even_read():
+    entrance = Entrance()
+    for topic, size in ((REQ_DRIVE, 2049), (REQ_CONTROL, 2049), (REQ_GOAL, 2049), (REQ_PATH, 131_073)):
+        entrance.intakes[topic.name].take(size, lambda: pytest.fail("read"))
+        await entrance.settle()
+        event = await entrance.events.next()
+        assert event.reason is Reason.BAD_INPUT
+        assert f"{topic.name}: request of {size} bytes" in event.text
+
+
+def goal(seq: int) -> bytes:
+    return wire.encode(REQ_GOAL, GoalRequest(**HEADER, seq=seq, goal=Pose2D(x=0.0, y=0.0, yaw=0.0)))
+
+
+@pytest.mark.parametrize(("topic", "make", "burst"), [(REQ_GOAL, goal, 5), (REQ_PATH, lambda seq: path(2, seq), 5)])
+async def test_more_than_a_few_a_second_are_dropped_and_told_once(
+    topic: Topic[Message], make: Callable[[int], bytes], burst: int
+):
+    entrance = Entrance()
+    got: list[Message] = []
+    entrance.bus.listen(topic, got.append)
+    entrance.send(*[(topic, make(seq)) for seq in range(50)])
+    await entrance.settle()
+    assert burst <= len(got) <= burst + 1
+    event = await entrance.events.next()
+    assert event.reason is Reason.MESSAGES_DROPPED
+    assert event.text == f"{topic.name}: more than 5 requests a second"
+    await asyncio.sleep(0.25)
+    entrance.send((topic, make(50)))
+    await entrance.settle()
+    assert len(got) > burst
+
+
+async def test_after_closing_nothing_comes_in():
+    entrance = Entrance()
+    got: list[Message] = []
+    entrance.bus.listen(REQ_CONTROL, got.append)
+    entrance.send((REQ_CONTROL, order(Order.ARM)))
+    entrance.intakes[REQ_CONTROL.name].close()
+    entrance.send((REQ_CONTROL, order(Order.ARM)))
+    await entrance.settle()
+    assert got == []
