@@ -1,0 +1,94 @@
+"""What the camera costs the control tick, on the wall clock: the whole truck over ptys, with and without its camera.
+
+Daemon and simulator run as processes, as on the desk; runs with and without 640x480 at 15 Hz alternate, so that what
+else the machine does weighs on both. A tick is as late as the stamp of its command is behind the 50 Hz grid; the figure
+is the difference of the medians of the runs' 99th percentiles. The last line is JSON.
+
+    python benchmarks/camera.py [ROUNDS] [SECONDS]
+"""
+
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruckd.demo.wall import connect, free_endpoint, program, write_overlay
+
+FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
+GOAL = 0.5
+PERIOD = 20_000_000
+WARM_UP = 6.0
+
+
+async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) -> tuple[NDArray[np.float64], int]:
+    """Every tick's lateness, ms, and the number of pictures that came."""
+    endpoint = free_endpoint()
+    config = write_overlay(FULL, folder, endpoint)
+    if not camera:
+        data = yaml.safe_load(config.read_text())
+        data["devices"]["camera"] = None
+        config.write_text(yaml.safe_dump(data))
+    async with (
+        program(folder / "simulate.txt", "simulate", "--config", str(config)),
+        program(folder / "daemon.txt", "run", "--config", str(config)),
+        await connect(clock, endpoint) as client,
+    ):
+        await clock.sleep(WARM_UP)
+        ticks, pictures = client.subscribe(topics.CMD_DRIVE, fifo(1 << 16)), client.subscribe(topics.CAMERA, fifo(4096))
+        await clock.sleep(seconds)
+        return behind_grid(np.array([tick.stamp for tick in ticks.drain()])), len(pictures.drain())
+
+
+def behind_grid(stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Milliseconds behind a grid of ``PERIOD`` that no stamp is ahead of; none is late by half a period usually."""
+    phase = (stamps - stamps[0]) % PERIOD
+    phase = (phase - int(np.median(phase)) + PERIOD // 2) % PERIOD
+    return (phase - phase.min()) / 1e6
+
+
+async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
+    late: dict[bool, list[NDArray[np.float64]]] = {True: [], False: []}
+    pictures = 0
+    with TemporaryDirectory() as folder:
+        for number in range(rounds):
+            for camera in (False, True):
+                where = Path(folder) / f"{number}-{camera}"
+                rows, count = await lateness(clock, where, camera=camera, seconds=seconds)
+                late[camera].append(rows)
+                pictures += count
+    rate = pictures / (rounds * seconds)
+    p99 = {}
+    for camera, name in ((False, "without camera"), (True, "with camera")):
+        each = [float(np.percentile(rows, 99)) for rows in late[camera]]
+        p99[camera] = float(np.median(each))
+        ticks = np.concatenate(late[camera])
+        runs = ", ".join(f"{value:.2f}" for value in each)
+        print(f"{name:15} {len(ticks)} ticks, median {np.median(ticks):.2f} ms, p99 of the runs: {runs} ms")
+    added = p99[True] - p99[False]
+    print(f"added to the p99 (median of runs) {added:+.2f} ms (goal {GOAL:.1f} ms) at {rate:.1f} pictures a second")
+    return {
+        "without_p99_ms": p99[False],
+        "with_p99_ms": p99[True],
+        "added_ms": added,
+        "goal_ms": GOAL,
+        "pictures_per_s": rate,
+        "rounds": rounds,
+        "ok": added <= GOAL and rate > 14,
+    }
+
+
+def main() -> None:
+    rounds, seconds = int(sys.argv[1]) if len(sys.argv) > 1 else 4, float(sys.argv[2]) if len(sys.argv) > 2 else 20.0
+    print(json.dumps(run_wall(lambda clock: compare(clock, rounds, seconds))))
+
+
+if __name__ == "__main__":
+    main()

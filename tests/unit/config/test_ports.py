@@ -1,0 +1,75 @@
+"""Where devices hang: by path, or by hub and port, and one line for every mistake in it."""
+
+from pathlib import Path
+
+import pytest
+
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_runtime.errors import ConfigError
+from monstertruckd.config.truck import PortConfig, TruckConfig
+from monstertruckd.config.validate import load_config
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def truck(folder: Path, text: str) -> TruckConfig:
+    file = folder / "truck.yaml"
+    file.write_text("version: 1\n" + text)
+    return load_config(file, TruckConfig)[0]
+
+
+def lidar(port: str) -> str:
+    return f"devices:\n  lidar:\n    port: {port}\n    driver: {{kind: hokuyo_urg}}\n"
+
+
+def test_both_ways_to_name_a_port(tmp_path: Path):
+    by_path = truck(tmp_path, lidar("{path: /dev/truck/lidar}")).devices.lidar
+    by_hub = truck(tmp_path, lidar('{hub: "1-1", port: 3, baud: 19200}')).devices.lidar
+    assert by_path is not None
+    assert by_path.port == PortConfig(path=Path("/dev/truck/lidar"))
+    assert by_hub is not None
+    assert by_hub.port == UsbPortConfig(hub="1-1", port=3, baud=19200)
+
+
+@pytest.mark.parametrize(
+    ("port", "expected"),
+    [
+        ("{baud: 9600}", "devices.lidar.port.path: missing"),
+        ('{hub: "1-1"}', "devices.lidar.port.port: missing"),
+        ('{hub: "first", port: 1}', "devices.lidar.port.hub: "),
+        ('{hub: "1-1", port: 77}', "devices.lidar.port.port: input should be less than or equal to 31, found 77"),
+        ('{hub: "1-1", port: 1, path: /dev/x}', "devices.lidar.port.path: unknown key"),
+        ("{path: /dev/x, speed: 5}", "devices.lidar.port.speed: unknown key"),
+        ("{path: /dev/x, baud: 1}", "devices.lidar.port.baud: input should be greater than or equal to 4800"),
+        ("7", "devices.lidar.port: "),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_its_key(port: str, expected: str, tmp_path: Path):
+    with pytest.raises(ConfigError) as caught:
+        truck(tmp_path, lidar(port))
+    said = str(caught.value)
+    assert expected in said
+    assert len(said.splitlines()) == 1
+    assert f"{tmp_path / 'truck.yaml'}:4" in said
+
+
+def test_no_two_devices_share_a_port(tmp_path: Path):
+    two = lidar('{hub: "1-1", port: 3}') + '  compass: {port: {hub: "1-1", port: 3}, driver: {kind: os4000}}\n'
+    with pytest.raises(ConfigError, match="lidar and compass share the port hub 1-1 port 3"):
+        truck(tmp_path, two)
+
+
+def test_the_battery_is_measured_once(tmp_path: Path):
+    steering = "devices:\n  steering: {{port: {{path: /dev/s}}, driver: {{kind: maestro{0}}}}}\n"
+    text = steering + "monitors:\n  battery: {{kind: iio}}\n"
+    with pytest.raises(ConfigError, match="both measure the battery"):
+        truck(tmp_path, text.format(""))
+    assert truck(tmp_path, text.format(", battery: null")).monitors.battery is not None
+
+
+def test_the_shipped_truck_has_everything_on_two_hubs():
+    config = load_config(ROOT / "configs" / "truck.yaml", TruckConfig)[0]
+    ports = {role: device.port for role, device in config.devices.present().items()}
+    assert set(ports) == {"lidar", "drive", "steering", "compass", "stabiliser", "camera"}
+    assert {port.hub for port in ports.values() if isinstance(port, UsbPortConfig)} == {"1-1", "1-2"}
+    assert ports["stabiliser"].baud == 1_000_000
