@@ -87,6 +87,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             bus.subscribe(topics.GATE, latest()),
             bus.publisher(topics.PATH, Writer.PLANNER),
             bus.event_sink(),
+            config.gate.max_request_age,
         )
         lidar = config.devices.lidar
         yield TrackerService(

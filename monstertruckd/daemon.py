@@ -20,8 +20,10 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
 from monstertruck_schemas import topics
+from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd import __version__
 from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
@@ -85,6 +87,7 @@ class Daemon:
         self._body = Body.of(config.geometry)
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
+        self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.recorder = self._build_recorder()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -182,6 +185,10 @@ class Daemon:
         rpc.register("config", config)
         rpc.register("versions", versions)
         return rpc
+
+    def _refuse_goal(self, request: GoalRequest) -> None:
+        text = f"goal of {request.source} refused: this robot follows paths, it has no planner that finds one"
+        self._events(Reason.NOT_SUPPORTED, Severity.WARNING, "daemon", text)
 
     # Building
 

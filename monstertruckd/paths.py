@@ -2,19 +2,25 @@
 
 import csv
 from pathlib import Path as FilePath
+from typing import Final
 
 import numpy as np
 
+from monstertruck_planners.track.line import check_path
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
-from monstertruck_schemas.state import GateState
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.gate.sources import OPERATORS, Sequences, freshness
 
 HEADER = ["x", "y", "yaw", "direction"]
+
+MOVING: Final = frozenset({GateMode.DRIVING, GateMode.STOPPING})
+"""Modes in which the path stays as it is."""
 
 
 def load_path(file: FilePath, *, closed: bool) -> Path:
@@ -33,7 +39,7 @@ def load_path(file: FilePath, *, closed: bool) -> Path:
     values = np.array([_numbers(file, line, row) for line, row in enumerate(rows[1:], start=2)])
     if len(values) < 2:
         raise InputError(f"{file}: expected at least two poses, found {len(values)}")
-    return Path(
+    path = Path(
         stamp=0,
         received=0,
         seq=0,
@@ -43,6 +49,11 @@ def load_path(file: FilePath, *, closed: bool) -> Path:
         closed=closed,
         name=file.stem,
     )
+    try:
+        check_path(path)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    return path
 
 
 def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
@@ -56,7 +67,17 @@ def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
 
 
 class PathService:
-    """Publishes the configured path, and replaces it by any that an operator sends."""
+    """Publishes the configured path, and replaces it by any that an operator sends while the truck stands.
+
+    Args:
+        drawn: the configured path.
+        clock: time.
+        requests: ``req/path``.
+        gate: state of the gate.
+        out: ``plan/path``.
+        events: where events go.
+        max_age: seconds; see ``GateConfig.max_request_age``.
+    """
 
     name = "path"
 
@@ -68,6 +89,7 @@ class PathService:
         gate: Subscription[GateState],
         out: Publisher[Path],
         events: EventSink,
+        max_age: float,
     ) -> None:
         self._drawn = drawn
         self._clock = clock
@@ -75,6 +97,8 @@ class PathService:
         self._gate = gate
         self._out = out
         self._events = events
+        self._max_age = max_age
+        self._sequences = Sequences()
 
     async def run(self, ready: Ready) -> None:
         """Publish, then serve requests until cancelled."""
@@ -83,23 +107,33 @@ class PathService:
         ready()
         while True:
             request = await self._requests.next()
-            refusal = self._refusal(request)
-            if refusal is None:
-                self._publish(request.path)
+            try:
+                self._examine(request)
+            except RequestRefusedError as error:
+                self._events(error.refusal, Severity.WARNING, request.source, f"path refused: {error}")
+            except InputError as error:
+                self._events(Reason.BAD_INPUT, Severity.WARNING, request.source, f"path refused: {error}")
             else:
-                self._events(refusal, Severity.WARNING, request.source, f"path refused: {refusal.text}")
+                self._publish(request.path)
 
-    def _refusal(self, request: PathRequest) -> Reason | None:
+    def _examine(self, request: PathRequest) -> None:
+        """Authority as for driving, and only while the truck stands: a path must not turn under it.
+
+        Raises:
+            RequestRefusedError: the sender may not, or not now.
+            InputError: the path cannot be tracked.
+        """
         gate = self._gate.latest
-        if gate is None or request.nonce != gate.nonce:
-            return Reason.BAD_NONCE
-        path = request.path
-        count = len(path.poses) // 3
-        if len(path.poses) != 3 * count or count < 2 or len(path.directions) not in (0, count):
-            return Reason.BAD_INPUT
-        if not (np.isfinite(path.poses).all() and np.isfinite(path.directions).all()):
-            return Reason.NOT_FINITE
-        return None
+        reason = Reason.BAD_NONCE if gate is None else self._sequences.accept(request, gate.nonce)
+        if reason is Reason.OK:
+            reason = freshness(request, self._clock.now(), self._max_age)
+        if reason is Reason.OK and request.role not in OPERATORS:
+            reason = Reason.BAD_ROLE
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+        if gate is not None and gate.mode in MOVING:
+            raise RequestRefusedError(Reason.BUSY, f"the truck is {gate.mode}, stop it first")
+        check_path(request.path)
 
     def _publish(self, path: Path) -> None:
         now = self._clock.now()

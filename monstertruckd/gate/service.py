@@ -98,6 +98,11 @@ class GateService:
             _Feed(inputs.health, gate.observe_health),
         ]
 
+    @property
+    def mode(self) -> GateMode:
+        """State now."""
+        return self._gate.mode
+
     def lateness(self) -> Lateness:
         """Punctuality of the tick; its count advances with every tick, for the watchdog."""
         return self._meter.lateness()

@@ -34,6 +34,7 @@ class Reason(StrEnum):
     DISK_FULL = "disk_full", 8, "no space left to record"
     LOG_DAMAGED = "log_damaged", 9, "log is truncated or damaged"
     RECORDING_FAILED = "recording_failed", 10, "log cannot be written"
+    NOT_SUPPORTED = "not_supported", 11, "the robot cannot do that"
 
     # Devices
     DEVICE_LOST = "device_lost", 20, "device unplugged or its port vanished"

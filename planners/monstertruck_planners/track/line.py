@@ -6,7 +6,7 @@ Progress along it only grows and is looked for near the present one, so a path m
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,15 @@ SAME_HEADING: Final = 0.3
 
 LEAST_STEP: Final = 1e-6
 """Shorter steps between two poses are left out, m."""
+
+MAX_POSES: Final = 5000
+MAX_COORDINATE: Final = 10_000.0
+"""Metres from the frame's origin."""
+MAX_STEP: Final = 100.0
+"""Metres between two poses."""
+MAX_RUNS: Final = 64
+"""Runs of one driving direction; each costs some 20 us to prepare."""
+MAX_NAME: Final = 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +119,7 @@ class Line:
         beyond: metres the way goes on behind each end, at least the look-ahead.
 
     Raises:
-        InputError: fewer than two different poses, or directions that do not fit.
+        InputError: see ``check_path``.
     """
 
     def __init__(self, path: Path, start: tuple[float, float, float], beyond: float) -> None:
@@ -142,25 +151,45 @@ class Line:
         return Progress(i, along - self.runs[i].before)
 
 
+def check_path(path: Path) -> None:
+    """Refuse what cannot be tracked: paths come from files and from outside.
+
+    Raises:
+        InputError: shape, size or numbers out of bounds, and what was expected.
+    """
+    if len(path.poses) % 3 or not 2 <= len(path.poses) // 3 <= MAX_POSES:
+        _refuse(path, f"{len(path.poses)} numbers: expected 2 to {MAX_POSES} rows of x, y, yaw")
+    poses = path.poses.reshape(-1, 3)
+    count = len(poses)
+    if len(path.directions) not in (0, count) or not (np.abs(path.directions) == 1.0).all():
+        _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
+    if np.count_nonzero(np.diff(path.directions)) >= MAX_RUNS:
+        _refuse(path, f"direction changes too often: expected at most {MAX_RUNS} runs forward and backward")
+    if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
+        _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m from the origin")
+    step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
+    length = np.hypot(step[:, 0], step[:, 1])
+    if not LEAST_STEP < length.max() <= MAX_STEP:
+        _refuse(path, f"steps of up to {length.max():g} m: expected different poses, at most {MAX_STEP:g} m apart")
+    if len(path.name) > MAX_NAME:
+        _refuse(path, f"name: expected at most {MAX_NAME} characters")
+
+
+def _refuse(path: Path, text: str) -> NoReturn:
+    raise InputError(f"path {path.name[:MAX_NAME]!r}: {text}")
+
+
 def _steps(path: Path) -> tuple[Array, Array]:
     """Distinct points (n, 2) and the direction of each of the n - 1 steps; a closed path ends on its beginning."""
-    if len(path.poses) % 3 or len(path.poses) < 6:
-        msg = f"path {path.name!r} of {len(path.poses)} numbers: expected at least two rows of x, y, yaw"
-        raise InputError(msg)
+    check_path(path)
     points = path.poses.reshape(-1, 3)[:, :2]
     directions = path.directions if len(path.directions) else np.ones(len(points))
-    if len(directions) != len(points) or not (np.abs(directions) == 1.0).all() or not np.isfinite(points).all():
-        msg = f"path {path.name!r}: expected finite poses and a direction of +1 or -1 for each of the {len(points)}"
-        raise InputError(msg)
     arriving = directions[1:]
     if path.closed:
         points = np.concatenate((points, points[:1]))
         arriving = np.concatenate((arriving, directions[:1]))
     step = np.diff(points, axis=0)
     real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
-    if not real.any():
-        msg = f"path {path.name!r}: expected at least two different poses"
-        raise InputError(msg)
     return np.concatenate((points[:1], points[1:][real])), arriving[real]
 
 

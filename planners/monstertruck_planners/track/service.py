@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, clearance_to_points, points_near, scan_points
 from monstertruck_planners.track.line import Line, Progress
@@ -111,7 +112,13 @@ class TrackerService:
         if self._line is None:
             return
         state = TruckState((pose.pose.x, pose.pose.y, pose.pose.yaw), pose.twist.vx, self._clearance(pose, now))
-        command = self._law.control(state, self._line, self._progress)
+        try:
+            command = self._law.control(state, self._line, self._progress)
+        except KinematicsError as error:
+            self._line = None
+            text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, text)
+            return
         if gate.mode in ACTIVE:
             self._progress = command.progress
             if command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST:

@@ -83,8 +83,8 @@ def test_poses_ahead_look_where_the_truck_looks():
 @pytest.mark.parametrize(
     ("bad", "hint"),
     [
-        (path([[0.0, 0.0]]), "at least two rows"),
-        (path([[1.0, 1.0], [1.0, 1.0]]), "two different poses"),
+        (path([[0.0, 0.0]]), "expected 2 to 5000 rows"),
+        (path([[1.0, 1.0], [1.0, 1.0]]), "expected different poses"),
         (path([[0.0, 0.0], [1.0, 0.0]], [1, 1, 1]), "for each of the 2"),
         (path([[0.0, 0.0], [1.0, 0.0]], [1, 0.5]), r"\+1 or -1"),
         (path([[0.0, 0.0], [math.inf, 0.0]]), "finite"),

@@ -4,9 +4,10 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
+from monstertruck_planners.track.pure_pursuit import PurePursuit, PurePursuitConfig
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D
@@ -239,6 +240,49 @@ def test_impossible_paths_are_told_once_and_ignored():
     bench = on_bench(scenario, path(straight(1.0), frame="map"))
     assert [reason for reason, _ in bench.events] == [Reason.BAD_INPUT, Reason.BAD_INPUT]
     assert "frame 'map': expected 'odom'" in bench.events[0][1]
+
+
+def test_a_path_of_huge_poses_is_told_and_ignored():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(1.0)
+        assert bench.asked == []
+        bench.path_in.latest = path(straight(1.0))
+        await bench.clock.sleep(0.2)
+        assert bench.asked
+
+    bench = on_bench(scenario, path([[0.0, 0.0], [1e308, 1e308], [-1e308, 0.0]]))
+    assert [reason for reason, _ in bench.events] == [Reason.BAD_INPUT]
+
+
+def test_a_path_that_the_kinematics_refuse_is_told_once_and_ignored(monkeypatch):
+    def refuse(*_):
+        raise KinematicsError("no such motion")
+
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        with monkeypatch.context() as patch:
+            patch.setattr(PurePursuit, "control", refuse)
+            await bench.clock.sleep(1.0)
+        asked = len(bench.asked)
+        await bench.clock.sleep(1.0)
+        assert len(bench.asked) == asked
+        bench.path_in.latest = path(straight(1.0))
+        await bench.clock.sleep(0.2)
+        assert len(bench.asked) > asked
+
+    bench = on_bench(scenario, path(straight(2.0)))
+    assert [reason for reason, _ in bench.events] == [Reason.BAD_INPUT]
+    assert "path 'test' cannot be driven from" in bench.events[0][1]
+
+
+def test_the_gates_stamp_is_echoed():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await bench.clock.sleep(0.5)
+        assert bench.asked[-1].gate_stamp == bench.gate_in.latest.stamp
+
+    on_bench(scenario, path(straight(2.0)))
 
 
 def test_nothing_happens_without_gate_or_path():

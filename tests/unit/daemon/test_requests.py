@@ -1,0 +1,49 @@
+"""What the composed daemon does with requests at the instant they arrive."""
+
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, GoalRequest, Order, Role
+from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_GOAL
+from monstertruckd.config.load import load_truck
+from monstertruckd.daemon import Daemon
+
+DEMO = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
+HEADER = {"stamp": 1, "received": 1, "seq": 1, "source": "ann", "role": Role.STATION, "lease": 1.0, "nonce": "any"}
+
+
+def with_daemon(tmp_path: Path, check) -> None:
+    async def main(clock: VirtualClock) -> None:
+        config, _ = load_truck(DEMO)
+        quiet = config.model_copy(update={"state_directory": tmp_path, "recorder": None})
+        check(Daemon(quiet, clock, seed=1))
+
+    run_virtual(main)
+
+
+def test_an_emergency_stop_is_carried_out_before_the_bus_returns(tmp_path: Path):
+    def check(daemon: Daemon) -> None:
+        for order in (Order.ESTOP, *[Order.ARM] * 16):
+            daemon.bus.inject(REQ_CONTROL, ControlRequest(**HEADER, order=order))
+        assert daemon.gate.mode is GateMode.ESTOPPED
+
+    with_daemon(tmp_path, check)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_every_goal_is_answered(tmp_path: Path, count: int):
+    def check(daemon: Daemon) -> None:
+        events = daemon.bus.subscribe(EVENT, fifo(9))
+        for _ in range(count):
+            daemon.bus.inject(REQ_GOAL, GoalRequest(**HEADER, frame="map", goal=Pose2D(x=1.0, y=2.0, yaw=0.0)))
+        told = events.drain()
+        assert [event.reason for event in told] == [Reason.NOT_SUPPORTED] * count
+        assert "ann" in told[0].text
+
+    with_daemon(tmp_path, check)
