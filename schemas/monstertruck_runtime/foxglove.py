@@ -24,7 +24,6 @@ from monstertruck_runtime.protobuf import (
     FIXED_UINT32,
     INT32,
     INT64,
-    OPTIONAL_DOUBLE,
     STRING,
     UINT64,
     Field,
@@ -77,7 +76,7 @@ LASER_SCAN: Final = Layout(
     Field(1004, "range_min", DOUBLE),
     Field(1005, "range_max", DOUBLE),
     Field(1006, "codes", BYTES),
-    Field(1007, "tilt", OPTIONAL_DOUBLE),
+    Field(1007, "tilt", DOUBLES),  # none or one: stock writers leave out a plain 0
 )
 POSE_IN_FRAME: Final = Layout(
     "foxglove.PoseInFrame",
@@ -208,7 +207,7 @@ def _scan_values(scan: LaserScan) -> dict[str, Any]:
         "range_min": scan.range_min,
         "range_max": scan.range_max,
         "codes": scan.codes.tobytes(),
-        **({} if scan.tilt is None else {"tilt": scan.tilt}),
+        "tilt": np.array([] if scan.tilt is None else [scan.tilt]),
     }
 
 
@@ -223,7 +222,7 @@ def _scan_model(values: Mapping[str, Any]) -> LaserScan:
         range_max=values["range_max"],
         ranges=values["ranges"],
         codes=np.frombuffer(values["codes"], np.uint8),
-        tilt=values["tilt"],
+        tilt=float(values["tilt"][0]) if len(values["tilt"]) else None,
     )
 
 

@@ -7,7 +7,7 @@ Source: https://protobuf.dev/programming-guides/encoding/. Scalars are always wr
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -223,8 +223,6 @@ def _same(value: Any) -> Any:
 
 
 DOUBLE: Final = Kind(FIXED64, 1, _DOUBLE.pack, lambda raw: _DOUBLE.unpack(raw)[0], 0.0)
-OPTIONAL_DOUBLE: Final = replace(DOUBLE, default=None)
-"""None while it is not on the wire."""
 FIXED_UINT32: Final = Kind(FIXED32, 7, _UINT32.pack, lambda raw: _UINT32.unpack(raw)[0], 0)
 INT64: Final = Kind(VARINT, 3, varint, _signed, 0)
 INT32: Final = Kind(VARINT, 5, varint, _signed, 0)

@@ -331,6 +331,17 @@ def test_an_old_scan_asks_for_more_room():
     assert speeds[1] < speeds[0] < 0.2
 
 
+@pytest.mark.parametrize(("tilt", "counts"), [(None, True), (0.3, True), (0.36, False), (math.pi / 2, False)])
+def test_a_scan_from_a_tilted_plane_does_not_count(tilt, counts):
+    rig = Rig()
+    rig.driving()
+    rig.silent = {"scan"}
+    for _ in range(30):
+        rig.gate.observe_scan(scan(rig.now, tilt=tilt))
+        rig.tick()
+    assert (Reason.SCAN_STALE in rig.out.reasons) is not counts
+
+
 def test_a_resting_stick_is_not_checked():
     rig = Rig()
     rig.obstacles = wall(0.25)

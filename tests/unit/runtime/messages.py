@@ -47,6 +47,7 @@ scans = st.integers(0, 20).flatmap(
         range_max=positive,
         ranges=doubles(n),
         codes=hnp.arrays(np.uint8, n),
+        tilt=st.none() | st.floats(0, 2),
     )
 )
 images = st.builds(CompressedImage, **header, data=st.binary(max_size=300), sequence=st.integers(0, 2**32 - 1))

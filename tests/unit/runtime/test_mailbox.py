@@ -35,6 +35,18 @@ async def test_fifo_keeps_the_newest_in_order_and_counts():
     assert box.drops == 5
 
 
+async def test_draining_takes_what_is_unread_without_waiting():
+    box: Mailbox[Message] = Mailbox(fifo(3))
+    assert box.drain() == []
+    for seq in range(4):
+        box.put(message(seq))
+    assert [m.seq for m in box.drain()] == [1, 2, 3]
+    assert box.drain() == []
+    assert box.latest is not None
+    box.put(message(9))
+    assert (await box.next()).seq == 9
+
+
 def test_a_fifo_needs_room():
     with pytest.raises(ValueError, match="at least one"):
         fifo(0)

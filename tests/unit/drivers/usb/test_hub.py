@@ -47,6 +47,8 @@ def test_a_hub_with_four_devices_vanishes_and_returns(tmp_path: Path, deaf: bool
             assert bench.service.waiting == set(FIRST)
             assert bench.states()["1-1.1"] is UsbState.WAITING
             assert bench.node("1-1.1").tty is None
+            assert bench.hubs.waits_for("drive") == "waits for hub 1-1"
+            assert bench.hubs.waits_for("compass") is None
             returned = bench.clock.now() / SECOND
             await bench.usb.return_hub("1-1", bench.clock)
             await bench.clock.sleep(8)
@@ -349,6 +351,7 @@ def test_over_current_is_told_and_the_port_left_alone(tmp_path: Path):
             bench.usb.plug("1-1.1")
             await bench.clock.sleep(8)
             assert bench.states()["1-1.1"] is UsbState.HELD
+            assert bench.hubs.waits_for("lidar") == "held after over-current at hub 1-1 port 1"
             assert len(starts["lidar"]) == 1
             await bench.clock.sleep(3)
             assert len(starts["lidar"]) == 2
