@@ -48,7 +48,7 @@ class Recorder:
         on_failure: called on the event loop with the reason and one line of text.
         attachments: JSON-able values attached to every file as ``<name>.json`` (config, calibration, versions).
         metadata: text about the run, in every file.
-        digest: takes every recorded message.
+        digest: takes every recorded message, in the thread.
         deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
             by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
     """
@@ -81,6 +81,7 @@ class Recorder:
         self._sequences = {topic.name: 0 for topic in TOPICS}
         self._recording = False
         self._ended = False
+        self._refusal: OSError | None = None
         self._reason = Reason.OK
         self._path: Path | None = None
         self._messages = self._bytes = self._drops = 0
@@ -125,13 +126,15 @@ class Recorder:
             return
         self._messages += 1
         self._bytes += len(payload)
-        if self._digest is not None:
-            self._digest.update(topic.name, stamp, payload)
         if not self._batch and not self._deterministic:
             self._loop.call_later(_BATCH_SECONDS, self._hand_over)
         self._batch.append(Entry(topic, self._clock.now(), stamp, sequence, payload))
         if len(self._batch) >= _BATCH:
             self._hand_over()
+
+    def refuse(self, error: OSError) -> None:
+        """From now on the disk answers with ``error``: for drills."""
+        self._refusal = error
 
     def health(self, seq: int) -> RecorderHealth:
         """State of the recording; counts are of messages and payload bytes handed to the writer."""
@@ -200,6 +203,10 @@ class Recorder:
                 self._ended = True
                 return
             for entry in batch:
+                if self._refusal is not None:
+                    raise self._refusal
+                if self._digest is not None:
+                    self._digest.update(entry.topic.name, entry.stamp, entry.payload)
                 writer.write(entry)
                 self._written += 1
                 self._progress.set()

@@ -122,6 +122,15 @@ def sinc(x: Real) -> Real:
     return math.sin(x) / x if abs(x) > 1e-4 else 1.0 - x * x / 6.0
 
 
+def sinc_slope(x: Real) -> Real:
+    """Derivative of sinc, (cos x - sinc x)/x, by its series where that cancels."""
+    if isinstance(x, np.ndarray):
+        small = np.abs(x) < 1e-3
+        away = np.where(small, 1.0, x)
+        return np.where(small, -x / 3.0 * (1.0 - x**2 / 10.0), (np.cos(away) - np.sinc(away / np.pi)) / away)
+    return (math.cos(x) - math.sin(x) / x) / x if abs(x) >= 1e-3 else -x / 3.0 * (1.0 - x**2 / 10.0)
+
+
 def polynomial(coefficients: tuple[float, ...], x: Real) -> Real:
     """Value of the polynomial at x, highest power first (Horner)."""
     value = 0.0 * x + coefficients[0]

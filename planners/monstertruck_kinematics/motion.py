@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, Real, cos, sin, sinc
+from monstertruck_kinematics.elementary import Array, Real, cos, sin, sinc, sinc_slope
 
 
 def to_world(heading: Real, vx: Real, vy: Real) -> tuple[Real, Real]:
@@ -46,17 +46,14 @@ def integration_jacobians(
     pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: float
 ) -> tuple[Array, Array]:
     """Derivatives (3, 3, ...) of ``integrate`` by the pose and by the twist, to propagate covariances."""
-    heading = np.asarray(pose[2], dtype=np.float64)
-    ahead, aside, turn = np.asarray(vx, np.float64), np.asarray(vy, np.float64), np.asarray(wz, np.float64)
-    half = turn * (0.5 * dt)
-    c, s = np.cos(heading + half), np.sin(heading + half)
-    chord = np.sinc(half / np.pi) * dt
-    dx, dy = c * ahead - s * aside, s * ahead + c * aside
-    # d sinc/dh = (cos h - sinc h)/h, by its series where that cancels.
-    small = np.abs(half) < 1e-3
-    away = np.where(small, 1.0, half)
-    bend = np.where(small, -half / 3.0 * (1.0 - half**2 / 10.0), (np.cos(away) - np.sinc(away / np.pi)) / away)
-    zero, one = np.zeros_like(dx + heading), np.ones_like(dx + heading)
+    heading = pose[2]
+    half = wz * (0.5 * dt)
+    c, s = cos(heading + half), sin(heading + half)
+    chord = sinc(half) * dt
+    dx, dy = c * vx - s * vy, s * vx + c * vy
+    bend = sinc_slope(half)
+    zero = 0.0 * (dx + heading)
+    one = zero + 1.0
     by_pose = np.array([[one, zero, -chord * dy + zero], [zero, one, chord * dx + zero], [zero, zero, one]])
     by_turn_x = 0.5 * dt * (bend * dt * dx - chord * dy)
     by_turn_y = 0.5 * dt * (bend * dt * dy + chord * dx)
