@@ -69,7 +69,8 @@ def simulate(
 ) -> None:
     """Serve a simulated truck's devices behind ptys at the ports its configuration names.
 
-    Faults are read from standard input as with `emulate`, each line beginning with the device's role.
+    Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
+    name, or `usb` (an unknown word lists what it knows).
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.sim.host import serve

@@ -1,5 +1,6 @@
 """The emulated computer of a simulated truck: hubs, ports and nodes as its configuration names them."""
 
+import asyncio
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.tree import ancestors
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
 from monstertruckd.cabling import Computer
 from monstertruckd.config.truck import Devices
 
@@ -21,6 +23,7 @@ IDENTITIES = {
 }
 """USB identity, product and kind of node by kind of device."""
 HUB_PORTS = 7
+HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
 
 
 class UsbCable:
@@ -63,10 +66,13 @@ class EmulatedComputer:
         folder: gets proc, sys and dev; must exist.
         devices: of the truck.
         cables: what each device's emulator serves, by role.
+        clock: time.
     """
 
-    def __init__(self, folder: Path, devices: Devices, cables: Mapping[str, EmulatedPort]) -> None:
+    def __init__(self, folder: Path, devices: Devices, cables: Mapping[str, EmulatedPort], clock: Clock) -> None:
         self.folder = folder
+        self._clock = clock
+        self._returning: asyncio.Task[None] | None = None
         self.usb = EmulatedUsb(folder)
         self.ports: dict[str, EmulatedPort] = dict(cables)
         """By role: where cables are plugged and pulled."""
@@ -91,9 +97,30 @@ class EmulatedComputer:
             )
             self.ports[role] = UsbCable(self.usb, port.device, cables[role])
 
-    def computer(self, clock: Clock) -> Computer:
+    def computer(self) -> Computer:
         """What a daemon in this process takes for its computer."""
-        return Computer(self.usb.machine(clock), self.folder, lambda: self.usb.watcher)
+        return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher)
+
+    def command(self, words: list[str]) -> None:
+        """Obey one word on the USB tree, see ``HELP``; a hub that returns takes its time.
+
+        Raises:
+            InputError: it is not understood, or there is no such place.
+        """
+        try:
+            match words:
+                case ["lose", hub]:
+                    self.usb.lose_hub(hub)
+                case ["return", hub] if self.usb.knows(hub):
+                    self._returning = asyncio.get_running_loop().create_task(self.usb.return_hub(hub, self._clock))
+                case ["over-current", where]:
+                    self.usb.over_current(where)
+                case ["suspend", where]:
+                    self.usb.suspend_when_idle(where)
+                case _:
+                    raise InputError(HELP)
+        except KeyError as error:
+            raise InputError(f"no hub or device at {error}; {HELP}") from error
 
 
 def hangs_by_hub(devices: Devices) -> bool:

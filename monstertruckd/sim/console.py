@@ -5,7 +5,7 @@ import os
 import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TextIO
+from typing import Protocol, TextIO
 
 from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.link import EmulatedPort, LineFaults
@@ -13,8 +13,20 @@ from monstertruck_runtime.errors import InputError
 
 HELP = (
     "known: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
-    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, or a fault of the device"
+    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, line short_writes COUNT, or a fault of the device"
 )
+
+
+class Commanded(Protocol):
+    """Something that obeys words."""
+
+    def command(self, words: list[str]) -> None:
+        """Obey one command.
+
+        Raises:
+            InputError: it is not understood; the text lists what is.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +57,38 @@ class Emulated:
                 raise InputError(HELP)
 
 
+class FileEmulator(Protocol):
+    """A part of the computer that shows in files."""
+
+    async def run(self) -> None:
+        """Bring them up to date until cancelled."""
+        ...
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedFiles:
+    """A part of the emulated computer; its faults are all it understands."""
+
+    emulator: FileEmulator
+
+    def command(self, words: list[str]) -> None:
+        """Obey one command.
+
+        Raises:
+            InputError: it is not understood; the text lists what is.
+        """
+        fault, *values = words or [""]
+        self.emulator.inject(fault, *values)
+
+
 def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
     """Set one fault of the cable from text.
 
@@ -59,6 +103,8 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
                 setattr(faults, name, float(value))
             case "chunk":
                 faults.chunk = None if value == "off" else int(value)
+            case "short_writes":
+                faults.short_writes = int(value)
             case "garbage":
                 faults.garbage = bytes.fromhex(value)
             case _:
@@ -70,7 +116,7 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
 class FaultConsole:
     """Reads commands line by line; with several devices each line begins with the device's name."""
 
-    def __init__(self, devices: Mapping[str, Emulated], source: TextIO, say: Callable[[str], None]) -> None:
+    def __init__(self, devices: Mapping[str, Commanded], source: TextIO, say: Callable[[str], None]) -> None:
         self._devices = devices
         self._source = source
         self._say = say
@@ -101,7 +147,7 @@ class FaultConsole:
         else:
             self._say("ok")
 
-    def _find(self, words: list[str]) -> Emulated:
+    def _find(self, words: list[str]) -> Commanded:
         if words[0] in self._devices:
             return self._devices[words.pop(0)]
         if len(self._devices) == 1:

@@ -22,7 +22,7 @@ from monstertruckd.config.truck import Monitors, PortConfig
 from monstertruckd.config.validate import load_config
 from monstertruckd.sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.console import Emulated, FaultConsole
+from monstertruckd.sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
 from monstertruckd.sim.robot import SimulatedRobot
 
 TRUTH_PERIOD = SECOND // 20
@@ -56,7 +56,7 @@ class TruthLog:
 async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
     """Serve the devices of ``config_file`` behind ptys at their configured ports until SIGTERM or SIGINT.
 
-    Faults are read from standard input, each line beginning with the device's role.
+    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
 
     Raises:
         InputError: the configuration has hubs or monitors, but names no place for the emulated computer.
@@ -91,10 +91,12 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
         path.parent.mkdir(parents=True, exist_ok=True)
         cables[role] = PtyPort(path)
-    ports = EmulatedComputer(folder, config.devices, cables).ports
-    robot = SimulatedRobot(config.sim, config, clock, ports, folder)
+    computer = EmulatedComputer(folder, config.devices, cables, clock)
+    robot = SimulatedRobot(config.sim, config, clock, computer.ports, folder)
     log = TruthLog(robot.world, clock)
-    emulated = {role: Emulated(robot.emulators[role], ports[role]) for role in devices}
+    emulated: dict[str, Commanded] = {role: Emulated(robot.emulators[role], robot.ports[role]) for role in devices}
+    emulated |= {name: EmulatedFiles(files) for name, files in robot.monitored.items()}
+    emulated["usb"] = computer
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)

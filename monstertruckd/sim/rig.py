@@ -35,7 +35,7 @@ class VirtualRig:
         """Start of the world, ns."""
         self._folder = TemporaryDirectory(prefix="monstertruck-")
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
-        self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports)
+        self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
         self.robot = SimulatedRobot(
             config.sim, config, clock, self.computer.ports, self.computer.folder, offload=inline
         )
@@ -47,7 +47,7 @@ class VirtualRig:
             if not isinstance(config.devices.present()[role].port, UsbPortConfig)
         }
         self.daemon = Daemon(
-            config, clock, ports=by_path, computer=self.computer.computer(clock), tree=tree, seed=config.sim.seed
+            config, clock, ports=by_path, computer=self.computer.computer(), tree=tree, seed=config.sim.seed
         )
         self.bus = self.daemon.bus
         self._stop = asyncio.Event()

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,25 +27,10 @@ from monstertruck_runtime.threads import Offload, in_thread
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.devices import CONVERTERS
 from monstertruckd.sim.config import SimConfig
+from monstertruckd.sim.console import FileEmulator
 
 LINE_BAUD = {"drive": 38400, "stabiliser": BAUD}
 """Serial lines whose speed is felt; the others are USB from end to end, or have a byte now and then."""
-
-
-class FileEmulator(Protocol):
-    """A part of the computer that shows in files."""
-
-    async def run(self) -> None:
-        """Bring them up to date until cancelled."""
-        ...
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        ...
 
 
 class SimulatedRobot:

@@ -127,6 +127,10 @@ class EmulatedUsb:
         self._things[name] = _Thing(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
         self.plug(name)
 
+    def knows(self, name: str) -> bool:
+        """Whether such a hub or device exists, plugged in or not."""
+        return name in self._things
+
     def present(self, name: str) -> bool:
         """Whether it shows in the tree."""
         return (self.sysfs.root / DEVICES / name).exists()
@@ -171,7 +175,7 @@ class EmulatedUsb:
 
     def lose_hub(self, name: str) -> None:
         """The hub drops off the bus: its devices vanish, then itself, though every cable is in."""
-        self._vanish(name)
+        self._vanish(self._things[name].name)
 
     def lose_power(self, hub: str) -> None:
         """Everything behind a hub vanishes, the hub stays."""
@@ -204,6 +208,7 @@ class EmulatedUsb:
 
     def over_current(self, name: str) -> None:
         """The port ``name`` hangs on draws too much and says so."""
+        name = self._things[name].name
         attribute = f"{port_directory(name)}/over_current_count"
         seen = self.sysfs.number(attribute) or 0
         self._write(port_directory(name), {"over_current_count": str(seen + 1)})
