@@ -164,7 +164,9 @@ class TruckPlant:
         """
         assert self._start_ns is not None
         seconds = (times_ns - self._start_ns) * 1e-9
-        trail = [*self._trail, (self._elapsed * 1e-9, *self._pose, *self._attitude)]
+        oldest = float(seconds[0]) - 2e-9 * STEP_NS
+        trail = [row for row in self._trail if row[0] >= oldest]
+        trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude))
         if (ahead := float(seconds[-1]) - trail[-1][0]) > 0:
             for part in (0.5, 1.0):
                 pose = integrate(self._pose, *self._twist, ahead * part)
