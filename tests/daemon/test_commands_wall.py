@@ -34,7 +34,13 @@ async def command(*arguments: str, timeout: float = 60) -> subprocess.CompletedP
 
 @pytest.mark.parametrize(
     ("device", "expected"),
-    [("lidar", "URG-04LX"), ("drive", "software"), ("steering", "errors"), ("compass", "heading")],
+    [
+        ("lidar", "URG-04LX"),
+        ("drive", "software"),
+        ("steering", "errors"),
+        ("compass", "heading"),
+        ("stabiliser", "AX-12A"),
+    ],
 )
 async def test_every_emulator_answers_its_probe(device: str, expected: str, tmp_path: Path):
     link = tmp_path / device
@@ -70,6 +76,24 @@ def short_lap(folder: Path) -> Path:
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(folder / "short.csv"), "closed": False}}
     config.write_text(yaml.safe_dump(overlay))
     return config
+
+
+@pytest.mark.parametrize(
+    ("device", "expected"),
+    [("camera", "nodes"), ("battery", "converters"), ("link", "interfaces"), ("host", "cores")],
+)
+async def test_what_hangs_on_no_line_is_probed_without_one(device: str, expected: str):
+    probed = await command("probe", device)
+    assert probed.returncode == 0, probed.stderr
+    assert expected in json.loads(probed.stdout)
+
+
+async def test_a_probe_that_needs_a_port_and_an_emulator_that_needs_none_say_so(tmp_path: Path):
+    probed = await command("probe", "lidar")
+    assert (probed.returncode, probed.stderr) == (3, "lidar: say where it hangs with --port\n")
+    emulated = await command("emulate", "host", "--link", str(tmp_path / "host"))
+    assert emulated.returncode == 3
+    assert "no device on a port" in emulated.stderr
 
 
 async def test_the_demo_drives_prints_and_leaves_log_and_picture(tmp_path: Path):
