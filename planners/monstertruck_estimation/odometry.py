@@ -31,7 +31,7 @@ STILL: Final = 0.02
 """Way, m, after which the truck no longer counts as standing at its start."""
 
 MEMORY: Final = SECOND
-"""A compass reading counts as a source of the estimate for this long, ns."""
+"""A reading counts as a source of the estimate for this long, ns."""
 
 
 class CompassConfig(Schema):
@@ -114,7 +114,7 @@ class DeadReckoning:
         self._slip = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2
         self._drift = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
         self._drive: DriveFeedback | None = None
-        self._steered = False
+        self._steering_used: int | None = None
         self._angles = (0.0, 0.0)
         self._angles_then = (0.0, 0.0)
         self._speed = 0.0
@@ -126,13 +126,15 @@ class DeadReckoning:
         """Headings left out because they were too far off."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent."""
+        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        if not feedback.trusted:
+            return
         front, rear = self._linkage.front, self._linkage.rear
         self._angles = (
             front.axle_from_servo(min(max(feedback.front, -front.servo_limit), front.servo_limit)),
             rear.axle_from_servo(min(max(feedback.rear, -rear.servo_limit), rear.servo_limit)),
         )
-        self._steered = True
+        self._steering_used = feedback.stamp
 
     def observe_drive(self, feedback: DriveFeedback) -> None:
         """Take a motor position and move the pose along the arc driven since the last one."""
@@ -197,10 +199,9 @@ class DeadReckoning:
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
         swing = np.array(((1.0, 0.0, self._pose[1] - y), (0.0, 1.0, x - self._pose[0]), (0.0, 0.0, 1.0)))
         sources = ["drive"]
-        if self._steered:
-            sources.append("steering")
-        if self._compass_used is not None and now - self._compass_used <= MEMORY:
-            sources.append("compass")
+        for name, used in (("steering", self._steering_used), ("compass", self._compass_used)):
+            if used is not None and now - used <= MEMORY:
+                sources.append(name)
         return Estimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,

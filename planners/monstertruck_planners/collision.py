@@ -88,13 +88,21 @@ def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Arr
     Returns:
         Shape (m, n), m; negative inside.
     """
-    dx = points[None, :, 0] - poses[:, None, 0]
-    dy = points[None, :, 1] - poses[:, None, 1]
-    c, s = np.cos(poses[:, None, 2]), np.sin(poses[:, None, 2])
-    beyond_x = np.abs(dx * c + dy * s) - footprint.half_length
-    beyond_y = np.abs(dy * c - dx * s) - footprint.half_width
-    outside = np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0))
-    return np.asarray(outside + np.minimum(np.maximum(beyond_x, beyond_y), 0.0))
+    return _distance(*_beyond(footprint, poses, points))
+
+
+def _beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, Array]:
+    """How far every point lies beyond the footprint's ends and sides, each of shape (m, n), m."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = np.column_stack((c, s)) @ points.T - (c * poses[:, 0] + s * poses[:, 1])[:, None]
+    y = np.column_stack((-s, c)) @ points.T - (c * poses[:, 1] - s * poses[:, 0])[:, None]
+    return np.abs(x) - footprint.half_length, np.abs(y) - footprint.half_width
+
+
+def _distance(beyond_x: Array, beyond_y: Array) -> Array:
+    out_x, out_y = np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0)
+    distance: Array = np.sqrt(out_x * out_x + out_y * out_y) + np.minimum(np.maximum(beyond_x, beyond_y), 0.0)
+    return distance
 
 
 def clearance_to_points(footprint: Footprint, poses: Array, points: Array) -> Array:
@@ -148,7 +156,13 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     near = points_near(points, poses, footprint.circumscribed_radius + margin)
     if len(near) == 0:
         return None
-    distance = rectangle_distance(footprint, poses, near)
+    beyond_x, beyond_y = _beyond(footprint, poses, near)
+    # Most points are never touched: the exact distance is for the others.
+    touching = (beyond_x < margin) & (beyond_y < margin)
+    points_touched = touching.any(axis=0)
+    if not points_touched.any():
+        return None
+    distance = _distance(beyond_x[:, points_touched], beyond_y[:, points_touched])
     hits = ((distance < margin) & (distance < distance[0] - 1e-9)).any(axis=1)
     return int(np.argmax(hits)) if hits.any() else None
 

@@ -211,7 +211,20 @@ def test_sources_tell_what_the_estimate_rests_on():
     truck = Truck(compass_error=noisy(0.0))
     truck.drive(0.2, 0.0, 0.0, 2.0)
     assert truck.estimate.sources == ("drive", "steering", "compass")
-    assert truck.reckoning.estimate(truck.now + 2 * SECOND).sources == ("drive", "steering")
+    assert truck.reckoning.estimate(truck.now + 2 * SECOND).sources == ("drive",)
+
+
+def test_servo_angles_that_nobody_vouches_for_are_left_out():
+    truck = Truck()
+    truck.drive(0.2, 0.3, -0.3, 1.0)
+    straight = servo_feedback(truck.now, 0.0, 0.0)
+    truck.reckoning.observe_steering(straight.model_copy(update={"trusted": False}))
+    assert truck.estimate.twist[2] > 0.1
+    truck.reckoning.observe_steering(straight)
+    assert truck.estimate.twist[2] == pytest.approx(0.0)
+    unheard = Truck()
+    unheard.reckoning.observe_steering(straight.model_copy(update={"trusted": False}))
+    assert unheard.estimate.sources == ("drive",)
 
 
 # Service

@@ -95,6 +95,17 @@ def test_first_contact_of_a_straight_run():
     assert index == 21  # the nose is at 0.435 after 0.20 m; the next pose is inside
 
 
+@given(st.integers(0, 10**6), st.integers(1, 700), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0, 0.1))
+@settings(max_examples=50)
+def test_first_contact_is_what_all_distances_say(seed, count, front, rear, margin):
+    rng = np.random.default_rng(seed)
+    cloud = rng.uniform(-1, 1, (count, 2))
+    poses = swept_poses(FourWheelSteering(), front, rear, np.linspace(0, rng.uniform(-0.5, 0.5), 20))
+    distance = rectangle_distance(BARE, poses, cloud)
+    hits = np.flatnonzero(((distance < margin) & (distance < distance[0] - 1e-9)).any(axis=1))
+    assert first_contact(BARE, poses, cloud, margin) == (hits[0] if len(hits) else None)
+
+
 def test_margin_comes_earlier():
     assert first_contact(BARE, straight(), points((0.435, 0.0)), margin=0.05) == 16
 
