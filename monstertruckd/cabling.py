@@ -62,6 +62,8 @@ class Cabling:
         places = {
             role: port for role, port in self._ports.items() if role not in given and isinstance(port, UsbPortConfig)
         }
+        self.on_hubs = frozenset(places)
+        """Roles of the devices that hang by hub and port."""
         self._hubs = HubCoordinator(config.usb, places, self._machine.clock, self._events)
         self._power = PortPower(config.usb.power, self._machine, self._events)
         self.service: UsbService | None = None

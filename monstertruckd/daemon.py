@@ -81,7 +81,11 @@ class Daemon:
         self._computer = computer or Computer.at(config.machine, clock)
         self._cabling = Cabling(config, self._computer, self.bus, ports or {})
         self._board = HealthBoard(
-            clock, self.bus.publisher(topics.HEALTH, Writer.DAEMON), self._events, self._cabling.waiting
+            clock,
+            self.bus.publisher(topics.HEALTH, Writer.DAEMON),
+            self._events,
+            self._cabling.waiting,
+            self._cabling.on_hubs,
         )
         self._drivers = build_drivers(config, self._cabling, clock, self.bus)
         self._body = Body.of(config.geometry)

@@ -1,6 +1,6 @@
 """Health of every service as a topic, and real time against the daemon's own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
@@ -21,13 +21,16 @@ STEP = SECOND // 20
 class HealthBoard:
     """Collects every service's state, publishes the table on change and once a second.
 
-    The first loss and the recovery of a service are events; repeated failures of one outage are not.
+    The first loss and the recovery of a service are events; repeated failures of one outage are not. A device that was
+    unplugged from a hub is told at its second failure: if the whole hub is gone there is none, as it waits for the
+    hub, whose loss is one event for all.
 
     Args:
         clock: time.
         out: the table.
         events: losses and recoveries.
         waiting: what keeps the service of that name from starting, in words; None = nothing.
+        on_hubs: services whose device hangs on a hub.
     """
 
     name = "health"
@@ -38,11 +41,14 @@ class HealthBoard:
         out: Publisher[HealthTable],
         events: EventSink,
         waiting: Callable[[str], str | None] = lambda _: None,
+        on_hubs: Collection[str] = (),
     ) -> None:
         self._clock = clock
         self._out = out
         self._events = events
         self._waiting = waiting
+        self._on_hubs = on_hubs
+        self._unplugged: set[str] = set()
         self._rows: dict[str, ServiceHealth] = {}
         self._down: set[str] = set()
 
@@ -50,15 +56,23 @@ class HealthBoard:
         """Take in a service's new state (a ``HealthSink``)."""
         self._rows[row.name] = row
         if row.state is ServiceState.READY:
-            returned = row.name in self._down
+            returned = row.name in self._down | self._unplugged
             self._down.discard(row.name)
+            self._unplugged.discard(row.name)
             text = "is back" if returned else "is ready"
             self._events(Reason.DEVICE_READY, Severity.INFO, row.name, text, restarts=row.restarts)
+        elif self._may_be_its_hub(row):
+            self._unplugged.add(row.name)
         elif row.state in (ServiceState.BACKOFF, ServiceState.FAILED) and row.name not in self._down:
             self._down.add(row.name)
             severity = Severity.ERROR if row.state is ServiceState.FAILED else Severity.WARNING
             self._events(row.reason, severity, row.name, row.detail, restarts=row.restarts)
         self._publish()
+
+    def _may_be_its_hub(self, row: ServiceHealth) -> bool:
+        """The first time that a working device on a hub is gone."""
+        first = row.state is ServiceState.BACKOFF and row.name not in self._down | self._unplugged
+        return first and row.reason is Reason.DEVICE_LOST and row.name in self._on_hubs
 
     def rows(self) -> tuple[ServiceHealth, ...]:
         """All services, in the order in which they first reported."""

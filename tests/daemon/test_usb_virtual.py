@@ -120,6 +120,7 @@ def test_a_hub_vanishes_and_returns(hub: str):
         lost = [event for event in events if event.reason is Reason.HUB_LOST]
         assert [event.values["devices"] for event in lost] == [len(BEHIND[hub])]
         assert [event.reason for event in events].count(Reason.HUB_RETURNED) == 1
+        assert Reason.DEVICE_LOST not in {event.reason for event in events}, "the hub's loss says it all"
         await robot.clock.sleep(1.0)
         for role in others:
             samples = robot.samples(role)
@@ -181,7 +182,8 @@ def test_one_cable_pulled_is_no_lost_hub():
         assert robot.down() == {"lidar"}
         lidar.port.plug()
         assert await robot.ready() < 2.0
-        assert robot.events(Reason.HUB_LOST) == []
+        told = [event for event in robot.events() if event.reason in (Reason.HUB_LOST, Reason.DEVICE_LOST)]
+        assert [(event.reason, event.source) for event in told] == [(Reason.DEVICE_LOST, "lidar")]
 
     play(scene)
 
