@@ -7,8 +7,7 @@ from typing import Any, Self
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
-from monstertruck_kinematics.polynomials import SteeringPolynomials
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.stabiliser import StabiliserService
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.service import TrackerService
@@ -16,9 +15,9 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
-from monstertruck_schemas.topics import Writer
+from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.config.truck import Geometry, TruckConfig
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
 
@@ -27,26 +26,19 @@ SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """The truck's kinematics, shared by gate, estimation and planners."""
+    """The robot's kinematics and outline, shared by gate, estimation and planners."""
 
-    steering: FourWheelSteering
-    drivetrain: DriveTrain
-    linkage: SteeringPolynomials
+    chassis: Chassis
     footprint: Footprint
 
     @classmethod
-    def of(cls, geometry: Geometry) -> Self:
-        """Kinematics of a configured body."""
-        return cls(
-            FourWheelSteering(geometry.wheelbase, geometry.track),
-            DriveTrain(geometry.drive_ratio, geometry.wheel_radius),
-            SteeringPolynomials.named("corrected"),
-            Footprint(geometry.length, geometry.width),
-        )
+    def of(cls, config: TruckConfig) -> Self:
+        """Of a configured robot."""
+        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width))
 
 
 def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
-    """Transforms always; odometry where the truck can drive and steer."""
+    """Transforms always; odometry where the robot can drive and steer."""
     mounts = {
         role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
         for role, m in ((role, device.mount) for role, device in config.devices.present().items())
@@ -62,13 +54,13 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION),
         joints=None if joints is None else (joints, bus.subscribe(topics.STABILISER, latest())),
     )
-    if config.devices.drive is None or config.devices.steering is None:
+    if config.missing_actuators() is not None:
         return
     yield OdometryService(
-        DeadReckoning(config.odometry, steering=body.steering, drivetrain=body.drivetrain, linkage=body.linkage),
+        DeadReckoning(config.odometry, body.chassis),
         clock,
-        drive=bus.subscribe(topics.DRIVE, latest()),
-        steering=bus.subscribe(topics.STEERING, latest()),
+        drives=[bus.subscribe(topic, latest()) for topic in DRIVES[: len(body.chassis.shafts)]],
+        steering=bus.subscribe(topics.STEERING, latest()) if body.chassis.linkage is not None else None,
         compass=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
         odometry=bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
         pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
@@ -93,7 +85,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
         yield TrackerService(
             config.tracker,
             clock,
-            steering=body.steering,
+            steering=body.chassis.bicycle,
             footprint=body.footprint,
             lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
             pose=bus.subscribe(topics.ODOMETRY, latest()),
@@ -124,17 +116,16 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
         )
 
 
-def calibration(config: TruckConfig, linkage: SteeringPolynomials) -> dict[str, Any]:
+def calibration(config: TruckConfig, chassis: Chassis) -> dict[str, Any]:
     """Everything that was measured on this very truck, for the log."""
     devices = config.devices
     values: dict[str, Any] = {
         "wheel_radius_m": config.geometry.wheel_radius,
         "drive_ratio": config.geometry.drive_ratio,
-        "linkage": dataclasses.asdict(linkage),
+        "linkage": None if chassis.linkage is None else dataclasses.asdict(chassis.linkage),
         "mounts": {role: device.mount.model_dump() for role, device in devices.present().items()},
     }
-    if devices.drive is not None:
-        values["drive_inverted"] = devices.drive.driver.inverted
+    values |= {f"{role}_inverted": device.driver.inverted for role, device in devices.shafts().items()}
     if devices.steering is not None:
         steering = devices.steering.driver
         values |= {"front_servo": steering.front.model_dump(), "rear_servo": steering.rear.model_dump()}

@@ -24,14 +24,14 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
-from monstertruck_schemas.topics import TOPICS, Writer
+from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd import __version__
 from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.cabling import Cabling, Computer
-from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.truck import SHAFTS, TruckConfig
 from monstertruckd.config.validate import resolved
 from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.devices import build_drivers, build_monitors
@@ -42,7 +42,7 @@ from monstertruckd.health import ClockService, HealthBoard, MeterService
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
 
-ACTUATORS = ("drive", "steering")
+ACTUATORS = (*SHAFTS, "steering")
 SENSORS = ("lidar", "compass", "stabiliser", "camera")
 VERSIONS = {"monstertruckd": __version__, "python": platform.python_version(), "machine": platform.machine()}
 
@@ -88,7 +88,7 @@ class Daemon:
             self._cabling.on_hubs,
         )
         self._drivers = build_drivers(config, self._cabling, clock, self.bus)
-        self._body = Body.of(config.geometry)
+        self._body = Body.of(config)
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
@@ -203,15 +203,14 @@ class Daemon:
         lidar = config.devices.lidar
         gate = Gate(
             config.gate,
-            steering=self._body.steering,
-            drivetrain=self._body.drivetrain,
-            linkage=self._body.linkage,
+            chassis=self._body.chassis,
             footprint=self._body.footprint,
             lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
             nonce=nonce,
             latched=latch.engaged(),
         )
-        drive, steering = bus.actuators()
+        shafts = len(self._body.chassis.shafts)
+        drives, steering = bus.actuators(shafts)
         return GateService(
             gate,
             config.gate.rate,
@@ -221,12 +220,12 @@ class Daemon:
                 wishes=bus.subscribe(topics.PLAN_DRIVE, fifo(16)),
                 scan=bus.subscribe(topics.SCAN, latest()),
                 attitude=bus.subscribe(topics.COMPASS, latest()),
-                drive=bus.subscribe(topics.DRIVE, latest()),
+                drives=tuple(bus.subscribe(topic, latest()) for topic in DRIVES[:shafts]),
                 steering=bus.subscribe(topics.STEERING, latest()),
                 battery=bus.subscribe(topics.BATTERY, latest()),
                 health=bus.subscribe(topics.HEALTH, latest()),
             ),
-            GateOutputs(drive, steering, bus.publisher(topics.GATE, Writer.GATE)),
+            GateOutputs(drives, steering, bus.publisher(topics.GATE, Writer.GATE)),
             self._events,
             latch,
         )
@@ -252,7 +251,7 @@ class Daemon:
             self._recorder_failed,
             attachments={
                 "config": resolved(self.config),
-                "calibration": calibration(self.config, self._body.linkage),
+                "calibration": calibration(self.config, self._body.chassis),
                 "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
                 "versions": VERSIONS,
             },

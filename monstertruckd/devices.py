@@ -13,11 +13,11 @@ from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.topics import Writer
+from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.cabling import Cabling, Computer
 from monstertruckd.catalog import BY_NAME
-from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.truck import SHAFTS, TruckConfig
 
 CONVERTERS = "sys/bus/iio/devices"
 RECENT = Delivery(16, counted=False)
@@ -46,8 +46,9 @@ def _ends(role: str, config: TruckConfig, bus: Bus) -> tuple[Any, ...]:
             return (bus.publisher(topics.COMPASS, Writer.DRIVER),)
         case "camera":
             return (bus.publisher(topics.CAMERA, Writer.DRIVER),)
-        case "drive":
-            return bus.subscribe(topics.CMD_DRIVE, latest()), bus.publisher(topics.DRIVE, Writer.DRIVER)
+        case "drive" | "drive_2" | "drive_3" | "drive_4":
+            shaft = SHAFTS.index(role)
+            return bus.subscribe(CMD_DRIVES[shaft], latest()), bus.publisher(DRIVES[shaft], Writer.DRIVER)
         case "stabiliser":
             return bus.subscribe(topics.PLAN_STABILISER, latest()), bus.publisher(topics.STABILISER, Writer.DRIVER)
         case _:

@@ -17,7 +17,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import CMD_DRIVE, CMD_STEERING, EVENT, Topic, Writer
+from monstertruck_schemas.topics import CMD_DRIVES, CMD_STEERING, EVENT, Topic, Writer
 
 M = TypeVar("M", bound=Message)
 
@@ -89,13 +89,13 @@ class Bus:
             raise RuntimeError(msg)
         return self._claim(topic)
 
-    def actuators(self) -> tuple[Publisher[DriveCommand], Publisher[SteeringCommand]]:
-        """Write ends of the actuators, for the safety gate alone.
+    def actuators(self, shafts: int = 1) -> tuple[tuple[Publisher[DriveCommand], ...], Publisher[SteeringCommand]]:
+        """Write ends of the actuators, for the safety gate alone: of so many driven shafts, and of the steering.
 
         Raises:
             RuntimeError: they were handed out before.
         """
-        return self._claim(CMD_DRIVE), self._claim(CMD_STEERING)
+        return tuple(self._claim(topic) for topic in CMD_DRIVES[:shafts]), self._claim(CMD_STEERING)
 
     def event_sink(self) -> EventSink:
         """Where any service reports what happened; all share one topic and its sequence numbers."""

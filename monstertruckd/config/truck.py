@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, Literal, Self, TypeVar
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -18,13 +18,19 @@ from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_kinematics.chassis import Chassis, build_chassis
+from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
-from monstertruck_planners.track.pure_pursuit import PurePursuitConfig
+from monstertruck_planners.track.pure_pursuit import STEERING_MODES, PurePursuitConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.body import BodyConfig, TruckBody
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.recorder.config import RecorderConfig
+
+SHAFTS: Final = ("drive", "drive_2", "drive_3", "drive_4")
+"""Roles of the driven shafts' controllers, in the order of the body's shafts."""
 
 C = TypeVar("C", bound=Schema)
 
@@ -88,10 +94,14 @@ class Device(Schema, Generic[C]):
 
 
 class Devices(Schema):
-    """The truck's devices by role; a role that is left out is not there."""
+    """The robot's devices by role; a role that is left out is not there."""
 
     lidar: Device[HokuyoConfig] | None = None
     drive: Device[EposConfig] | None = None
+    drive_2: Device[EposConfig] | None = None
+    """Controller of the body's second driven shaft, if it has one"""
+    drive_3: Device[EposConfig] | None = None
+    drive_4: Device[EposConfig] | None = None
     steering: Device[MaestroConfig] | None = None
     compass: Device[Os4000Config] | None = None
     stabiliser: Device[Ax12Config] | None = None
@@ -101,6 +111,10 @@ class Devices(Schema):
     def present(self) -> dict[str, Device[Schema]]:
         """The devices that are configured, by role."""
         return {role: device for role in type(self).model_fields if (device := getattr(self, role)) is not None}
+
+    def shafts(self) -> dict[str, Device[EposConfig]]:
+        """The controllers of the driven shafts, by role."""
+        return {role: device for role in SHAFTS if (device := getattr(self, role)) is not None}
 
     @model_validator(mode="after")
     def _one_port_each(self) -> Self:
@@ -127,7 +141,7 @@ class Geometry(Schema):
     """The truck's body (navigation-relevant lengths, author's robot as default)."""
 
     wheelbase: Metres = 0.32
-    """Metres between front and rear axle"""
+    """Metres between front and rear axle; of a body without axles, the length of the bicycle that requests speak of"""
     track: Metres = 0.26
     """Metres between left and right wheel centres"""
     wheel_radius: Metres = 0.075
@@ -188,6 +202,8 @@ class TruckConfig(Schema):
     version: Literal[1]
     robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = "truck"
     """Name of this robot in every key"""
+    body: BodyConfig = TruckBody()
+    """Kind of robot, with what only this kind has"""
     geometry: Geometry = Geometry()
     devices: Devices
     monitors: Monitors = Monitors()
@@ -206,20 +222,55 @@ class TruckConfig(Schema):
     state_directory: Path = Path("runs/state")
     """Where the e-stop latch is kept"""
 
+    def chassis(self) -> Chassis:
+        """The body's kinematics.
+
+        Raises:
+            KinematicsError: dimensions no robot can have.
+        """
+        geometry = self.geometry
+        return build_chassis(
+            wheelbase=geometry.wheelbase,
+            track=geometry.track,
+            drivetrain=DriveTrain(geometry.drive_ratio, geometry.wheel_radius),
+            **self.body.model_dump(),
+        )
+
+    def missing_actuators(self) -> str | None:
+        """What the body needs to drive and steer, if some of it is not there."""
+        chassis = self.chassis()
+        needed = (*SHAFTS[: len(chassis.shafts)], *(("steering",) if chassis.linkage is not None else ()))
+        if set(needed) <= self.devices.present().keys():
+            return None
+        return f"the devices {', '.join(needed[:-1])} and {needed[-1]}"
+
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        if self.tracker is not None and (self.devices.drive is None or self.devices.steering is None):
-            raise ValueError("a tracker needs the devices drive and steering")
+        self._check_actuators()
         steering = self.devices.steering
         if self.monitors.battery is not None and steering is not None and steering.driver.battery is not None:
             raise ValueError(
                 "monitors.battery and devices.steering.driver.battery both measure the battery; set the other one null"
             )
-        if self.devices.drive is not None:
-            self._check_braking(self.devices.drive.driver)
         return self
 
-    def _check_braking(self, drive: EposConfig) -> None:
+    def _check_actuators(self) -> None:
+        chassis = self.chassis()
+        shafts = self.devices.shafts()
+        if shafts and set(shafts) != set(SHAFTS[: len(chassis.shafts)]):
+            wanted = ", ".join(f"{role} ({shaft})" for role, shaft in zip(SHAFTS, chassis.shafts, strict=False))
+            raise ValueError(f"body {self.body.kind} is driven by {wanted}; got {', '.join(shafts)}")
+        if self.tracker is not None:
+            if lack := self.missing_actuators():
+                raise ValueError(f"a tracker needs {lack}")
+            if why := chassis.refusal(*STEERING_MODES[self.tracker.steering]):
+                raise ValueError(
+                    f"tracker.steering {self.tracker.steering}: impossible for body {self.body.kind}: {why}"
+                )
+        for role, device in shafts.items():
+            self._check_braking(role, device.driver)
+
+    def _check_braking(self, role: str, drive: EposConfig) -> None:
         """The gate promises stopping distances; the drive controller must brake at least as hard."""
         metres = 2 * math.pi * self.geometry.wheel_radius / (60 * self.geometry.drive_ratio)
         for name, promised, rpm_s in (
@@ -228,6 +279,6 @@ class TruckConfig(Schema):
         ):
             if promised > rpm_s * metres:
                 raise ValueError(
-                    f"gate.{name} {promised} m/s^2: the drive is configured to brake with {rpm_s} rpm/s, "
+                    f"gate.{name} {promised} m/s^2: the {role} is configured to brake with {rpm_s} rpm/s, "
                     f"which is {rpm_s * metres:.2f} m/s^2"
                 )

@@ -49,7 +49,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
     async with (
         program(folder / "simulate.txt", *simulate),
         program(folder / "daemon.txt", "run", "--config", str(overlay)),
-        await connect(clock, endpoint) as client,
+        await connect(clock, load_tree(config).data.get("robot", "truck"), endpoint) as client,
     ):
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
@@ -129,20 +129,20 @@ async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subpro
             await ended
 
 
-async def connect(clock: Clock, endpoint: str) -> TruckClient:
+async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
     """A client, as soon as the daemon listens."""
     try:
         async with clock.deadline(PATIENCE):
             while True:
                 try:
-                    async with TruckClient(endpoint=endpoint, clock=clock, timeout=0.5) as client:
+                    async with TruckClient(robot, endpoint, clock=clock, timeout=0.5) as client:
                         if await client.alive():
                             break
                 except NotFoundError:
                     await clock.sleep(0.2)
     except TimeoutError:
         raise NoAnswerError(f"the daemon did not come up within {PATIENCE:g} s at {endpoint}") from None
-    return TruckClient(endpoint=endpoint, source=f"demo:{os.getpid()}", clock=clock)
+    return TruckClient(robot, endpoint, source=f"demo:{os.getpid()}", clock=clock)
 
 
 async def _appear(exists: Callable[[], bool], clock: Clock) -> None:

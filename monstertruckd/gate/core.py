@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
@@ -49,9 +49,7 @@ class Gate:
 
     Args:
         config: limits.
-        steering: the truck's geometry.
-        drivetrain: motor to wheel.
-        linkage: axle to servo.
+        chassis: what the body can do, and how its motors and servos do it.
         footprint: the truck's outline.
         lidar: pose (x, y, yaw) of the lidar in base.
         nonce: of this run; requests must carry it.
@@ -65,26 +63,25 @@ class Gate:
         self,
         config: GateConfig,
         *,
-        steering: FourWheelSteering,
-        drivetrain: DriveTrain,
-        linkage: SteeringPolynomials,
+        chassis: Chassis,
         footprint: Footprint,
         lidar: tuple[float, float, float],
         nonce: str,
         latched: bool = False,
     ) -> None:
-        reach = min(abs(end) for axle in (linkage.front, linkage.rear) for end in axle.axle_limits)
-        if config.angle > reach:
-            msg = f"gate.angle {config.angle} rad: expected at most {reach:.4f} rad, which the steering linkage reaches"
+        if config.angle > chassis.reach:
+            msg = (
+                f"gate.angle {config.angle} rad: expected at most {chassis.reach:.4f} rad, "
+                "which the steering linkage reaches"
+            )
             raise ConfigError(msg)
         self._config = config
-        self._drivetrain = drivetrain
-        self._linkage = linkage
+        self._chassis = chassis
         self._sources = Sources(nonce, config)
-        self._watch = Watch(config, drivetrain)
-        self._obstacles = ObstacleGuard(config, steering, footprint, lidar)
-        self._motion = Motion(config, steering)
-        self._servos = (0.0, 0.0), linkage.servo_from_axles(0.0, 0.0)
+        self._watch = Watch(config, chassis)
+        self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, lidar)
+        self._motion = Motion(config, chassis)
+        self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
         """Axle angles and their servo angles at the last tick."""
         self._measured = (0.0, 0.0)
         """Axle angles by the newest steering feedback."""
@@ -123,15 +120,15 @@ class Gate:
         """Take the newest attitude."""
         self._watch.observe_attitude(attitude)
 
-    def observe_drive(self, feedback: DriveFeedback) -> None:
-        """Take the newest drive feedback."""
-        self._watch.observe_drive(feedback)
+    def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
+        """Take the newest feedback of a driven shaft."""
+        self._watch.observe_drive(feedback, shaft)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the newest steering feedback."""
         self._watch.observe_steering(feedback)
         if self._watch.steering is feedback:
-            self._measured = self._axles(feedback)
+            self._measured = self._chassis.axles(feedback.front, feedback.rear)
 
     def observe_battery(self, battery: Battery) -> None:
         """Take the newest battery reading."""
@@ -158,6 +155,8 @@ class Gate:
         if wrong:
             text = ", ".join(f"{name} is {value}" for name, value in wrong.items()) + ": expected finite numbers"
             return self._refuse(now, Reason.NOT_FINITE, request, text)
+        if (why := self._chassis.refusal(request.front, request.rear)) is not None:
+            return self._refuse(now, Reason.IMPOSSIBLE_MOTION, request, why)
         source = self._sources.add(request, now, inside=inside)
         if self._mode is GateMode.ESTOPPED:
             return self._refuse(now, Reason.ESTOPPED, request)
@@ -364,13 +363,6 @@ class Gate:
         near = self._blocked_ahead and self._obstacles.too_near(free, speed, now)
         self._emergency = moving_there and (self._emergency or near)
 
-    def _axles(self, feedback: SteeringFeedback) -> tuple[float, float]:
-        front, rear = self._linkage.front, self._linkage.rear
-        return (
-            front.axle_from_servo(min(max(feedback.front, -front.servo_limit), front.servo_limit)),
-            rear.axle_from_servo(min(max(feedback.rear, -rear.servo_limit), rear.servo_limit)),
-        )
-
     def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:
         """Tell about reasons that were not there at the last tick."""
         if self._mode not in ACTIVE:
@@ -403,15 +395,15 @@ class Gate:
         reasons = tuple(dict.fromkeys((*state, *blocks, *slow)))
         moving_allowed = self._mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
         motion, holder = self._motion, self._holder
-        wheel_speed = motion.wheel_speed
-        travelling = max(abs(self._watch.speed(now) or 0.0), abs(wheel_speed))
+        speeds = motion.shaft_speeds
+        travelling = max(abs(self._watch.speed(now) or 0.0), *map(abs, speeds))
         if self._servos[0] != (motion.front, motion.rear):
-            self._servos = (motion.front, motion.rear), self._linkage.servo_from_axles(motion.front, motion.rear)
+            self._servos = (motion.front, motion.rear), self._chassis.servos(motion.front, motion.rear)
         front_servo, rear_servo = self._servos[1]
         return GateOutput(
             action=self._action(now, reasons),
-            speed=wheel_speed,
-            motor_velocity=self._drivetrain.motor_rate(wheel_speed),
+            speeds=speeds,
+            motor_velocities=tuple(map(self._chassis.drivetrain.motor_rate, speeds)),
             front=motion.front,
             rear=motion.rear,
             front_servo=front_servo,

@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_schemas.req import DriveRequest
 from monstertruckd.gate.config import GateConfig
 
@@ -16,20 +16,20 @@ class Motion:
 
     Args:
         config: limits.
-        steering: the truck's geometry.
+        chassis: what the body can do.
     """
 
-    def __init__(self, config: GateConfig, steering: FourWheelSteering) -> None:
+    def __init__(self, config: GateConfig, chassis: Chassis) -> None:
         self._config = config
-        self._steering = steering
+        self._chassis = chassis
         self.speed = 0.0
         self.front = 0.0
         self.rear = 0.0
 
     @property
-    def wheel_speed(self) -> float:
-        """What the drive has to do for it, m/s over ground."""
-        return self._steering.drive_speed(self.speed, self.front, self.rear)
+    def shaft_speeds(self) -> tuple[float, ...]:
+        """What the driven shafts have to do for it, m/s over ground."""
+        return self._chassis.shaft_speeds(self.speed, self.front, self.rear)
 
     def clipped_angles(self, request: DriveRequest) -> tuple[float, float, bool]:
         """Axle angles within the limits that keep the curvature asked for, and whether that changed them."""
@@ -37,12 +37,12 @@ class Motion:
         rear = min(max(request.rear, -STEEPEST), STEEPEST)
         if max(abs(front), abs(rear)) <= self._config.angle:
             return front, rear, False
-        return *self._steering.limit_keeping_curvature(front, rear, self._config.angle), True
+        return *self._chassis.limited(front, rear, self._config.angle), True
 
     def cap(self, direction: float) -> float:
         """Greatest speed of the base at the present axle angles, m/s: the wheels must not exceed theirs."""
         wheels = self._config.speed if direction >= 0 else self._config.reverse_speed
-        return wheels / max(self._steering.drive_speed(1.0, self.front, self.rear), 1.0)
+        return wheels / max(1.0, *map(abs, self._chassis.shaft_speeds(1.0, self.front, self.rear)))
 
     def steer(self, front: float, rear: float, dt: float) -> None:
         """Turn both axles towards (front, rear) by one common share of the way, within the steering rate."""

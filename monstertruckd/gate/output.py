@@ -14,9 +14,9 @@ class GateOutput:
     """Commands and state of one tick: the fields of DriveCommand, SteeringCommand and GateState, and the events."""
 
     action: DriveAction
-    speed: float
-    """Wheel speed over ground, m/s."""
-    motor_velocity: float
+    speeds: tuple[float, ...]
+    """Wheel speed over ground of every driven shaft, m/s."""
+    motor_velocities: tuple[float, ...]
     front: float
     rear: float
     front_servo: float

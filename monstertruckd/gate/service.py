@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND, Clock
@@ -37,7 +38,8 @@ class GateInputs:
     """``plan/drive``."""
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
-    drive: Subscription[DriveFeedback]
+    drives: tuple[Subscription[DriveFeedback], ...]
+    """One per driven shaft."""
     steering: Subscription[SteeringFeedback]
     battery: Subscription[Battery]
     health: Subscription[HealthTable]
@@ -47,7 +49,7 @@ class GateInputs:
 class GateOutputs:
     """What the gate writes; nobody else gets the first two."""
 
-    drive: Publisher[DriveCommand]
+    drives: tuple[Publisher[DriveCommand], ...]
     steering: Publisher[SteeringCommand]
     state: Publisher[GateState]
 
@@ -92,7 +94,7 @@ class GateService:
         self._feeds: list[_Feed] = [
             _Feed(inputs.scan, gate.observe_scan),
             _Feed(inputs.attitude, gate.observe_attitude),
-            _Feed(inputs.drive, gate.observe_drive),
+            *(_Feed(drive, partial(gate.observe_drive, shaft=i)) for i, drive in enumerate(inputs.drives)),
             _Feed(inputs.steering, gate.observe_steering),
             _Feed(inputs.battery, gate.observe_battery),
             _Feed(inputs.health, gate.observe_health),
@@ -147,17 +149,18 @@ class GateService:
             self._gate.wish(await self._inputs.wishes.next(), self._clock.now())
 
     def _publish(self, output: GateOutput, now: int) -> None:
-        drive, steering = self._outputs.drive, self._outputs.steering
-        drive.put(
-            DriveCommand(
-                stamp=now,
-                received=now,
-                seq=drive.next_seq(),
-                action=output.action,
-                speed=output.speed,
-                motor_velocity=output.motor_velocity,
+        steering = self._outputs.steering
+        for drive, speed, velocity in zip(self._outputs.drives, output.speeds, output.motor_velocities, strict=True):
+            drive.put(
+                DriveCommand(
+                    stamp=now,
+                    received=now,
+                    seq=drive.next_seq(),
+                    action=output.action,
+                    speed=speed,
+                    motor_velocity=velocity,
+                )
             )
-        )
         steering.put(
             SteeringCommand(
                 stamp=now,

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas.base import Message
@@ -25,6 +25,9 @@ SENSOR_SERVICES: Final = {
     "lidar": Reason.SCAN_STALE,
     "compass": Reason.ATTITUDE_STALE,
     "drive": Reason.DRIVE_STALE,
+    "drive_2": Reason.DRIVE_STALE,
+    "drive_3": Reason.DRIVE_STALE,
+    "drive_4": Reason.DRIVE_STALE,
     "steering": Reason.STEERING_STALE,
 }
 """Services whose reported loss ends the worth of their samples at once."""
@@ -49,14 +52,14 @@ class Watch:
 
     Args:
         config: limits.
-        drivetrain: motor to wheel.
+        chassis: what moves.
     """
 
-    def __init__(self, config: GateConfig, drivetrain: DriveTrain) -> None:
+    def __init__(self, config: GateConfig, chassis: Chassis) -> None:
         self._config = config
-        self._drivetrain = drivetrain
+        self._chassis = chassis
         self.scan: LaserScan | None = None
-        self.drive: DriveFeedback | None = None
+        self._drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
         self.steering: SteeringFeedback | None = None
         self._attitude: Attitude | None = None
         self._battery: Battery | None = None
@@ -70,10 +73,10 @@ class Watch:
             self.scan = scan
         return self.scan is scan
 
-    def observe_drive(self, feedback: DriveFeedback) -> None:
-        """Take drive feedback."""
+    def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
+        """Take feedback of a driven shaft."""
         if self._good(feedback):
-            self.drive = feedback
+            self._drives[shaft] = feedback
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take steering feedback; what the servo controller does not vouch for is no good sample."""
@@ -95,7 +98,7 @@ class Watch:
         """Take the services' health: samples from before a service was lost no longer count."""
         for row in table.services:
             if row.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(row.name)) is not None:
-                self._lost[stale] = row.since
+                self._lost[stale] = max(row.since, self._lost.get(stale, -1))
         self._failed = tuple(
             row.name
             for row in table.services
@@ -119,10 +122,17 @@ class Watch:
         return self._fresh(self.steering, self._config.steering, now, Reason.STEERING_STALE)
 
     def speed(self, now: int) -> float | None:
-        """Measured speed of the wheels over ground, m/s; None without fresh feedback."""
-        if self.drive is None or not self._fresh(self.drive, self._config.drive, now, Reason.DRIVE_STALE):
+        """Measured speed of the fastest wheel over ground, m/s; None without fresh feedback of every shaft."""
+        drives = self._fresh_drives(now)
+        if not drives:
             return None
-        return self._drivetrain.speed(self.drive.velocity)
+        return self._chassis.travel(tuple(self._chassis.drivetrain.speed(drive.velocity) for drive in drives))
+
+    def _fresh_drives(self, now: int) -> tuple[DriveFeedback, ...]:
+        """Feedback of all shafts; none of it unless all of it counts."""
+        drives = tuple(drive for drive in self._drives if drive is not None)
+        fresh = all(self._fresh(drive, self._config.drive, now, Reason.DRIVE_STALE) for drive in self._drives)
+        return drives if fresh else ()
 
     def at_rest(self, now: int, since: int = 0) -> bool:
         """Whether the truck is known to stand still, by a sample not older than ``since``.
@@ -130,9 +140,10 @@ class Watch:
         A truck without a critical drive counts as standing.
         """
         speed = self.speed(now)
-        if speed is None or self.drive is None:
+        if speed is None:
             return not self._config.drive.critical
-        return self.drive.stamp >= since and abs(speed) < self._config.standstill
+        sampled = min(drive.stamp for drive in self._fresh_drives(now))
+        return sampled >= since and abs(speed) < self._config.standstill
 
     def judge(self, now: int) -> Judgement:
         """Verdict at ``now``."""
@@ -140,14 +151,17 @@ class Watch:
         blocks: list[Reason] = []
         limits: dict[Reason, float] = {}
         values: dict[str, Value] = {}
-        if self.drive is not None and self.drive.mode is DriveMode.FAULT:
+        for drive in self._drives:
+            if drive is not None and drive.mode is DriveMode.FAULT:
+                values["drive_fault_code"] = drive.fault_code
+        if "drive_fault_code" in values:
             blocks.append(Reason.DRIVE_FAULT)
-            values["drive_fault_code"] = self.drive.fault_code
         if self._failed:
             blocks.append(Reason.SERVICE_FAILED)
+        steered = self._chassis.linkage is not None
         for message, limit, reason in (
-            (self.drive, config.drive, Reason.DRIVE_STALE),
-            (self.steering, config.steering, Reason.STEERING_STALE),
+            *((drive, config.drive, Reason.DRIVE_STALE) for drive in self._drives),
+            *(((self.steering, config.steering, Reason.STEERING_STALE),) if steered else ()),
             (self.scan, config.scan, Reason.SCAN_STALE),
             (self._attitude, config.attitude, Reason.ATTITUDE_STALE),
             (self._battery, config.battery, Reason.BATTERY_STALE),
@@ -161,7 +175,7 @@ class Watch:
             elif self._tilt.slow:
                 limits[Reason.TILT_SLOW] = config.tilt.slow_speed
         self._judge_battery(now, blocks, limits, values)
-        return Judgement(tuple(blocks), limits, values)
+        return Judgement(tuple(dict.fromkeys(blocks)), limits, values)
 
     def _judge_battery(
         self, now: int, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]

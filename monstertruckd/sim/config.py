@@ -1,9 +1,9 @@
 """Configuration of a run in the simulated world: the daemon's own, and the world behind the emulators."""
 
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_drivers.world.config import WorldConfig
 from monstertruck_schemas.base import Schema
@@ -30,3 +30,9 @@ class SimulatedTruckConfig(TruckConfig):
     FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (*TruckConfig.FILE_KEYS, ("sim", "recording"))
 
     sim: SimConfig
+
+    @model_validator(mode="after")
+    def _same_kind(self) -> Self:
+        if self.sim.world.truck.body.kind != self.body.kind:
+            raise ValueError(f"sim.world.truck.body is {self.sim.world.truck.body.kind}, body is {self.body.kind}")
+        return self

@@ -24,12 +24,12 @@ from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
-from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.truck import SHAFTS, TruckConfig
 from monstertruckd.devices import CONVERTERS
 from monstertruckd.sim.config import SimConfig
 from monstertruckd.sim.console import FileEmulator
 
-LINE_BAUD = {"drive": 38400, "stabiliser": BAUD}
+LINE_BAUD = {**dict.fromkeys(SHAFTS, 38400), "stabiliser": BAUD}
 """Serial lines whose speed is felt; the others are USB from end to end, or have a byte now and then."""
 
 
@@ -68,9 +68,11 @@ class SimulatedRobot:
             self.emulators["lidar"] = HokuyoEmulator(clock, self.world.lidar, seed=config.seed)
         if "compass" in present:
             self.emulators["compass"] = Os4000Emulator(clock, self.world.compass, seed=config.seed)
-        if "drive" in present:
-            self.epos = EposEmulator(clock, self.world.motor, seed=config.seed)
-            self.emulators["drive"] = self.epos
+        shafts = devices.shafts()
+        self.epos = tuple(
+            EposEmulator(clock, motor, seed=config.seed + i) for i, motor in enumerate(self.world.motors[: len(shafts)])
+        )
+        self.emulators.update(zip(shafts, self.epos, strict=True))
         if devices.steering is not None:
             self._deadman_channel = devices.steering.driver.deadman_channel if config.deadman_wired else None
             self.emulators["steering"] = MaestroEmulator(
@@ -123,7 +125,8 @@ class SimulatedRobot:
 
     def _output_changed(self, channel: int, high: bool) -> None:
         if channel == self._deadman_channel:
-            self.epos.set_quick_stop_input(not high)
+            for epos in self.epos:
+                epos.set_quick_stop_input(not high)
 
 
 def stabiliser_bus(config: Ax12Config, clock: Clock, seed: int) -> Ax12Bus:

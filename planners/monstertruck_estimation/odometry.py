@@ -1,9 +1,10 @@
-"""Dead reckoning of the truck: motor turns along the steered arc, the heading held by the compass.
+"""Dead reckoning: motor turns along the steered arc, the heading held by the compass.
 
 Between two drive readings the pose is a prediction, and its covariance grows with the reading's age.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate, integration_jacobians
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
@@ -92,32 +93,22 @@ class DeadReckoning:
 
     Args:
         config: start and noise.
-        steering: the truck's geometry.
-        drivetrain: motor to wheel.
-        linkage: servo to axle.
+        chassis: from motors and servos to the body's motion.
     """
 
-    def __init__(
-        self,
-        config: OdometryConfig,
-        *,
-        steering: FourWheelSteering,
-        drivetrain: DriveTrain,
-        linkage: SteeringPolynomials,
-    ) -> None:
+    def __init__(self, config: OdometryConfig, chassis: Chassis) -> None:
         self._config = config
-        self._steering = steering
-        self._drivetrain = drivetrain
-        self._linkage = linkage
+        self._chassis = chassis
         self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
         self._covariance: Array = np.zeros((3, 3))
         self._slip = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2
         self._drift = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
-        self._drive: DriveFeedback | None = None
+        self._turns: tuple[float, ...] | None = None
+        self._stamp = 0
         self._steering_used: int | None = None
         self._angles = (0.0, 0.0)
         self._angles_then = (0.0, 0.0)
-        self._speed = 0.0
+        self._pace = (0.0,) * len(chassis.shafts)
         self._driven = 0.0
         self._aligning: list[float] = []
         self._north: float | None = None
@@ -129,32 +120,34 @@ class DeadReckoning:
         """Take the servo angles being sent, unless the servo controller does not vouch for them."""
         if not feedback.trusted:
             return
-        front, rear = self._linkage.front, self._linkage.rear
-        self._angles = (
-            front.axle_from_servo(min(max(feedback.front, -front.servo_limit), front.servo_limit)),
-            rear.axle_from_servo(min(max(feedback.rear, -rear.servo_limit), rear.servo_limit)),
-        )
+        self._angles = self._chassis.axles(feedback.front, feedback.rear)
         self._steering_used = feedback.stamp
 
-    def observe_drive(self, feedback: DriveFeedback) -> None:
-        """Take a motor position and move the pose along the arc driven since the last one."""
-        before, angles_then = self._drive, self._angles_then
+    def observe_drive(self, *shafts: DriveFeedback) -> None:
+        """Take the position of every motor and move the pose along the arc driven since the last ones.
+
+        Positions that were not read at one instant are brought to the newest by their own speeds; what that misses is
+        made up by the next ones.
+        """
+        stamp = max(shaft.stamp for shaft in shafts)
+        turns = tuple(shaft.position + shaft.velocity * ((stamp - shaft.stamp) / SECOND) for shaft in shafts)
+        before, angles_then = self._turns, self._angles_then
+        dt = (stamp - self._stamp) / SECOND
+        if before is not None and dt <= 0:
+            return
+        self._turns, self._stamp, self._angles_then = turns, stamp, self._angles
         if before is None:
-            self._drive, self._angles_then = feedback, self._angles
             return
-        dt = (feedback.stamp - before.stamp) / SECOND
-        if dt <= 0:
-            return
-        self._drive, self._angles_then = feedback, self._angles
-        rolled = self._drivetrain.distance(feedback.position - before.position)
-        if abs(rolled) > self._config.max_speed * dt:
+        drivetrain = self._chassis.drivetrain
+        rolled = [drivetrain.distance(now - then) for now, then in zip(turns, before, strict=True)]
+        if max(map(abs, rolled)) > self._config.max_speed * dt:
             self._lose(dt)
             return
         front = (angles_then[0] + self._angles[0]) / 2
         rear = (angles_then[1] + self._angles[1]) / 2
-        self._speed = rolled / dt / self._steering.drive_speed(1.0, front, rear)
-        twist = self._steering.body_twist(self._speed, front, rear)
-        way = abs(self._speed) * dt
+        self._pace = self._chassis.pace(tuple(way / dt for way in rolled), front, rear)
+        twist = self._chassis.twist(self._pace, front, rear)
+        way = max(map(abs, self._pace)) * dt
         self._driven += way
         by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
         slipped = by_twist * (self._slip * way / dt**2) @ by_twist.T
@@ -165,9 +158,9 @@ class DeadReckoning:
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take a heading: the first ones find north, the others correct the yaw."""
         config = self._config.compass
-        if config is None or attitude.heading_disturbed or self._drive is None:
+        if config is None or attitude.heading_disturbed or self._turns is None:
             return
-        ahead = min(max((attitude.stamp - self._drive.stamp) / SECOND, -1.0), self._config.max_prediction)
+        ahead = min(max((attitude.stamp - self._stamp) / SECOND, -1.0), self._config.max_prediction)
         yaw = self._pose[2] + self._twist()[2] * ahead
         # The device counts clockwise from north.
         off = -attitude.heading - yaw
@@ -191,9 +184,9 @@ class DeadReckoning:
 
     def estimate(self, now: int) -> Estimate | None:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
-        if self._drive is None:
+        if self._turns is None:
             return None
-        age = max((now - self._drive.stamp) / SECOND, 0.0)
+        age = max((now - self._stamp) / SECOND, 0.0)
         twist = self._twist()
         x, y, yaw = integrate(self._pose, *twist, min(age, self._config.max_prediction))
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
@@ -212,13 +205,13 @@ class DeadReckoning:
         )
 
     def _twist(self) -> Vector:
-        return self._steering.body_twist(self._speed, *self._angles)
+        return self._chassis.twist(self._pace, *self._angles)
 
     def _lose(self, dt: float) -> None:
         """The drive counts from a new origin: what it did in between is not known."""
-        self._speed = 0.0
+        self._pace = (0.0,) * len(self._pace)
         lost = (self._config.max_speed * dt) ** 2
-        turned = lost * self._steering.curvature(0.4, -0.4) ** 2
+        turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
         self._covariance = self._covariance + np.diag((lost, lost, turned))
 
     def _align(self, off: float, config: CompassConfig) -> None:
@@ -235,8 +228,8 @@ class OdometryService:
     Args:
         reckoning: the filter.
         clock: time.
-        drive: motor feedback.
-        steering: servo feedback.
+        drives: feedback of every driven shaft.
+        steering: servo feedback, of a body that steers.
         compass: headings, if there is a compass.
         odometry: ``state/odometry``.
         pose: ``state/pose``.
@@ -250,8 +243,8 @@ class OdometryService:
         reckoning: DeadReckoning,
         clock: Clock,
         *,
-        drive: Subscription[DriveFeedback],
-        steering: Subscription[SteeringFeedback],
+        drives: Sequence[Subscription[DriveFeedback]],
+        steering: Subscription[SteeringFeedback] | None,
         compass: Subscription[Attitude] | None,
         odometry: Publisher[Odometry],
         pose: Publisher[Odometry],
@@ -259,13 +252,14 @@ class OdometryService:
     ) -> None:
         self._reckoning = reckoning
         self._clock = clock
-        self._drive = drive
+        self._drives = tuple(drives)
         self._steering = steering
         self._compass = compass
         self._odometry = odometry
         self._pose = pose
         self._rate = rate
-        self._seen: tuple[object, object, object] = (None, None, None)
+        self._reckoned: tuple[DriveFeedback, ...] = ()
+        self._seen: tuple[object, object] = (None, None)
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled; the first pose follows the first drive reading."""
@@ -282,15 +276,18 @@ class OdometryService:
                 self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
     def _take(self) -> None:
-        steering, drive = self._steering.latest, self._drive.latest
+        steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen
-        self._seen = (steering, drive, compass)
+        self._seen = (steering, compass)
         if steering is not None and steering is not before[0]:
             self._reckoning.observe_steering(steering)
-        if drive is not None and drive is not before[1]:
-            self._reckoning.observe_drive(drive)
-        if compass is not None and compass is not before[2]:
+        drives = tuple(reading for drive in self._drives if (reading := drive.latest) is not None)
+        known = self._reckoned or (None,) * len(drives)
+        if len(drives) == len(self._drives) and all(now is not then for now, then in zip(drives, known, strict=True)):
+            self._reckoned = drives
+            self._reckoning.observe_drive(*drives)
+        if compass is not None and compass is not before[1]:
             self._reckoning.observe_attitude(compass)
 
 

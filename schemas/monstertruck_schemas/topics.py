@@ -77,6 +77,9 @@ W = Writer
 SCAN: Final = Topic("sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, 0.35, foxglove="foxglove.LaserScan")
 COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, 0.3)
 DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.25)
+DRIVE_2: Final = Topic("sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, 0.25)
+DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, 0.25)
+DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, 0.25)
 STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.3)
 BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
 CAMERA: Final = Topic(
@@ -128,6 +131,9 @@ PLAN_STABILISER: Final = Topic(
 )
 
 CMD_DRIVE: Final = Topic("cmd/drive", DriveCommand, W.GATE, "Command sent to the drive controller", 50, 0.1)
+CMD_DRIVE_2: Final = Topic("cmd/drive_2", DriveCommand, W.GATE, "The same to the second driven shaft", 50, 0.1)
+CMD_DRIVE_3: Final = Topic("cmd/drive_3", DriveCommand, W.GATE, "The same to the third driven shaft", 50, 0.1)
+CMD_DRIVE_4: Final = Topic("cmd/drive_4", DriveCommand, W.GATE, "The same to the fourth driven shaft", 50, 0.1)
 CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command sent to the servos", 50, 0.1)
 
 HEALTH: Final = Topic("health/services", HealthTable, W.DAEMON, "Every service's state", 1, 3.0, retained=True)
@@ -147,6 +153,10 @@ REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off
 TOPICS: Final[tuple[Topic[Message], ...]] = tuple(
     value for value in list(globals().values()) if isinstance(value, Topic)
 )
+DRIVES: Final = (DRIVE, DRIVE_2, DRIVE_3, DRIVE_4)
+"""Feedback of the driven shafts in their order; most robots have the first one only."""
+CMD_DRIVES: Final = (CMD_DRIVE, CMD_DRIVE_2, CMD_DRIVE_3, CMD_DRIVE_4)
+"""Their commands."""
 BY_NAME: Final[dict[str, Topic[Message]]] = {topic.name: topic for topic in TOPICS}
 
 

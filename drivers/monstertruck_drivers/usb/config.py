@@ -74,7 +74,17 @@ class UsbConfig(Schema):
     """Seconds a returned hub may stay empty until its devices count as unplugged"""
     stagger: Seconds = 0.3
     """Seconds between the starts of two devices of one hub"""
-    start_order: tuple[str, ...] = ("drive", "steering", "compass", "lidar", "stabiliser", "camera")
+    start_order: tuple[str, ...] = (
+        "drive",
+        "drive_2",
+        "drive_3",
+        "drive_4",
+        "steering",
+        "compass",
+        "lidar",
+        "stabiliser",
+        "camera",
+    )
     """Roles in the order they start behind a returned hub: what stops the truck first, what loads the bus last"""
     over_current_hold: Seconds = 10.0
     """Seconds a device is not started after its port reported over-current"""

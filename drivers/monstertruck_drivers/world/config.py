@@ -8,7 +8,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_kinematics.chassis import Chassis, build_chassis
+from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_schemas.base import Pose2D, Schema
+from monstertruck_schemas.body import BodyConfig, TruckBody
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -66,9 +69,20 @@ class TruckConfig(Schema):
 
     Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (gravity on a
     side slope included); the body covers less ground than the wheels roll by ``slip_per_newton`` times the pull.
-    Both carry a slow random part.
+    Both carry a slow random part. A wheel that is not steered rolls along its own axis.
     """
 
+    body: BodyConfig = TruckBody()
+    """Kind of robot, as the daemon's own ``body``"""
+    dynamics: Literal["kinematic", "single_track"] = "kinematic"
+    """How tyres hold a body with steered axles: by their slip angles, or with the inertia of the single-track model
+    (linear tyres, blended into rolling below 0.15 m/s), whose stiffnesses then replace the slip angles."""
+    yaw_inertia: Positive = 0.20
+    """kg m^2; of the single-track model"""
+    front_stiffness: Positive = 120.0
+    """Of the front axle's tyres, N/rad; of the single-track model"""
+    rear_stiffness: Positive = 120.0
+    """Of the rear axle's tyres, N/rad; of the single-track model"""
     wheelbase: Positive = 0.32
     """m."""
     track: Positive = 0.26
@@ -98,6 +112,21 @@ class TruckConfig(Schema):
     front_servo: ServoConfig = ServoConfig(channel=1)
     rear_servo: ServoConfig = ServoConfig(channel=0)
     motor: MotorConfig = MotorConfig()
+    """Each of the motors"""
+
+    def chassis(self) -> Chassis:
+        """True kinematics.
+
+        Raises:
+            KinematicsError: dimensions no robot can have.
+        """
+        return build_chassis(
+            wheelbase=self.wheelbase,
+            track=self.track,
+            drivetrain=DriveTrain(self.motor.ratio, self.wheel_radius),
+            polynomials=self.steering,
+            **self.body.model_dump(),
+        )
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Self:
@@ -108,6 +137,9 @@ class TruckConfig(Schema):
             )
         if self.front_servo.channel == self.rear_servo.channel:
             raise ValueError(f"front_servo and rear_servo share channel {self.front_servo.channel}")
+        chassis = self.chassis()
+        if self.dynamics == "single_track" and (chassis.linkage is None or chassis.freedom == "parallel"):
+            raise ValueError(f"dynamics single_track: body {self.body.kind} has no axles that steer it into a curve")
         return self
 
 

@@ -107,24 +107,24 @@ class SimulatedView:
 
 
 class SimulatedMotor:
-    """``MotorPlant``: the shaft in the controller's own sign."""
+    """``MotorPlant``: one of the driven shafts in the controller's own sign."""
 
-    def __init__(self, plant: TruckPlant, config: MotorConfig, seed: int | None) -> None:
-        self._plant, self._config = plant, config
-        self._noise = WhiteNoise(seed, CURRENT) if seed is not None else None
+    def __init__(self, plant: TruckPlant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
+        self._plant, self._config, self._shaft = plant, config, shaft
+        self._noise = WhiteNoise(seed, CURRENT, 1 + shaft) if seed is not None else None
         self._sign = -1.0 if config.inverted else 1.0
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
         """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
         self._plant.advance(time_ns)
-        self._plant.shaft.command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
+        self._plant.shafts[self._shaft].command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
 
     def reading(self, time_ns: int) -> MotorReading:
         """State at ``time_ns``."""
         self._plant.advance(time_ns)
-        shaft, current = self._plant.shaft, self._plant.current
+        shaft, current = self._plant.shafts[self._shaft], self._plant.currents[self._shaft]
         if self._noise is not None:
-            current += self._config.current_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[0]
+            current += self._config.current_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[self._shaft]
         return MotorReading(
             turns=self._sign * shaft.turns,
             rpm=self._sign * shaft.rpm,

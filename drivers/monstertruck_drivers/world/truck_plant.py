@@ -1,4 +1,4 @@
-"""The truck's physics: motor, clutch, steering, tyres, body, battery; integrated lazily on a fixed grid.
+"""The robot's physics: motors, clutches, steering, tyres, body, battery; integrated lazily on a fixed grid.
 
 Steps are 5 ms: a quarter of the fastest lag (which is integrated exactly anyway), a quarter of a servo frame, and at
 0.22 m/s a body point moves less than 2 mm a step, so testing the footprint after each step misses no cell. A step
@@ -18,9 +18,9 @@ from monstertruck_drivers.world.actuators import RPM, Servo, Shaft
 from monstertruck_drivers.world.battery import Battery
 from monstertruck_drivers.world.config import BatteryConfig, TruckConfig
 from monstertruck_drivers.world.noise import SLIP, SlowNoise
+from monstertruck_kinematics.chassis import Chassis, TruckChassis
+from monstertruck_kinematics.dynamics import SingleTrack
 from monstertruck_kinematics.motion import integrate
-from monstertruck_kinematics.polynomials import SteeringPolynomials
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 
 STEP_NS = 5_000_000
 SERVO_FRAME_NS = 20_000_000
@@ -66,7 +66,9 @@ class TruthState:
 
 
 class TruckPlant:
-    """One truck in its surroundings.
+    """One robot in its surroundings: by default the truck, else the body that ``config`` names.
+
+    Every driven shaft has its own motor, clutch and share of the mass.
 
     Args:
         config: true parameters.
@@ -88,22 +90,23 @@ class TruckPlant:
     ) -> None:
         self.config = config
         self.battery = Battery(battery)
-        self.shaft = Shaft(config.motor)
-        self.current = 0.0
+        self._chassis = config.chassis()
+        count = len(self._chassis.shafts)
+        self.shafts = tuple(Shaft(config.motor) for _ in range(count))
+        self.currents = [0.0] * count
         self.pulses: PulseSource | None = None
-        self._kinematics = FourWheelSteering(config.wheelbase, config.track)
-        self._drivetrain = DriveTrain(config.motor.ratio, config.wheel_radius)
         self._front, self._rear = Servo(config.front_servo), Servo(config.rear_servo)
-        self._steering = _Steering(SteeringPolynomials.named(config.steering), self._kinematics)
+        self._steering = _Steering(self._chassis)
+        self._tyres = _tyres(config, self._chassis)
         self._contact, self._tilt = contact, tilt
-        self._noise = SlowNoise(seed, SLIP, 3, _SLIP_PERIOD_NS) if seed is not None else None
+        self._noise = SlowNoise(seed, SLIP, 2 + count, _SLIP_PERIOD_NS) if seed is not None else None
         self._start_ns: int | None = None
         self._elapsed = 0
         self._pose = start
         self._attitude = tilt(0, *start)
-        self._wheel_speed = 0.0
-        self._pull = 0.0
-        self._slipping = False
+        self._wheel_speeds = [0.0] * count
+        self._pulls = [0.0] * count
+        self._slipping = [False] * count
         self._stuck_at: Pose | None = None
         self._twist = (0.0, 0.0, 0.0)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_HISTORY)
@@ -112,6 +115,11 @@ class TruckPlant:
     def attitude(self) -> tuple[float, float]:
         """Pitch and roll."""
         return self._attitude
+
+    @property
+    def current(self) -> float:
+        """Of all motors together, A."""
+        return sum(self.currents)
 
     @property
     def yaw(self) -> float:
@@ -151,7 +159,7 @@ class TruckPlant:
             pitch=self._attitude[0],
             roll=self._attitude[1],
             stuck=self._stuck_at is not None,
-            clutch_slipping=self._slipping,
+            clutch_slipping=any(self._slipping),
             charge=self.battery.charge,
             supply_v=self.battery.volts,
             motor_current=self.current,
@@ -179,12 +187,14 @@ class TruckPlant:
 
     def _step(self, dt: float) -> None:
         self._steer(dt)
-        self.shaft.step(dt)
-        self._drive(dt)
+        for i, shaft in enumerate(self.shafts):
+            shaft.step(dt)
+            self._drive(i, dt)
         self._move(dt)
-        winding_w = self.current**2 * self.config.motor.winding_resistance
-        shaft_w = abs(self.current * self.config.motor.torque_constant * self.shaft.rpm * RPM)
-        self.battery.step(dt, winding_w + shaft_w)
+        motor, watts = self.config.motor, 0.0
+        for shaft, current in zip(self.shafts, self.currents, strict=True):
+            watts += current**2 * motor.winding_resistance + abs(current * motor.torque_constant * shaft.rpm * RPM)
+        self.battery.step(dt, watts)
 
     def _steer(self, dt: float) -> None:
         if self.pulses is not None and self._elapsed % SERVO_FRAME_NS == 0:
@@ -195,45 +205,53 @@ class TruckPlant:
         self._rear.step(dt)
         self._steering.follow(self._front.angle, self._rear.angle)
 
-    def _drive(self, dt: float) -> None:
-        """Wheels follow the motor as fast as the clutch can pull mass, slope and rolling resistance."""
-        config, motor = self.config, self.config.motor
-        wanted = self._drivetrain.speed(self.shaft.rpm * RPM)
-        weight = config.mass * GRAVITY
-        rolling = config.rolling_resistance * weight * min(max(self._wheel_speed / 0.01, -1.0), 1.0)
+    def _drive(self, i: int, dt: float) -> None:
+        """Wheels follow their motor as fast as the clutch can pull mass, slope and rolling resistance."""
+        config, motor, shaft, speed = self.config, self.config.motor, self.shafts[i], self._wheel_speeds[i]
+        wanted = self._chassis.drivetrain.speed(shaft.rpm * RPM)
+        mass = config.mass / len(self.shafts)
+        weight = mass * GRAVITY
+        rolling = config.rolling_resistance * weight * min(max(speed / 0.01, -1.0), 1.0)
         resistance = rolling - weight * sin(self._attitude[0])
-        followed = (wanted - self._wheel_speed) * (1.0 - exp(-dt / motor.drivetrain_lag))
-        pull = config.mass * followed / dt + resistance
-        if self._stuck_at is not None and self._wheel_speed == 0.0 and wanted != 0.0:
+        followed = (wanted - speed) * (1.0 - exp(-dt / motor.drivetrain_lag))
+        pull = mass * followed / dt + resistance
+        if self._stuck_at is not None and speed == 0.0 and wanted != 0.0:
             pull = copysign(2 * motor.clutch_force, wanted)  # wound up until the clutch gives
-        self._slipping = abs(pull) > motor.clutch_force
-        if self._slipping:
+        self._slipping[i] = abs(pull) > motor.clutch_force
+        if self._slipping[i]:
             pull = copysign(motor.clutch_force, pull)
-            change = (pull - resistance) * dt / config.mass
+            change = (pull - resistance) * dt / mass
             followed = copysign(min(abs(change), abs(followed)), followed) if change * followed > 0 else change
-        self._wheel_speed += followed
-        self._pull = pull
-        inertia = motor.rotor_inertia * self.shaft.slope * RPM
+        self._wheel_speeds[i] = speed + followed
+        self._pulls[i] = pull
+        inertia = motor.rotor_inertia * shaft.slope * RPM
         load = pull * config.wheel_radius / (motor.ratio * motor.efficiency)
-        idle = copysign(motor.idle_current, self.shaft.rpm) if self.shaft.rpm else 0.0
-        self.current = idle + (load + inertia) / motor.torque_constant if self.shaft.powered else 0.0
+        idle = copysign(motor.idle_current, shaft.rpm) if shaft.rpm else 0.0
+        self.currents[i] = idle + (load + inertia) / motor.torque_constant if shaft.powered else 0.0
 
     def _move(self, dt: float) -> None:
         config = self.config
-        front_noise, rear_noise, slip_noise = self._noise.at(self._elapsed) if self._noise else (0.0, 0.0, 0.0)
+        noise = self._noise.at(self._elapsed) if self._noise else [0.0] * (2 + len(self.shafts))
+        front_noise, rear_noise, *slip_noises = noise
         vx, _, wz = self._twist
-        sense = copysign(1.0, self._wheel_speed)
-        lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * sense
+        lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * copysign(1.0, self._wheel_speeds[0])
+        if self._tyres is not None:
+            lateral = 0.0
         front = self._steering.front - config.front_slip_angle * lateral + config.slip_angle_noise * front_noise
         rear = self._steering.rear - config.rear_slip_angle * lateral + config.slip_angle_noise * rear_noise
-        slip = config.slip_per_newton * self._pull * sense + config.slip_noise * slip_noise
-        speed = self._wheel_speed * self._steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0])
-        twist = self._kinematics.body_twist(speed, front, rear)
+        pace = []
+        for wheel, pull, slip_noise in zip(self._wheel_speeds, self._pulls, slip_noises, strict=True):
+            slip = config.slip_per_newton * pull * copysign(1.0, wheel) + config.slip_noise * slip_noise
+            pace.append(wheel * self._steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0]))
+        twist = self._chassis.twist(tuple(pace), front, rear)
+        if self._tyres is not None:
+            speed = copysign(hypot(twist[0], twist[1]), twist[0])
+            twist = self._tyres.step(self._twist, speed, front, rear if self._chassis.freedom == "both" else 0.0, dt)
         pose = integrate(self._pose, *twist, dt)
         depth = self._contact(*pose) if pose != self._pose else 0.0
         if depth > 0.0 and depth >= self._contact(*self._pose):
             self._stuck_at = self._pose
-            self._wheel_speed = 0.0
+            self._wheel_speeds = [0.0] * len(self.shafts)
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
@@ -245,11 +263,11 @@ class TruckPlant:
 class _Steering:
     """Axle angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
 
-    One motor drives four wheels through open differentials: it turns with the mean of the four wheel speeds.
+    The truck's one motor drives four wheels through open differentials: it turns with the mean of their speeds.
     """
 
-    def __init__(self, linkage: SteeringPolynomials, kinematics: FourWheelSteering) -> None:
-        self._linkage, self._kinematics = linkage, kinematics
+    def __init__(self, chassis: Chassis) -> None:
+        self._chassis = chassis
         self._servos: tuple[float, float] | None = None
         self.follow(0.0, 0.0)
 
@@ -257,5 +275,13 @@ class _Steering:
         if (front_servo, rear_servo) == self._servos:
             return
         self._servos = (front_servo, rear_servo)
-        self.front, self.rear = self._linkage.axles_from_servo(front_servo, rear_servo)
-        self.body_per_wheel = 4.0 / sum(self._kinematics.wheel_speeds(1.0, self.front, self.rear))
+        self.front, self.rear = self._chassis.axles(front_servo, rear_servo)
+        self.body_per_wheel = 1.0
+        if isinstance(self._chassis, TruckChassis):
+            self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, self.front, self.rear))
+
+
+def _tyres(config: TruckConfig, chassis: Chassis) -> SingleTrack | None:
+    if config.dynamics == "kinematic":
+        return None
+    return SingleTrack(chassis.bicycle, config.mass, config.yaw_inertia, config.front_stiffness, config.rear_stiffness)

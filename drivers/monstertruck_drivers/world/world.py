@@ -61,9 +61,16 @@ class World:
         self._lidar = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
         self.view: ViewSource = SimulatedView(self._plant, self._cast, config.camera)
-        self.motor: MotorPlant = SimulatedMotor(self._plant, config.truck.motor, noise_seed)
+        self.motors: tuple[MotorPlant, ...] = tuple(
+            SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
+        )
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
+
+    @property
+    def motor(self) -> MotorPlant:
+        """The first driven shaft, of the truck the only one."""
+        return self.motors[0]
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:

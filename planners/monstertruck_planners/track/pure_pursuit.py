@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
 
@@ -14,6 +14,9 @@ from monstertruck_schemas.reasons import Reason
 
 Positive = Annotated[float, Field(gt=0)]
 
+STEERING_MODES: Final = {"front": (0.1, 0.0), "counter": (0.1, -0.1), "crab": (0.1, 0.1)}
+"""An example of each way of steering: front and rear axle angle, rad."""
+
 
 class PurePursuitConfig(Schema):
     """Pure pursuit and the tracker around it."""
@@ -23,8 +26,8 @@ class PurePursuitConfig(Schema):
     """Requests per second."""
     lease: Annotated[float, Field(gt=0, le=2)] = 0.25
     """Lease of each request, s."""
-    steering: Literal["front", "counter"] = "counter"
-    """Steered axles: the front one alone, or both by opposite angles."""
+    steering: Literal["front", "counter", "crab"] = "counter"
+    """Steered axles: the front one alone, or both by opposite or (keeping the heading) equal angles."""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.4
     """Greatest axle angle, rad."""
     speed: Positive = 0.18
@@ -151,6 +154,10 @@ class PurePursuit:
         c, sn = math.cos(yaw), math.sin(yaw)
         dx, dy = goal.point[0] - x, goal.point[1] - y
         ahead, aside = c * dx + sn * dy, c * dy - sn * dx
+        if self._config.steering == "crab":
+            bearing = math.atan2(run.direction * aside, run.direction * ahead)
+            angle = min(max(bearing, -self._config.angle), self._config.angle)
+            return angle, angle
         arm = self._steering.l_r
         if self._config.steering == "counter":
             # The turning centre lies beside the base point: the arc is tangent to the truck there.

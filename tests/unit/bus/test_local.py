@@ -44,8 +44,8 @@ def test_commands_requests_and_events_have_no_plain_write_end(bus: Bus, topic):
 
 
 def test_actuators_are_handed_out_exactly_once(bus: Bus):
-    drive, steering = bus.actuators()
-    assert (drive.next_seq(), drive.next_seq(), steering.next_seq()) == (0, 1, 0)
+    (drive, second), steering = bus.actuators(2)
+    assert (drive.next_seq(), drive.next_seq(), second.next_seq(), steering.next_seq()) == (0, 1, 0, 0)
     with pytest.raises(RuntimeError, match="already handed out"):
         bus.actuators()
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
+from monstertruck_kinematics.chassis import build_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
@@ -12,6 +13,7 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, Stee
 STEERING = FourWheelSteering()
 DRIVETRAIN = DriveTrain()
 LINKAGE = SteeringPolynomials()
+CHASSIS = build_chassis("truck", drivetrain=DRIVETRAIN)
 
 
 def drive_feedback(now, position, velocity=0.0):
@@ -33,9 +35,7 @@ class Truck:
     """Truth, and a filter fed with 20 Hz drive readings and servo angles."""
 
     def __init__(self, compass_error=None, **config):
-        self.reckoning = DeadReckoning(
-            OdometryConfig(**config), steering=STEERING, drivetrain=DRIVETRAIN, linkage=LINKAGE
-        )
+        self.reckoning = DeadReckoning(OdometryConfig(**config), CHASSIS)
         self.now = SECOND
         self.pose = (0.0, 0.0, 0.0)
         self.motor = 1000.0

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.odometry import OdometryService
+from monstertruck_kinematics.chassis import build_chassis
 from monstertruck_runtime.clock import SECOND, run_virtual
 from tests.unit.estimation.kit import DRIVETRAIN, Truck, drive_feedback, heading, servo_feedback, spread
 
 
 def test_nothing_is_known_before_the_first_drive_reading():
     truck = Truck()
-    truck.reckoning._drive = None
+    truck.reckoning._turns = None
     assert truck.estimate is None
 
 
@@ -152,7 +153,7 @@ def test_without_a_compass_the_heading_drifts_with_it_it_stays_bounded():
     drifting = Truck(compass=None)
     held = Truck(compass_error=noisy(math.radians(0.5)))
     for truck in (drifting, held):
-        truck.reckoning._steering = type(truck.reckoning._steering)(wheelbase=0.34)  # a wrong wheelbase
+        truck.reckoning._chassis = build_chassis("truck", wheelbase=0.34, drivetrain=DRIVETRAIN)  # a wrong wheelbase
         lap(truck, laps=5)
     assert drifting.error()[1] > 0.3
     assert held.error()[1] < math.radians(5)
@@ -200,7 +201,7 @@ def test_a_sudden_turn_of_the_compass_alone_is_rejected():
 
 def test_headings_before_the_first_drive_reading_are_ignored():
     truck = Truck()
-    truck.reckoning._drive = None
+    truck.reckoning._turns = None
     truck.reckoning.observe_attitude(heading(truck.now, 0.1))
     assert truck.reckoning._aligning == []
 
@@ -248,10 +249,10 @@ def test_poses_go_out_50_times_a_second_in_odom_and_map():
 
     async def main(clock):
         truck = Truck()
-        truck.reckoning._drive = None
+        truck.reckoning._turns = None
         drive, steering, compass = Inbox(), Inbox(), Inbox()
         service = OdometryService(
-            truck.reckoning, clock, drive=drive, steering=steering, compass=compass, odometry=odometry, pose=pose
+            truck.reckoning, clock, drives=[drive], steering=steering, compass=compass, odometry=odometry, pose=pose
         )
         task = asyncio.create_task(service.run(lambda: None))
         await clock.sleep(0.2)
@@ -289,7 +290,7 @@ def test_a_truck_without_a_compass_publishes_too():
         service = OdometryService(
             Truck(compass=None).reckoning,
             clock,
-            drive=drive,
+            drives=[drive],
             steering=steering,
             compass=None,
             odometry=odometry,

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from monstertruck_kinematics.chassis import build_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
@@ -29,14 +30,13 @@ SENSORS = ("scan", "attitude", "drive", "steering", "battery")
 DRIVETRAIN = DriveTrain()
 LINKAGE = SteeringPolynomials()
 STEERING = FourWheelSteering()
+CHASSIS = build_chassis("truck", drivetrain=DRIVETRAIN)
 
 
-def make_gate(latched=False, nonce=NONCE, **config):
+def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, **config):
     return Gate(
         GateConfig(**config),
-        steering=STEERING,
-        drivetrain=DRIVETRAIN,
-        linkage=LINKAGE,
+        chassis=chassis,
         footprint=Footprint(),
         lidar=(0.14, 0.0, 0.0),
         nonce=nonce,
@@ -153,7 +153,7 @@ class Rig:
 
     def _obey(self):
         quick = self.out.action is DriveAction.QUICK_STOP
-        target = self.out.speed if self.out.action is DriveAction.RUN else 0.0
+        target = self.out.speeds[0] if self.out.action is DriveAction.RUN else 0.0
         step = (self.config.quick_deceleration if quick else self.config.deceleration) * 0.02
         self.speed += min(max(target - self.speed, -step), step)
         self.travelled += abs(self.speed) * 0.02

@@ -23,7 +23,7 @@ def test_non_finite_requests_are_refused_by_name(field, value):
     event = rig.told(Reason.NOT_FINITE)[0]
     assert f"{field} is {value}" in event.text
     assert rig.out.mode is GateMode.DRIVING
-    assert rig.out.speed == pytest.approx(0.2)
+    assert rig.out.speeds[0] == pytest.approx(0.2)
 
 
 def test_non_finite_requests_do_not_renew_the_lease():
@@ -218,7 +218,7 @@ def test_anybody_may_stop():
         rig = Rig().driving()
         assert rig.order(Order.STOP, source="cy", role=role, nonce="any") is Reason.OK
         rig.tick()
-        assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+        assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
         assert "cy" in rig.told(Reason.STOPPED)[0].text
 
 

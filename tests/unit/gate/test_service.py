@@ -55,7 +55,7 @@ class Bench:
         self.latch = latch or MemoryLatch()
         self.requests, self.wishes = Inbox(), Inbox()
         self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
-        self.out = GateOutputs(Outbox(), Outbox(), Outbox())
+        self.out = GateOutputs((Outbox(),), Outbox(), Outbox())
         self.events = []
         self.readies = 0
         inputs = GateInputs(
@@ -63,7 +63,7 @@ class Bench:
             self.wishes,
             self.scan,
             self.attitude,
-            self.drive,
+            (self.drive,),
             self.steering,
             self.battery,
             self.health,
@@ -142,11 +142,11 @@ def test_ticks_stay_on_an_absolute_grid():
         await bench.clock.sleep(1.0)
 
     bench = on_bench(scenario)
-    stamps = np.array([message.stamp for message in bench.out.drive.messages])[:-1]  # the last one is the farewell
+    stamps = np.array([message.stamp for message in bench.out.drives[0].messages])[:-1]  # the last one is the farewell
     assert len(stamps) == pytest.approx(56, abs=1)
     assert np.abs((stamps - stamps[0]) - np.arange(len(stamps)) * SECOND // 50).max() < 1000  # ns: no drift
-    assert [m.seq for m in bench.out.drive.messages] == list(range(len(bench.out.drive.messages)))
-    assert len(bench.out.steering.messages) == len(bench.out.drive.messages)
+    assert [m.seq for m in bench.out.drives[0].messages] == list(range(len(bench.out.drives[0].messages)))
+    assert len(bench.out.steering.messages) == len(bench.out.drives[0].messages)
     assert bench.readies == len(stamps)
     lateness = bench.service.lateness()
     assert lateness.ticks == len(stamps)
@@ -160,7 +160,7 @@ def test_a_stall_skips_ticks_but_keeps_the_grid():
         await bench.clock.sleep(0.2)
 
     bench = on_bench(scenario)
-    stamps = np.array([message.stamp for message in bench.out.drive.messages])[:-1]
+    stamps = np.array([message.stamp for message in bench.out.drives[0].messages])[:-1]
     assert np.diff(stamps).max() > 0.09 * SECOND
     offsets = (stamps - stamps[0]) % (SECOND // 50)
     late = np.minimum(offsets, SECOND // 50 - offsets) > 1000
@@ -179,8 +179,8 @@ def test_requests_of_both_kinds_reach_the_gate():
         bench.wish(bench.requests, Role.GAMEPAD)
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.holder == "gamepad"
-        assert bench.out.drive.last.speed > 0
-        assert bench.out.drive.last.action is DriveAction.RUN
+        assert bench.out.drives[0].last.speed > 0
+        assert bench.out.drives[0].last.action is DriveAction.RUN
         assert bench.out.steering.last.front > 0
         assert bench.out.steering.last.front_servo > bench.out.steering.last.front
 
@@ -232,11 +232,11 @@ def test_the_last_commands_are_neutral():
         await bench.clock.sleep(0.05)
         bench.wish(bench.requests, Role.GAMEPAD)
         await bench.clock.sleep(0.1)
-        assert bench.out.drive.last.speed > 0
+        assert bench.out.drives[0].last.speed > 0
 
     bench = on_bench(scenario)
-    assert bench.out.drive.last.action is DriveAction.QUICK_STOP
-    assert bench.out.drive.last.speed == 0
+    assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+    assert bench.out.drives[0].last.speed == 0
     assert Reason.SHUTDOWN in bench.out.state.last.reasons
 
 
@@ -247,10 +247,10 @@ def test_shutting_down_stops_at_once_and_for_good():
         bench.wish(bench.requests, Role.GAMEPAD)
         await bench.clock.sleep(0.05)
         bench.service.shut_down()
-        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
         bench.wish(bench.requests, Role.GAMEPAD)
         await bench.clock.sleep(0.2)
-        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
 
     on_bench(scenario)
 
@@ -261,7 +261,7 @@ def test_a_bug_ends_the_service_with_neutral_commands():
         bench.scan.latest = "not a scan"
         with pytest.raises(ExceptionGroup):
             await bench.service.run(bench.ready)
-        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
 
     run_virtual(main)
 
@@ -285,7 +285,7 @@ def test_an_emergency_stop_survives_a_restart(tmp_path):
 
     async def restarted(bench):
         assert bench.out.state.last.mode is GateMode.ESTOPPED
-        assert bench.out.drive.last.action is DriveAction.QUICK_STOP
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
         bench.order(Order.RESET)
         await asyncio.sleep(0.05)
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -14,7 +15,7 @@ from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Gate
-from tests.unit.gate.rig import DRIVETRAIN, STEERING, TICK, Rig
+from tests.unit.gate.rig import CHASSIS, DRIVETRAIN, STEERING, TICK, Rig
 
 
 def seconds(ticks):
@@ -25,20 +26,20 @@ def test_starts_disarmed_and_powerless():
     out = Rig().tick()
     assert out.mode is GateMode.DISARMED
     assert out.action is DriveAction.DISABLE
-    assert (out.speed, out.front, out.rear, out.speed_limit) == (0, 0, 0, 0)
+    assert (out.speeds[0], out.front, out.rear, out.speed_limit) == (0, 0, 0, 0)
     assert out.reasons == (Reason.DISARMED,)
 
 
 def test_arm_drive_and_let_go():
     rig = Rig().armed()
     assert rig.out.action is DriveAction.RUN
-    assert rig.out.speed == 0
+    assert rig.out.speeds[0] == 0
     rig.driver = {"speed": 0.2}
     rig.tick(40)
     assert rig.out.mode is GateMode.DRIVING
     assert (rig.out.holder, rig.out.role) == ("ann", Role.GAMEPAD)
-    assert rig.out.speed == pytest.approx(0.2)
-    assert rig.out.motor_velocity == pytest.approx(DRIVETRAIN.motor_rate(0.2))
+    assert rig.out.speeds[0] == pytest.approx(0.2)
+    assert rig.out.motor_velocities[0] == pytest.approx(DRIVETRAIN.motor_rate(0.2))
     assert rig.out.lease_left == pytest.approx(0.25)
     assert rig.out.last_seq == rig._seq
     assert rig.out.stopping_distance == pytest.approx(0.2 * 0.08 + 0.04 / 2.0)
@@ -53,7 +54,7 @@ def test_a_lapsed_lease_stops_within_300_ms_and_stands_within_300_more():
         rig.tick()
         ticks += 1
     assert seconds(ticks) <= 0.3
-    assert (rig.out.action, rig.out.speed) == (DriveAction.RUN, 0.0)
+    assert (rig.out.action, rig.out.speeds[0]) == (DriveAction.RUN, 0.0)
     assert rig.out.mode is GateMode.STOPPING
     assert rig.out.reasons == (Reason.LEASE_EXPIRED,)
     assert rig.out.speed_limit == 0
@@ -91,9 +92,9 @@ def test_a_request_while_stopping_waits_for_standstill():
         rig.tick()
     rig.driver = {"speed": 0.2}
     rig.tick()
-    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
     while rig.out.mode is GateMode.STOPPING:
-        assert rig.out.speed == 0.0
+        assert rig.out.speeds[0] == 0.0
         rig.tick()
     rig.tick()
     assert rig.out.mode is GateMode.DRIVING
@@ -136,7 +137,7 @@ def test_clipping_keeps_the_curvature():
     rig = Rig().driving(speed=0.5, front=0.6, rear=-0.1, ticks=80)
     assert STEERING.curvature(rig.out.front, rig.out.rear) == pytest.approx(STEERING.curvature(0.6, -0.1))
     assert max(abs(rig.out.front), abs(rig.out.rear)) <= 0.436 + 1e-12
-    assert rig.out.speed == pytest.approx(0.21)  # of the wheels
+    assert rig.out.speeds[0] == pytest.approx(0.21)  # of the wheels
     assert Reason.CLIPPED in rig.out.reasons
     assert len(rig.told(Reason.CLIPPED)) == 1
     rig.driver = {"speed": 0.1, "front": 9.0, "rear": -9.0}
@@ -145,14 +146,14 @@ def test_clipping_keeps_the_curvature():
 
 
 def test_crab_goes_as_fast_as_straight_and_a_curve_as_fast_as_the_wheels_may():
-    assert Rig().driving(speed=0.21, front=0.3, rear=0.3).out.speed == pytest.approx(0.21)
+    assert Rig().driving(speed=0.21, front=0.3, rear=0.3).out.speeds[0] == pytest.approx(0.21)
     rig = Rig().driving(speed=0.21, front=0.4, rear=-0.4, ticks=80)
-    assert rig.out.speed == pytest.approx(0.21)
+    assert rig.out.speeds[0] == pytest.approx(0.21)
     assert rig.gate._motion.speed < 0.2
 
 
 def test_reversing_has_its_own_limit():
-    assert Rig().driving(speed=-0.2, ticks=60).out.speed == pytest.approx(-0.15)
+    assert Rig().driving(speed=-0.2, ticks=60).out.speeds[0] == pytest.approx(-0.15)
 
 
 def test_servo_angles_belong_to_the_axle_angles():
@@ -241,7 +242,7 @@ def test_disarm_stops_first():
     rig = Rig().driving()
     assert rig.order(Order.DISARM) is Reason.OK
     rig.tick()
-    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
     rig.order(Order.DISARM)  # again while stopping
     rig.tick(20)
     assert rig.out.mode is GateMode.DISARMED
@@ -277,7 +278,7 @@ def test_arming_while_stopping_is_refused():
 def test_shutdown_is_a_quick_stop_for_good():
     rig = Rig().driving()
     out = rig.gate.neutral(rig.now)
-    assert (out.action, out.speed, out.motor_velocity) == (DriveAction.QUICK_STOP, 0.0, 0.0)
+    assert (out.action, out.speeds[0], out.motor_velocities[0]) == (DriveAction.QUICK_STOP, 0.0, 0.0)
     assert out.mode is GateMode.DISARMED
     assert Reason.SHUTDOWN in out.reasons
     assert out.events[-1].reason is Reason.DISARMED
@@ -336,9 +337,7 @@ def test_the_linkage_must_reach_the_limit():
     with pytest.raises(ConfigError, match=r"gate\.angle .* 0\.3927 rad"):
         Gate(
             GateConfig(),
-            steering=STEERING,
-            drivetrain=DRIVETRAIN,
-            linkage=SteeringPolynomials(short, short),
+            chassis=replace(CHASSIS, linkage=SteeringPolynomials(short, short)),
             footprint=Footprint(),
             lidar=(0.14, 0.0, 0.0),
             nonce="n",

@@ -27,7 +27,7 @@ def test_a_silent_sensor_stops_within_300_ms_of_its_last_sample(sensor):
     while rig.out.mode is GateMode.DRIVING:
         rig.tick()
     assert rig.now - last <= 0.3 * SECOND
-    assert rig.out.speed == 0.0
+    assert rig.out.speeds[0] == 0.0
     urgent = sensor == "drive"
     assert rig.out.action is (DriveAction.QUICK_STOP if urgent else DriveAction.RUN)
     assert rig.out.reasons == (STALE[sensor],)
@@ -117,26 +117,26 @@ def test_tilt_slows_then_stops_with_hysteresis():
     rig.tilt = 0.22
     rig.tick(20)
     assert rig.out.reasons == (Reason.TILT_SLOW,)
-    assert rig.out.speed == pytest.approx(0.08)
+    assert rig.out.speeds[0] == pytest.approx(0.08)
     assert rig.out.speed_limit == pytest.approx(0.08)
     assert rig.told(Reason.TILT_SLOW)[0].values["tilt"] == pytest.approx(0.22)
     rig.tilt = 0.19
     rig.tick(20)
-    assert rig.out.speed == pytest.approx(0.08)
+    assert rig.out.speeds[0] == pytest.approx(0.08)
     rig.tilt = 0.17
     rig.tick(20)
-    assert rig.out.speed == pytest.approx(0.2)
+    assert rig.out.speeds[0] == pytest.approx(0.2)
     rig.tilt = 0.36
     rig.tick()
-    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
     assert rig.out.reasons == (Reason.TILT_STOP,)
     rig.tilt = 0.33
     rig.tick(20)
     assert rig.out.mode is GateMode.ARMED
-    assert rig.out.speed == 0.0
+    assert rig.out.speeds[0] == 0.0
     rig.tilt = 0.30
     rig.tick(30)
-    assert rig.out.speed == pytest.approx(0.08)
+    assert rig.out.speeds[0] == pytest.approx(0.08)
 
 
 def test_roll_and_pitch_add_up():
@@ -155,11 +155,11 @@ def test_a_low_battery_slows_a_critical_one_stops_and_disarms():
     rig = Rig().driving()
     rig.level = BatteryLevel.LOW
     rig.tick(20)
-    assert rig.out.speed == pytest.approx(0.1)
+    assert rig.out.speeds[0] == pytest.approx(0.1)
     assert rig.out.reasons == (Reason.BATTERY_LOW,)
     rig.level = BatteryLevel.CRITICAL
     rig.tick()
-    assert (rig.out.mode, rig.out.speed) == (GateMode.STOPPING, 0.0)
+    assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
     rig.tick(20)
     assert rig.out.mode is GateMode.DISARMED
     rig.level = BatteryLevel.CRITICAL
@@ -178,7 +178,7 @@ def test_a_battery_nobody_measures_any_more_slows():
     assert rig.out.reasons == ()
     rig.tick(30)
     assert rig.out.reasons == (Reason.BATTERY_STALE,)
-    assert rig.out.speed == pytest.approx(0.1)
+    assert rig.out.speeds[0] == pytest.approx(0.1)
 
 
 def test_a_faulty_battery_sensor_counts_as_silence():
@@ -188,7 +188,7 @@ def test_a_faulty_battery_sensor_counts_as_silence():
         rig.gate.observe_battery(battery(rig.now, BatteryLevel.SENSOR_FAULT, None))
         rig.tick()
     assert rig.out.reasons == (Reason.BATTERY_STALE,)
-    assert rig.out.speed == 0.0
+    assert rig.out.speeds[0] == 0.0
 
 
 def test_a_truck_without_battery_monitor_drives():
@@ -274,7 +274,7 @@ def test_a_sudden_obstacle_is_a_quick_stop_in_the_same_tick():
     rig = Rig().driving()
     rig.obstacles = wall(0.27)
     rig.tick()
-    assert (rig.out.action, rig.out.speed) == (DriveAction.QUICK_STOP, 0.0)
+    assert (rig.out.action, rig.out.speeds[0]) == (DriveAction.QUICK_STOP, 0.0)
     assert rig.out.reasons[0] is Reason.OBSTACLE_STOP
     rig.tick(10)
     assert rig.speed == 0.0
@@ -288,7 +288,7 @@ def test_the_way_back_is_free():
     rig.tick(20)
     rig.driver = {"speed": -0.1}
     rig.tick(20)
-    assert rig.out.speed == pytest.approx(-0.1)
+    assert rig.out.speeds[0] == pytest.approx(-0.1)
 
 
 def test_the_sweep_follows_the_commanded_arc():
@@ -327,7 +327,7 @@ def test_an_old_scan_asks_for_more_room():
             seen = scan(rig.now - round(age * SECOND), *wall(0.245 + 0.2))
             rig.gate.observe_scan(seen.model_copy(update={"received": rig.now}))
             rig.tick()
-        speeds.append(rig.out.speed)
+        speeds.append(rig.out.speeds[0])
     assert speeds[1] < speeds[0] < 0.2
 
 
@@ -355,7 +355,7 @@ def test_a_silent_drive_does_not_hide_a_wall():
     rig.obstacles = wall(0.27)
     rig.tick()
     assert rig.out.reasons == (Reason.OBSTACLE_STOP,)
-    assert rig.out.speed == 0.0
+    assert rig.out.speeds[0] == 0.0
 
 
 def test_an_overcharged_battery_does_not_hinder_driving():

@@ -148,7 +148,18 @@ def test_angles_stay_within_the_limit():
     assert max(max(abs(c.front), abs(c.rear)) for c in truck.log) <= 0.25 + 1e-9
 
 
-@pytest.mark.parametrize("bad", [{"min_speed": 0.2}, {"goal_tolerance": 0.5}, {"steering": "crab"}])
+@pytest.mark.parametrize("bad", [{"min_speed": 0.2}, {"goal_tolerance": 0.5}, {"steering": "rear"}])
 def test_contradictory_configs_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         PurePursuitConfig(**bad)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_crabbing_keeps_the_heading(direction):
+    x = np.arange(0.0, 2.0, 0.05)
+    route = np.column_stack((direction * x, 0.3 * np.sin(1.2 * x)))
+    truck = Follower(path(route, [direction] * len(route)), steering="crab")
+    assert truck.run() is Reason.GOAL_REACHED
+    assert truck.cross_track().max() < 0.05
+    assert truck.pose[2] == 0.0
+    assert all(c.front == c.rear for c in truck.log)

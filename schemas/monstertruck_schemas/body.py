@@ -1,0 +1,108 @@
+"""Which robot it is, for the daemon's configuration and for the simulated world's: drive families by ``kind``.
+
+Lengths that every robot has (wheelbase, track, wheel radius, gear ratio) stand beside it. Requests always name the
+speed of the base and two axle angles; a body without axles is driven as the bicycle of its ``wheelbase`` that moves
+alike. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in the order given here.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Metres = Annotated[float, Field(gt=0, le=10)]
+Gain = Annotated[float, Field(gt=0, le=10)]
+
+
+class TruckBody(Schema):
+    """Two steered axles, one motor for all four wheels."""
+
+    kind: Literal["truck"] = "truck"
+
+
+class AckermannBody(Schema):
+    """A car: steered front axle, fixed rear axle with the motor; the front servo steers."""
+
+    kind: Literal["ackermann"]
+
+
+class BicycleBody(Schema):
+    """One steered front wheel, one fixed rear wheel; the front servo steers."""
+
+    kind: Literal["bicycle"]
+    driven: Literal["front", "rear"] = "rear"
+    """Wheel that the motor drives"""
+
+
+class TricycleBody(Schema):
+    """One steered front wheel, two fixed rear wheels; the front servo steers."""
+
+    kind: Literal["tricycle"]
+    driven: Literal["front", "rear"] = "front"
+    """Axle that the motor drives"""
+
+
+class IndependentBody(Schema):
+    """Two steered axles with ideal linkages, a motor in every wheel: front left, front right, rear left, rear right."""
+
+    kind: Literal["independent"]
+
+
+class DifferentialBody(Schema):
+    """Two driven wheels (left, right) beside the base point, and casters; nothing is steered."""
+
+    kind: Literal["differential"]
+
+
+class SkidSteerBody(Schema):
+    """Left and right wheels driven side by side (left, right), turning by skidding; parameters as identified."""
+
+    kind: Literal["skid_steer"]
+    icr_left: float | None = None
+    """Lateral position of the left side's turning centre, m; default half the track, which is no skidding at all"""
+    icr_right: float | None = None
+    """Lateral position of the right side's turning centre, m"""
+    icr_x: float = 0.0
+    """Longitudinal position of the turning centres, m, behind the base (0 to -wheelbase)"""
+    gain_left: Gain = 1.0
+    """Effective over nominal radius of the left wheels"""
+    gain_right: Gain = 1.0
+    """Effective over nominal radius of the right wheels"""
+
+
+class SynchroBody(Schema):
+    """Wheels that roll (one motor) and turn (the front servo) together; the body keeps its heading."""
+
+    kind: Literal["synchro"]
+
+
+class OmniBody(Schema):
+    """Driven 90-degree Swedish wheels on a circle, counter-clockwise from the one straight ahead."""
+
+    kind: Literal["omni"]
+    circle: Metres = 0.2
+    """Radius of the circle, m"""
+    count: Annotated[int, Field(ge=3, le=4)] = 3
+    """Wheels"""
+
+
+class MecanumBody(Schema):
+    """Four driven mecanum wheels: front left, front right, rear left, rear right."""
+
+    kind: Literal["mecanum"]
+
+
+BodyConfig = Annotated[
+    TruckBody
+    | AckermannBody
+    | BicycleBody
+    | TricycleBody
+    | IndependentBody
+    | DifferentialBody
+    | SkidSteerBody
+    | SynchroBody
+    | OmniBody
+    | MecanumBody,
+    Field(discriminator="kind"),
+]

@@ -1,0 +1,116 @@
+"""Every robot of configs/robots drives its bend through real drivers and emulators, on the virtual clock."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.body import BodyConfig
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import Odometry
+from monstertruckd.config.load import load_truck
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import Lap, LocalOperator, drive_lap
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+FOLDER = Path(__file__).resolve().parents[2] / "configs" / "robots"
+ROBOTS = sorted(file.stem for file in FOLDER.glob("*.yaml") if file.stem != "hall")
+KEEP_HEADING = {"synchro", "mecanum", "truck"}
+"""These crab."""
+END = (2.4, 4.15)
+
+
+def drive(name: str) -> tuple[Lap, np.ndarray, Odometry, VirtualRig]:
+    config, _ = load_config(FOLDER / f"{name}.yaml", SimulatedTruckConfig)
+    config = config.model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> tuple[Lap, np.ndarray, Odometry, VirtualRig]:
+        rig = VirtualRig(config, clock)
+        with rig.bus.subscribe(topics.ODOMETRY, latest()) as odometry:
+            async with rig.running():
+                lap = await drive_lap(LocalOperator(rig.bus, clock), clock, limit=40)
+                await clock.sleep(0.5)
+            assert odometry.latest is not None
+            return lap, rig.truth.array(), odometry.latest, rig
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_there_is_a_robot_of_every_kind():
+    kinds = {load_truck(FOLDER / f"{name}.yaml")[0].body.kind for name in ROBOTS}
+    union = BodyConfig.__origin__  # type: ignore[attr-defined]
+    assert kinds == {model.model_fields["kind"].annotation.__args__[0] for model in union.__args__}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_drives_its_bend(name: str):
+    lap, truth, odometry, rig = drive(name)
+    assert lap.outcome is Reason.GOAL_REACHED
+    assert not truth[:, 5].any()
+    x, y, yaw = truth[-1, 1:4]
+    assert math.dist((x, y), END) < 0.06
+    assert lap.cross_track_rms < 0.03
+    assert math.dist((odometry.pose.x, odometry.pose.y), (x, y)) < 0.03
+    assert odometry.pose.yaw == pytest.approx(yaw, abs=0.05)
+    heading = np.abs(truth[:, 3]).max()
+    assert heading < 0.05 if name in KEEP_HEADING else heading > 0.2
+    shafts = len(rig.world.motors)
+    assert [motor.reading(0).turns != 0 for motor in rig.world.motors] == [True] * shafts
+
+
+# Configurations that do not fit the body
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "include: {0}/differential.yaml\nversion: 1\ndevices: {{drive_2: null}}\n",
+            "body differential is driven by drive (left), drive_2 (right); got drive",
+        ),
+        (
+            "include: {0}/ackermann.yaml\nversion: 1\n"
+            "devices: {{drive_2: {{port: {{path: /dev/x}}, driver: {{kind: epos}}}}}}\n",
+            "body ackermann is driven by drive (drive); got drive, drive_2",
+        ),
+        (
+            "include: {0}/differential.yaml\nversion: 1\ntracker: {{steering: counter}}\n",
+            "tracker.steering counter: impossible for body differential: rear is -0.1: expected 0",
+        ),
+        (
+            "include: {0}/differential.yaml\nversion: 1\ntracker: {{steering: crab}}\n",
+            "this body has no second steered axle and cannot move sideways",
+        ),
+        (
+            "include: {0}/synchro.yaml\nversion: 1\ntracker: {{steering: front}}\n",
+            "impossible for body synchro: front is 0.1, rear is 0: expected equal angles",
+        ),
+        (
+            "include: {0}/ackermann.yaml\nversion: 1\ndevices: {{steering: null}}\n",
+            "a tracker needs the devices drive and steering",
+        ),
+        (
+            "include: {0}/differential.yaml\nversion: 1\nsim: {{world: {{truck: {{body: {{kind: omni}}}}}}}}\n",
+            "sim.world.truck.body is omni, body is differential",
+        ),
+        (
+            "include: {0}/skid_steer.yaml\nversion: 1\nbody: {{icr_left: -0.3}}\n",
+            "icr_left is -0.3: expected more than icr_right",
+        ),
+        ("include: {0}/ackermann.yaml\nversion: 1\nbody: {{kind: hovercraft}}\n", "body: "),
+    ],
+)
+def test_what_does_not_fit_the_body_is_refused(text: str, said: str, tmp_path: Path):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(text.format(FOLDER))
+    with pytest.raises(ConfigError) as caught:
+        load_truck(bad)
+    assert said in str(caught.value)

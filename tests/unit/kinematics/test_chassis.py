@@ -1,0 +1,129 @@
+"""Every body does what the equivalent bicycle asks, measures it again, and refuses what it cannot do."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.truck import STEEPEST, DriveTrain
+
+DRIVETRAIN = DriveTrain()
+SKID = {"icr_left": 0.2, "icr_right": -0.21, "icr_x": -0.03, "gain_left": 0.98, "gain_right": 0.9}
+BODIES = {
+    "truck": build_chassis("truck", drivetrain=DRIVETRAIN),
+    "independent": build_chassis("independent", drivetrain=DRIVETRAIN),
+    "ackermann": build_chassis("ackermann", drivetrain=DRIVETRAIN),
+    "bicycle": build_chassis("bicycle", drivetrain=DRIVETRAIN),
+    "front-driven bicycle": build_chassis("bicycle", drivetrain=DRIVETRAIN, driven="front"),
+    "tricycle": build_chassis("tricycle", drivetrain=DRIVETRAIN, driven="front"),
+    "differential": build_chassis("differential", drivetrain=DRIVETRAIN),
+    "skid-steer": build_chassis("skid_steer", drivetrain=DRIVETRAIN, **SKID),
+    "synchro": build_chassis("synchro", drivetrain=DRIVETRAIN),
+    "omni": build_chassis("omni", drivetrain=DRIVETRAIN),
+    "omni of four": build_chassis("omni", drivetrain=DRIVETRAIN, count=4, circle=0.15),
+    "mecanum": build_chassis("mecanum", drivetrain=DRIVETRAIN),
+}
+every_body = pytest.mark.parametrize("chassis", BODIES.values(), ids=BODIES)
+
+
+def angles_of(chassis, rng):
+    front, rear = rng.uniform(-0.4, 0.4, 2).tolist()
+    return {"both": (front, rear), "front": (front, 0.0), "parallel": (front, front)}[chassis.freedom]
+
+
+@every_body
+def test_shafts_move_the_base_as_the_bicycle_and_tell_it_again(chassis):
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        speed, (front, rear) = float(rng.uniform(-0.3, 0.3)), angles_of(chassis, rng)
+        assert chassis.refusal(front, rear) is None
+        shafts = chassis.shaft_speeds(speed, front, rear)
+        assert len(shafts) == len(chassis.shafts)
+        twist = chassis.twist(chassis.pace(shafts, front, rear), front, rear)
+        assert twist == pytest.approx(chassis.bicycle.body_twist(speed, front, rear), abs=1e-12)
+
+
+@every_body
+def test_travel_is_the_fastest_wheel_with_the_sign_of_the_way(chassis):
+    fastest = max(map(abs, chassis.shaft_speeds(0.2, 0.0, 0.0)))
+    share = {"skid-steer": 1 / 0.9, "omni": math.cos(math.pi / 6)}
+    assert fastest == pytest.approx(0.2 * next((share[n] for n in share if BODIES[n] is chassis), 1.0))
+    for speed in (0.2, -0.2):
+        travel = chassis.travel(chassis.shaft_speeds(speed, 0.0, 0.0))
+        assert travel == pytest.approx(math.copysign(fastest, speed))
+
+
+@every_body
+def test_angles_are_limited_to_what_the_body_can_take(chassis):
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        front, rear = angles_of(chassis, rng)
+        limited = chassis.limited(2 * front, 2 * rear, 0.3)
+        assert max(map(abs, limited)) <= 0.3 + 1e-12
+        assert chassis.refusal(*limited) is None
+
+
+@every_body
+def test_servos_and_axles_are_each_others_inverse(chassis):
+    front, rear = angles_of(chassis, np.random.default_rng(5))
+    back = chassis.axles(*chassis.servos(front, rear))
+    assert back == pytest.approx((front, rear) if chassis.linkage is not None else (0.0, 0.0), abs=1e-9)
+    assert chassis.axles(2.0, 2.0) == chassis.axles(math.pi / 4, math.pi / 4)
+
+
+def test_the_truck_is_its_own_formulas():
+    truck = BODIES["truck"]
+    assert truck.shaft_speeds(0.2, 0.3, -0.2) == (truck.bicycle.drive_speed(0.2, 0.3, -0.2),)
+    assert truck.servos(0.3, -0.2) == truck.linkage.servo_from_axles(0.3, -0.2)
+
+
+def test_a_differential_drive_turns_by_different_wheels_and_about_its_axle():
+    left, right = BODIES["differential"].shaft_speeds(0.2, 0.3, 0.0)
+    wz = 0.2 * math.tan(0.3) / 0.32
+    assert (left, right) == pytest.approx((0.2 - 0.13 * wz, 0.2 + 0.13 * wz))
+    spin = BODIES["differential"].twist((-0.1, 0.1), 0.0, 0.0)
+    assert spin == pytest.approx((0.0, 0.0, 0.2 / 0.26))
+
+
+def test_mecanum_wheels_crab():
+    speeds = BODIES["mecanum"].shaft_speeds(0.2, 0.4, 0.4)
+    assert speeds == pytest.approx([0.2 * (math.cos(0.4) + sign * math.sin(0.4)) for sign in (-1, 1, 1, -1)])
+
+
+@pytest.mark.parametrize(
+    ("body", "front", "rear", "why"),
+    [
+        ("ackermann", 0.2, 0.1, r"rear is 0\.1: expected 0"),
+        ("differential", 0.2, 0.2, "cannot move sideways"),
+        ("skid-steer", 0.2, -0.2, r"rear is -0\.2"),
+        ("synchro", 0.2, 0.0, "expected equal angles, this body keeps its heading"),
+    ],
+)
+def test_what_a_body_cannot_do_is_refused_with_the_reason(body, front, rear, why):
+    assert re.search(why, BODIES[body].refusal(front, rear) or "")
+
+
+def test_only_steered_axles_limit_the_reach():
+    ackermann = BODIES["ackermann"]
+    stiff = replace(ackermann.linkage, rear=replace(ackermann.linkage.rear, servo_limit=0.1))
+    assert replace(ackermann, linkage=stiff).reach == ackermann.reach
+    assert replace(BODIES["truck"], linkage=stiff).reach < 0.1
+    assert BODIES["mecanum"].reach == STEEPEST
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "complaint"),
+    [
+        ("hovercraft", {}, "body 'hovercraft': expected truck, ackermann"),
+        ("skid_steer", {"icr_x": 0.1}, r"icr_x is 0\.1: expected -0\.32 to 0"),
+        ("skid_steer", {"icr_left": -0.3}, "icr_left is -0.3"),
+        ("differential", {"track": -1.0}, "track"),
+    ],
+)
+def test_bodies_nobody_can_build(kind, parameters, complaint):
+    with pytest.raises(KinematicsError, match=complaint):
+        build_chassis(kind, drivetrain=DRIVETRAIN, **parameters)
