@@ -31,6 +31,7 @@ from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.sources import OPERATORS, Key, Source, Sources
+from monstertruckd.gate.steering_check import SteeringCheck
 from monstertruckd.gate.watch import Judgement, Watch
 
 URGENT: Final = frozenset(
@@ -38,7 +39,7 @@ URGENT: Final = frozenset(
 )
 """These stop by quick stop, which jumps every queue; the others by the drive's ordinary ramp."""
 
-DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED})
+DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
 """After these somebody has to arm again, however short they were."""
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
@@ -84,6 +85,7 @@ class Gate:
         self._watch = Watch(config, drivetrain)
         self._obstacles = ObstacleGuard(config, steering, footprint, lidar)
         self._motion = Motion(config, steering)
+        self._steering_check = None if config.turning is None else SteeringCheck(config.turning, steering)
         self._servos = (0.0, 0.0), linkage.servo_from_axles(0.0, 0.0)
         """Axle angles and their servo angles at the last tick."""
         self._measured = (0.0, 0.0)
@@ -122,6 +124,11 @@ class Gate:
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take the newest attitude."""
         self._watch.observe_attitude(attitude)
+        if self._steering_check is not None:
+            now = attitude.received
+            trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._watch.steering_fresh(now)
+            heading = attitude.heading if trusted and self._mode in ACTIVE else None
+            self._steering_check.observe(attitude.stamp, heading, self._watch.speed(now), *self._measured)
 
     def observe_drive(self, feedback: DriveFeedback) -> None:
         """Take the newest drive feedback."""
@@ -283,6 +290,8 @@ class Gate:
         own = [Reason.SHUTDOWN] if self._shut_down else []
         if now < self._stalled_until:
             own.append(Reason.TICK_STALLED)
+        if self._steering_check is not None and self._steering_check.dead:
+            own.append(Reason.STEERING_DEAD)
         return (*own, *judgement.blocks)
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
@@ -326,6 +335,8 @@ class Gate:
     def _disarm(self, now: int, text: str) -> None:
         self._mode, self._since, self._stop_reasons, self._holder = GateMode.DISARMED, now, (), None
         self._disarm_at_rest = False
+        if self._steering_check is not None:
+            self._steering_check.reset()  # only driving shows whether it works again
         self._events.tell(now, Reason.DISARMED, Severity.INFO, text, always=True)
 
     def _follow(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:

@@ -73,6 +73,7 @@ class Reason(StrEnum):
     SERVICE_FAILED = "service_failed", 63, "a service failed"
     NOT_ARMED_SPEED = "not_armed_speed", 64, "arming refused: the truck or the stick is not at rest"
     SHUTDOWN = "shutdown", 65, "the daemon is stopping"
+    STEERING_DEAD = "steering_dead", 66, "the truck does not turn as it is steered"
     ARMED = "armed", 0, "armed"
     DRIVING = "driving", 0, "driving"
     STOPPED = "stopped", 0, "at standstill"

@@ -91,6 +91,8 @@ class TruckPlant:
         self.shaft = Shaft(config.motor)
         self.current = 0.0
         self.pulses: PulseSource | None = None
+        self.servo_supply = True
+        """The steering servos have their 5 V."""
         self._kinematics = FourWheelSteering(config.wheelbase, config.track)
         self._drivetrain = DriveTrain(config.motor.ratio, config.wheel_radius)
         self._front, self._rear = Servo(config.front_servo), Servo(config.rear_servo)
@@ -189,8 +191,8 @@ class TruckPlant:
     def _steer(self, dt: float) -> None:
         if self.pulses is not None and self._elapsed % SERVO_FRAME_NS == 0:
             now = (self._start_ns or 0) + self._elapsed
-            self._front.latch(self.pulses.pulse_us(self.config.front_servo.channel, now))
-            self._rear.latch(self.pulses.pulse_us(self.config.rear_servo.channel, now))
+            for servo, config in ((self._front, self.config.front_servo), (self._rear, self.config.rear_servo)):
+                servo.latch(self.pulses.pulse_us(config.channel, now) if self.servo_supply else None)
         self._front.step(dt)
         self._rear.step(dt)
         self._steering.follow(self._front.angle, self._rear.angle)
