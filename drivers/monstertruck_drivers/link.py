@@ -313,6 +313,7 @@ class DeviceEnd:
 
     def take(self, data: bytes) -> None:
         """Bytes from the host enter the line."""
+        data = self.faults.shorten(data)
         self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
 
     def _paced(self, free: float, count: int, act: Callable[[], None], after: float = 0.0) -> float:
@@ -358,6 +359,8 @@ class LineFaults:
         """Probability that a byte is lost."""
         self.garbage = b""
         """Sent once before the next bytes."""
+        self.short_writes = 0
+        """So many of the host's next writes of several bytes end half-way."""
         self._state = 0x9E3779B9
 
     def seed(self, seed: int) -> None:
@@ -378,6 +381,13 @@ class LineFaults:
         if self.chunk is None:
             return [data] if data else []
         return [data[i : i + self.chunk] for i in range(0, len(data), self.chunk)]
+
+    def shorten(self, data: bytes) -> bytes:
+        """What of one write of the host enters the line."""
+        if self.short_writes <= 0 or len(data) < 2:
+            return data
+        self.short_writes -= 1
+        return data[: len(data) // 2]
 
     def _random(self) -> float:
         self._state ^= (self._state << 13) & 0xFFFFFFFF

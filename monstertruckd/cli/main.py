@@ -7,7 +7,7 @@ import typer
 
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruckd import __version__
-from monstertruckd.cli import demo, devices, kinematics, live, logs, robot, usb
+from monstertruckd.cli import demo, devices, drill, kinematics, live, logs, robot, usb
 
 app = typer.Typer(
     name="monstertruckd",
@@ -33,6 +33,7 @@ def _options(
 
 app.command("demo")(demo.demo)
 app.command("simulate")(demo.simulate)
+app.command("drill")(drill.drill)
 app.command("run")(robot.run)
 app.command("check-config")(robot.check_config)
 app.command("topics")(robot.topics)

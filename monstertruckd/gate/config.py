@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
+from monstertruckd.gate.steering_check import SteeringCheckConfig
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0)]
@@ -124,6 +125,8 @@ class GateConfig(Schema):
     """Seconds of punctual ticks that end such a stop."""
 
     tilt: TiltLimits = TiltLimits()
+    turning: SteeringCheckConfig | None = SteeringCheckConfig()
+    """Compass against steering: servos without supply are found; null = off."""
     battery_low_speed: Positive = 0.1
     """Speed limit with a low, or no longer measured, battery, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
@@ -31,6 +31,7 @@ from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.sources import OPERATORS, Key, Source, Sources
+from monstertruckd.gate.steering_check import SteeringCheck
 from monstertruckd.gate.watch import Judgement, Watch
 
 URGENT: Final = frozenset(
@@ -38,7 +39,7 @@ URGENT: Final = frozenset(
 )
 """These stop by quick stop, which jumps every queue; the others by the drive's ordinary ramp."""
 
-DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED})
+DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
 """After these somebody has to arm again, however short they were."""
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
@@ -81,6 +82,12 @@ class Gate:
         self._watch = Watch(config, chassis)
         self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, lidar)
         self._motion = Motion(config, chassis)
+        # Other bodies are turned by their wheel speeds, or not at all, and have no lone servo supply to lose.
+        self._steering_check = (
+            SteeringCheck(config.turning, chassis.bicycle)
+            if config.turning is not None and isinstance(chassis, TruckChassis)
+            else None
+        )
         self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
         """Axle angles and their servo angles at the last tick."""
         self._measured = (0.0, 0.0)
@@ -119,6 +126,11 @@ class Gate:
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take the newest attitude."""
         self._watch.observe_attitude(attitude)
+        if self._steering_check is not None:
+            now = attitude.received
+            trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._watch.steering_fresh(now)
+            heading = attitude.heading if trusted and self._mode in ACTIVE else None
+            self._steering_check.observe(attitude.stamp, heading, self._watch.speed(now), *self._measured)
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
@@ -282,6 +294,8 @@ class Gate:
         own = [Reason.SHUTDOWN] if self._shut_down else []
         if now < self._stalled_until:
             own.append(Reason.TICK_STALLED)
+        if self._steering_check is not None and self._steering_check.dead:
+            own.append(Reason.STEERING_DEAD)
         return (*own, *judgement.blocks)
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
@@ -325,6 +339,8 @@ class Gate:
     def _disarm(self, now: int, text: str) -> None:
         self._mode, self._since, self._stop_reasons, self._holder = GateMode.DISARMED, now, (), None
         self._disarm_at_rest = False
+        if self._steering_check is not None:
+            self._steering_check.reset()  # only driving shows whether it works again
         self._events.tell(now, Reason.DISARMED, Severity.INFO, text, always=True)
 
     def _follow(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:

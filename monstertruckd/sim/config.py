@@ -10,6 +10,15 @@ from monstertruck_schemas.base import Schema
 from monstertruckd.config.truck import TruckConfig
 
 
+class DrillConfig(Schema):
+    """Faults drawn at random while a simulated truck runs."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Which faults, and when"""
+    period: Annotated[float, Field(gt=0)] = 10.0
+    """Seconds from one fault to the next, on average"""
+
+
 class SimConfig(Schema):
     """The simulated side."""
 
@@ -20,6 +29,8 @@ class SimConfig(Schema):
     servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
     world: WorldConfig = WorldConfig()
+    drill: DrillConfig | None = None
+    """Faults that happen by themselves; null = none"""
     recording: Path | None = None
     """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""
 

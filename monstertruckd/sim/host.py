@@ -23,6 +23,7 @@ from monstertruckd.config.validate import load_config
 from monstertruckd.sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
+from monstertruckd.sim.drill_faults import Mishaps, Site
 from monstertruckd.sim.robot import SimulatedRobot
 
 TRUTH_PERIOD = SECOND // 20
@@ -105,6 +106,9 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         asyncio.create_task(log.run(), name="truth"),
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
+    if config.sim.drill is not None:
+        mishaps = Mishaps(Site(config, robot, computer, clock), config.sim.drill, _say)
+        tasks.append(asyncio.create_task(mishaps.run(), name="faults"))
     if robot.recorded is not None:
         tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
     waiting = asyncio.create_task(stop.wait())

@@ -15,6 +15,7 @@ from monstertruckd.daemon import Daemon
 from monstertruckd.sim.computer import EmulatedComputer
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.console import Emulated
+from monstertruckd.sim.drill_faults import Mishaps, Site
 from monstertruckd.sim.host import TruthLog
 from monstertruckd.sim.robot import SimulatedRobot
 
@@ -68,6 +69,9 @@ class VirtualRig:
             asyncio.create_task(self.robot.run(), name="robot"),
             asyncio.create_task(self.truth.run(), name="truth"),
         ]
+        if (drill := self.config.sim.drill) is not None:
+            site = Site(self.config, self.robot, self.computer, self.clock, self.daemon.recorder)
+            around.append(asyncio.create_task(Mishaps(site, drill).run(), name="faults"))
         self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
         try:
             yield self

@@ -177,7 +177,7 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 class VirtualClock(_LoopClock):
-    """Clock of a ``VirtualLoop``; its real time is fixed, so that runs are reproducible."""
+    """Clock of a ``VirtualLoop``; its real time is fixed but for ``step_real``, so that runs are reproducible."""
 
     def __init__(self, loop: VirtualLoop, real_offset: int = 0) -> None:
         self._loop = loop
@@ -188,8 +188,12 @@ class VirtualClock(_LoopClock):
         return self._loop.now()
 
     def real_offset(self) -> int:
-        """The fixed offset given at construction."""
+        """The offset given at construction, and the steps since."""
         return self._real_offset
+
+    def step_real(self, seconds: float) -> None:
+        """Set the real time forwards or back, as an operator or a time server does."""
+        self._real_offset += round(seconds * SECOND)
 
 
 class ReplayClock(VirtualClock):

@@ -31,6 +31,8 @@ class Battery:
     def __init__(self, config: BatteryConfig) -> None:
         self._config = config
         self._slow_sag = 0.0
+        self.connected = True
+        """Its plug is in."""
         self.set_charge(config.charge)
         self._filtered = self.volts
 
@@ -56,6 +58,8 @@ class Battery:
         self._filtered += (self.volts - self._filtered) * _share(dt, config.filter_time)
 
     def _loaded(self, current: float) -> float:
+        if not self.connected:
+            return 0.0
         return max(0.0, self._rest - current * self._config.resistance - self._slow_sag)
 
 

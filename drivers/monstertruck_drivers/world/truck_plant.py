@@ -95,6 +95,8 @@ class TruckPlant:
         self.shafts = tuple(Shaft(config.motor) for _ in range(count))
         self.currents = [0.0] * count
         self.pulses: PulseSource | None = None
+        self.servo_supply = True
+        """The steering servos have their 5 V."""
         self._front, self._rear = Servo(config.front_servo), Servo(config.rear_servo)
         self._steering = _Steering(self._chassis)
         self._tyres = _tyres(config, self._chassis)
@@ -199,8 +201,8 @@ class TruckPlant:
     def _steer(self, dt: float) -> None:
         if self.pulses is not None and self._elapsed % SERVO_FRAME_NS == 0:
             now = (self._start_ns or 0) + self._elapsed
-            self._front.latch(self.pulses.pulse_us(self.config.front_servo.channel, now))
-            self._rear.latch(self.pulses.pulse_us(self.config.rear_servo.channel, now))
+            for servo, config in ((self._front, self.config.front_servo), (self._rear, self.config.rear_servo)):
+                servo.latch(self.pulses.pulse_us(config.channel, now) if self.servo_supply else None)
         self._front.step(dt)
         self._rear.step(dt)
         self._steering.follow(self._front.angle, self._rear.angle)

@@ -108,6 +108,16 @@ class World:
         self._plant.advance(time_ns)
         self._plant.battery.set_charge(charge)
 
+    def connect_battery(self, time_ns: int, *, connected: bool) -> None:
+        """Plug the battery in or pull its plug; what then has no supply is not the world's business."""
+        self._plant.advance(time_ns)
+        self._plant.battery.connected = connected
+
+    def supply_servos(self, time_ns: int, *, on: bool) -> None:
+        """Switch the steering servos' own 5 V: without it they stay where they are, whatever their pulses say."""
+        self._plant.advance(time_ns)
+        self._plant.servo_supply = on
+
     def set_tilt(self, time_ns: int, tilt: TiltConfig) -> None:
         """From now on tilt the truck in another way."""
         self._plant.advance(time_ns)

@@ -1,0 +1,186 @@
+"""Random faults on the whole daemon, on the virtual clock, and an observer that is not to be fooled."""
+
+import asyncio
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.protocol import write_request
+from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.world.obstacles import Disc
+from monstertruck_drivers.world.world import World
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.validate import load_config
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.drill import Drill, Outcome, Report
+from monstertruckd.sim.drill_faults import Kind, Menu
+from monstertruckd.sim.drill_observer import Observer, Violation
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@cache
+def full() -> SimulatedTruckConfig:
+    return load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0]
+
+
+@cache
+def demo() -> SimulatedTruckConfig:
+    return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
+
+
+def test_random_faults_end_safely_and_leave_nothing_behind():
+    report = Drill(4, 32, full(), leg=16).run()
+    assert len(report.outcomes) == 32
+    assert [(o.fault, o.violations) for o in report.outcomes if o.violations] == []
+    assert [(o.fault, o.stuck) for o in report.outcomes if o.stuck] == []
+    assert all(o.standstill_s is not None and o.standstill_s <= 0.6 for o in report.outcomes if o.must_stop)
+    assert report.score > 95
+
+
+def test_one_seed_is_one_report():
+    runs = [Drill(7, 3, with_overlay(demo(), {"recorder": None})).run() for _ in range(2)]
+    assert runs[0] == runs[1]
+    assert {o.fault for o in Drill(8, 3, demo()).run().outcomes} != {o.fault for o in runs[0].outcomes}
+
+
+def test_every_kind_is_on_the_menu_of_the_whole_truck_and_what_needs_hubs_is_not_without():
+    assert set(Menu(full()).kinds) == set(Kind)
+    missing = set(Kind) - set(Menu(demo()).kinds)
+    assert missing == {Kind.HUB_LOSS, Kind.RAIL_ELECTRONICS, Kind.RAIL_12V, Kind.ECHO}
+
+
+def test_draws_are_the_seeds():
+    menu = Menu(full())
+    names = [[menu.draw(rng).name for _ in range(50)] for rng in map(np.random.default_rng, (1, 1, 2))]
+    assert names[0] == names[1] != names[2]
+    assert len(set(names[0])) > 20
+
+
+# The observer, with nobody driving but the test
+
+
+@dataclass(frozen=True)
+class Bare:
+    world: World
+    ports: dict[str, MemoryPort]
+    clock: VirtualClock
+
+
+def watched(
+    scene: Callable[[Bare], None], *, stops: bool = False, disarmed: bool = False, seconds: float = 3.0
+) -> set[str]:
+    """Rules broken by a scene."""
+
+    async def main(clock: VirtualClock) -> set[str]:
+        world = World(demo().sim.world, seed=1)
+        ports = {role: MemoryPort(role) for role in ("drive", "steering")}
+        bare = Bare(world, ports, clock)
+        observer = Observer(demo(), world, ports, clock)
+        watching = asyncio.create_task(observer.run())
+        try:
+            world.truth(clock.now())
+            observer.begin(stops=stops)
+            if disarmed:
+                observer.disarm()
+            scene(bare)
+            await clock.sleep(seconds)
+        finally:
+            watching.cancel()
+        return {violation.rule for violation in observer.violations()}
+
+    return run_virtual(main)
+
+
+def motor(rpm: float) -> Callable[[Bare], None]:
+    return lambda bare: bare.world.motor.command(bare.clock.now(), -rpm, 1e5)
+
+
+def pulses(channel: int, us: int) -> bytes:
+    return bytes((0x84, channel, 4 * us & 0x7F, 4 * us >> 7))
+
+
+def test_a_quiet_drive_breaks_no_rule():
+    assert watched(motor(10_000)) == set()
+
+
+def test_motion_of_a_disarmed_truck_is_seen():
+    assert watched(motor(10_000), disarmed=True) == {"disarmed"}
+
+
+def test_motion_after_a_fault_that_must_stop_is_seen():
+    assert watched(motor(10_000), stops=True) == {"stop"}
+
+
+def test_a_truck_that_is_too_fast_is_seen():
+    assert watched(motor(20_000)) == {"speed"}
+
+
+def test_driving_into_something_is_seen():
+    def scene(bare: Bare) -> None:
+        now = bare.clock.now()
+        truth = bare.world.truth(now)
+        bare.world.add(now, Disc(truth.x + 0.5 * math.cos(truth.yaw), truth.y + 0.5 * math.sin(truth.yaw), 0.1))
+        motor(10_000)(bare)
+
+    assert watched(scene) == {"contact", "obstacle"}
+
+
+@pytest.mark.parametrize(("pulse", "rules"), [(1240, set[str]()), (900, {"angle bytes"})])
+def test_pulses_beyond_the_limits_are_seen(pulse: int, rules: set[str]):
+    assert watched(lambda bare: bare.ports["steering"].device.take(pulses(1, pulse))) == rules
+
+
+def test_a_truck_that_does_not_turn_as_its_pulses_ask_is_seen():
+    def scene(bare: Bare) -> None:
+        bare.ports["steering"].device.take(pulses(1, 1140) + pulses(0, 1740))
+        motor(14_000)(bare)
+
+    assert watched(scene, seconds=4.0) == {"steering"}
+
+
+def test_target_speeds_beyond_the_limit_are_seen():
+    frame = write_request(od.TARGET_VELOCITY, -30_000, 1)
+    assert watched(lambda bare: bare.ports["drive"].device.take(frame.body)) == {"speed bytes"}
+
+
+# Scores and configuration
+
+
+def test_the_score_counts_motion_first():
+    safe = Outcome("a", Kind.STALL, True, recovered_s=0.5)
+    late = Outcome("b", Kind.STALL, True, recovered_s=6.0)
+    stuck = Outcome("c", Kind.STALL, True, stuck=("lidar",))
+    unsafe = Outcome("d", Kind.STALL, True, recovered_s=0.5, violations=(Violation(0.7, "stop", ""),))
+    assert [o.score for o in (safe, late, stuck, unsafe)] == [100, 80, 50, 0]
+    report = Report(1, (safe, late, stuck, unsafe))
+    assert (report.unsafe, report.stuck, report.score) == (1, 1, 57.5)
+    assert report.recovery(50) == 0.5
+    assert report.as_json()["outcomes"][3]["reaction"] == "UNSAFE"
+
+
+def test_a_configuration_can_let_faults_happen_by_themselves():
+    config = with_overlay(demo(), {"recorder": None, "map": None, "sim": {"drill": {"seed": 3, "period": 2.0}}})
+
+    async def main(clock: VirtualClock) -> set[Reason]:
+        rig = VirtualRig(config, clock)
+        events = rig.bus.subscribe(topics.EVENT, fifo(4096))
+        async with rig.running():
+            await clock.sleep_until(20 * SECOND)
+        return {event.reason for event in events.drain()}
+
+    told = run_virtual(main)
+    assert told & {Reason.DEVICE_LOST, Reason.DEVICE_TIMEOUT, Reason.DEVICE_WRONG, Reason.DEVICE_FAULT}, told

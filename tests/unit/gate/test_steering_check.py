@@ -1,0 +1,121 @@
+"""Yaw against steering: what betrays servos without supply, and what must not be taken for it."""
+
+import math
+
+import pytest
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.sensor import Attitude
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.steering_check import SteeringCheck, SteeringCheckConfig
+from tests.unit.gate.rig import Rig, header, servos
+
+STEERING = FourWheelSteering()
+PERIOD = SECOND // 20
+SPEED = 0.18
+FRONT, REAR = 0.3, -0.3
+RATE = STEERING.body_twist(SPEED / STEERING.drive_speed(1.0, FRONT, REAR), FRONT, REAR)[2]
+
+
+def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, front=FRONT, rear=REAR, start=0):
+    """Heading (clockwise) of a truck that turns by a share of what it is told; seconds until found dead."""
+    for step in range(round(seconds * SECOND / PERIOD) + 1):
+        at = step * PERIOD / SECOND
+        measured = (heading - turning * RATE * at) % (2 * math.pi)
+        check.observe(start + step * PERIOD, measured, speed, front, rear)
+        if check.dead:
+            return at
+    return None
+
+
+@pytest.fixture
+def check():
+    return SteeringCheck(SteeringCheckConfig(), STEERING)
+
+
+@pytest.mark.parametrize("turning", [0.8, 1.0, 1.2])
+def test_a_truck_that_turns_about_as_told_is_sound(check, turning):
+    assert drive(check, 20.0, turning=turning) is None
+
+
+@pytest.mark.parametrize("turning", [0.0, -0.5, 3.0])
+def test_one_that_does_not_is_found_within_a_second_and_a_half(check, turning):
+    found = drive(check, 20.0, turning=turning)
+    assert found is not None
+    assert found < 1.5
+    assert check.dead
+
+
+def test_turning_without_being_told_to_is_found(check):
+    assert drive(check, 5.0, front=0.0, rear=0.0) is not None
+
+
+def test_standing_still_proves_nothing(check):
+    assert drive(check, 5.0, turning=0.0, speed=0.0) is None
+
+
+def test_a_reset_forgets(check):
+    drive(check, 5.0, turning=0.0)
+    check.reset()
+    assert not check.dead
+    assert drive(check, 5.0, start=60 * SECOND) is None
+
+
+def test_a_heading_that_jumps_is_the_compass(check):
+    drive(check, 2.0)
+    assert drive(check, 3.0, heading=2.0, start=round(2.05 * SECOND)) is None
+
+
+@pytest.mark.parametrize(("heading", "speed"), [(None, SPEED), (0.0, None)])
+def test_what_is_not_known_is_not_judged(check, heading, speed):
+    for step in range(200):
+        unknown = step % 5 == 0
+        check.observe(step * PERIOD, heading if unknown else 0.0, speed if unknown else SPEED, FRONT, REAR)
+    assert not check.dead
+
+
+def test_headings_far_apart_are_not_compared(check):
+    for step in range(20):
+        check.observe(step * SECOND, 0.0, SPEED, FRONT, REAR)
+    assert not check.dead
+
+
+class Straight(Rig):
+    """A truck whose servos turn on paper alone: it drives straight on."""
+
+    def sense(self):
+        super().sense()
+        if self.out is not None:
+            self.gate.observe_steering(servos(self.now, self.out.front_servo, self.out.rear_servo))
+
+
+def test_the_gate_stops_for_dead_steering_and_has_to_be_armed_again():
+    rig = Straight().armed()
+    rig.driver = {"speed": 0.2, "front": 0.3, "rear": -0.3}
+    rig.tick(150)
+    assert rig.told(Reason.STEERING_DEAD)
+    assert rig.out.mode is GateMode.DISARMED
+    assert rig.speed == 0
+    assert rig.travelled < 0.5
+    rig.driver = None
+    rig.tick(30)
+    assert rig.out.reasons == (Reason.DISARMED,)
+    assert rig.order(Order.ARM) == "ok"
+
+
+def test_it_can_be_told_not_to_look():
+    rig = Straight(turning=None).armed()
+    rig.driver = {"speed": 0.2, "front": 0.3, "rear": -0.3}
+    rig.tick(150)
+    assert rig.out.mode is GateMode.DRIVING
+
+
+def test_a_disarmed_truck_may_be_carried_about():
+    rig = Rig()
+    for step in range(100):
+        rig.tick()
+        rig.gate.observe_attitude(Attitude(**header(rig.now), heading=step * 0.02, roll=0.0, pitch=0.0))
+    assert rig.order(Order.ARM) == "ok"
