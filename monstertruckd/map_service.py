@@ -98,8 +98,6 @@ class MapService:
                 self._spacing *= 2
         if scan.tilt is not None and scan.tilt > self._config.max_tilt:
             return []
-        if scan.tilt is not None and scan.tilt > self._config.max_tilt:
-            return []
         return [(pose, scan_points(scan, self._mount))]
 
     def _picture(self, outcome: Reason) -> dict[str, Any]:

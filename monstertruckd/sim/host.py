@@ -4,6 +4,7 @@ import asyncio
 import gc
 import signal
 import sys
+from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,7 +38,7 @@ class TruthLog:
     def __init__(self, world: World, clock: Clock) -> None:
         self._world = world
         self._clock = clock
-        self._rows: list[tuple[float, ...]] = []
+        self._rows = array("d")
 
     async def run(self) -> None:
         """Sample until cancelled."""
@@ -45,7 +46,7 @@ class TruthLog:
         while True:
             now = self._clock.now()
             state = self._world.truth(now)
-            self._rows.append((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
+            self._rows.extend((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
             due += TRUTH_PERIOD
             await self._clock.sleep_until(due)
 

@@ -3,6 +3,7 @@
 import asyncio
 
 import pytest
+
 from monstertruck_runtime.clock import SECOND, ReplayClock, VirtualClock, WallClock, run_replay, run_virtual
 
 

@@ -415,3 +415,15 @@ def test_kill_9_loses_less_than_a_second_and_the_file_opens_after_repair(config)
     assert len(messages) == recovery.messages > 0
     assert last - messages[-1].log_time <= SECOND
     assert open_log(path).attachments().keys() == {"config.json"}
+
+
+def test_a_disk_can_be_told_to_refuse(config, failures):
+    async def main(clock):
+        async with Recorder(config, clock, failures, deterministic=True) as recorder:
+            recorder.refuse(OSError(errno.ENOSPC, "No space left on device"))
+            await drive(recorder, clock, 2.0)
+        return recorder.health(0)
+
+    health = run_virtual(main)
+    assert not health.recording
+    assert health.reason is Reason.DISK_FULL

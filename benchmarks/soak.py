@@ -1,0 +1,123 @@
+"""An hour of driving and replugging on the virtual clock: memory and file descriptors stay flat.
+
+    python benchmarks/soak.py [--minutes 60] [--seed 1]
+
+The whole daemon and its emulated devices share one process; the first ten minutes warm it up.
+"""
+
+import argparse
+import asyncio
+import gc
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_schemas.req import Order
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.drill_faults import hubs_of
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+
+ROOT = Path(__file__).resolve().parents[1]
+WARM = 1 / 6
+"""Share of the run that does not count."""
+GROWTH = 4.0
+"""MB by which memory may grow after that: the simulator's own record of the truth takes 3.5 MB an hour."""
+
+Sample = tuple[float, float, int]
+
+
+def now_used(minute: float) -> Sample:
+    """Minute, resident memory in MB, open file descriptors."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return minute, pages * os.sysconf("SC_PAGE_SIZE") / 1e6, sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+async def soak(clock: VirtualClock, config: SimulatedTruckConfig, minutes: int, seed: int) -> tuple[list[Sample], int]:
+    """Samples, one a minute, and how often something was replugged."""
+    rng = np.random.default_rng(seed)
+    rig = VirtualRig(config, clock)
+    samples: list[Sample] = []
+    replugs = 0
+    async with rig.running():
+        operator = LocalOperator(rig.bus, clock)
+        began = clock.now()
+        arming = asyncio.create_task(_arm_for_ever(operator, clock))
+        try:
+            for minute in range(minutes):
+                while clock.now() - began < (minute + 1) * 60 * SECOND:
+                    await _replug(rig, rng)
+                    replugs += 1
+                    await clock.sleep(float(rng.uniform(2.0, 6.0)))
+                samples.append(now_used(minute + 1))
+                print(f"minute {minute + 1}: {samples[-1][1]:.1f} MB, {samples[-1][2]} descriptors", file=sys.stderr)
+        finally:
+            arming.cancel()
+            await asyncio.wait([arming])
+    return samples, replugs
+
+
+async def _arm_for_ever(operator: LocalOperator, clock: VirtualClock) -> None:
+    while True:
+        await operator.order(Order.ARM)
+        await clock.sleep(1.0)
+
+
+async def _replug(rig: VirtualRig, rng: np.random.Generator) -> None:
+    hubs = hubs_of(rig.config)
+    pause = float(rng.uniform(0.05, 1.5))
+    if hubs and rng.random() < 0.2:
+        hub = hubs[rng.integers(len(hubs))]
+        rig.computer.usb.lose_hub(hub)
+        await rig.clock.sleep(pause)
+        await rig.computer.usb.return_hub(hub, rig.clock)
+        return
+    roles = tuple(rig.computer.ports)
+    port = rig.computer.ports[roles[rng.integers(len(roles))]]
+    port.unplug()
+    await rig.clock.sleep(pause)
+    port.plug()
+
+
+def main() -> int:
+    """Soak; 0 = flat."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    logging.disable(logging.CRITICAL)
+    config = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
+    began = perf_counter()
+    with TemporaryDirectory() as folder:
+        truck = with_overlay(config, {"map": None, "recorder": {"directory": folder, "quota_bytes": 50_000_000}})
+        samples, replugs = run_virtual(lambda clock: soak(clock, truck, arguments.minutes, arguments.seed))
+    warm = [sample for sample in samples if sample[0] > WARM * arguments.minutes]
+    third = max(1, len(warm) // 3)
+    growth = float(np.median([s[1] for s in warm[-third:]]) - np.median([s[1] for s in warm[:third]]))
+    descriptors = sorted({sample[2] for sample in warm})
+    result = {
+        "bench": "soak",
+        "minutes": arguments.minutes,
+        "replugs": replugs,
+        "rss_mb": round(samples[-1][1], 1),
+        "rss_growth_mb": round(growth, 2),
+        "descriptors": descriptors,
+        "real_s": round(perf_counter() - began, 1),
+    }
+    result["ok"] = growth <= GROWTH and descriptors[-1] - descriptors[0] <= 1  # a log rotates
+    print(json.dumps(result))
+    return 0 if result["ok"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
