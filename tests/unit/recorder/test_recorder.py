@@ -390,6 +390,7 @@ run_wall(main)
 """
 
 
+@pytest.mark.wall
 def test_kill_9_loses_less_than_a_second_and_the_file_opens_after_repair(config):
     process = subprocess.Popen(
         [sys.executable, "-c", CHILD, config.directory], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()

@@ -13,6 +13,8 @@ from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
 from tests.unit.drivers.ax12.rig import FAST, Rig, background, bench
 
+pytestmark = pytest.mark.virtual
+
 DELAY = 0.04
 """Age of a compass reading when it comes, s."""
 

@@ -17,6 +17,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
 from tests.unit.drivers.kit import Events, Kept, Latest, background
 
+pytestmark = pytest.mark.virtual
+
 
 class Rig:
     def __init__(self, clock: VirtualClock, root: Path, **config: Any) -> None:

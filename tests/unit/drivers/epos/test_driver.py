@@ -834,6 +834,7 @@ def test_probe_copes_without_a_serial_number(monkeypatch: pytest.MonkeyPatch):
     on_bench(test)
 
 
+@pytest.mark.wall
 async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
     clock, path = WallClock(), tmp_path / "drive"
     async with bench(clock, port=PtyPort(path)) as rig:

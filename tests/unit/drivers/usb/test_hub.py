@@ -19,6 +19,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.usb import UsbState
 from tests.unit.drivers.usb.rig import PORTS, Bench, play
 
+pytestmark = pytest.mark.virtual
+
 FIRST = ("lidar", "steering", "drive", "stabiliser")
 """Roles behind hub 1-1."""
 

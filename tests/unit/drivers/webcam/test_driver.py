@@ -321,6 +321,7 @@ def test_unknown_faults_are_refused_with_a_list():
     on_bench(test)
 
 
+@pytest.mark.wall
 async def test_on_the_wall_clock_over_a_pty_with_rendering_in_a_thread(tmp_path: Path):
     clock = WallClock()
     rig = Rig(clock, PtyPort(tmp_path / "camera"), offload=_watched, width=640, height=480, rate=30.0)
