@@ -47,7 +47,7 @@ async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) 
     async with (
         program(folder / "simulate.txt", "simulate", "--config", str(config)),
         program(folder / "daemon.txt", "run", "--config", str(config)),
-        await connect(clock, endpoint) as client,
+        await connect(clock, "truck", endpoint) as client,
     ):
         await clock.sleep(WARM_UP)
         ticks, pictures = client.subscribe(topics.CMD_DRIVE, fifo(1 << 16)), client.subscribe(topics.CAMERA, fifo(4096))

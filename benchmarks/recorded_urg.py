@@ -73,7 +73,7 @@ async def play(clock: WallClock, folder: Path, config: Path, recording: Recorded
 
     try:
         await start("-m", "monstertruckd", "run", "--config", str(overlay))
-        await connect(clock, endpoint)
+        await connect(clock, "truck", endpoint)
         subscriber = await start("-c", SUBSCRIBER, endpoint, str(len(recording)), str(target))
         await _said(subscriber, "subscribed")
         simulator = await start("-m", "monstertruckd", "simulate", "--config", str(overlay))
