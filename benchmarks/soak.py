@@ -33,6 +33,9 @@ WARM = 1 / 6
 GROWTH = 4.0
 """MB by which memory may grow after that: the simulator's own record of the truth takes 3.5 MB an hour."""
 
+LOGS = {"rotate_seconds": 120, "quota_bytes": 50_000_000}
+"""The index of a log is kept until the next file begins, some 0.3 MB a minute; so here they begin soon."""
+
 Sample = tuple[float, float, int]
 
 
@@ -99,7 +102,7 @@ def main() -> int:
     config = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()
     with TemporaryDirectory() as folder:
-        truck = with_overlay(config, {"map": None, "recorder": {"directory": folder, "quota_bytes": 50_000_000}})
+        truck = with_overlay(config, {"map": None, "recorder": {"directory": folder, **LOGS}})
         samples, replugs = run_virtual(lambda clock: soak(clock, truck, arguments.minutes, arguments.seed))
     warm = [sample for sample in samples if sample[0] > WARM * arguments.minutes]
     third = max(1, len(warm) // 3)

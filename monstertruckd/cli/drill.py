@@ -74,7 +74,8 @@ def _print(report: "Report") -> None:
         if outcome.stuck:
             console.print(f"{outcome.fault}: not back: {', '.join(outcome.stuck)}", style="yellow")
     console.print(
-        f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck; "
+        f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck, "
+        f"{report.blocked} times set back by hand; "
         f"back after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "
         f"score [bold]{report.score:.1f}[/bold] of 100"
     )

@@ -67,6 +67,8 @@ class Outcome:
     """All services ready, and the truck drives again when armed; 0: it never lacked anything."""
     stuck: tuple[str, ...] = ()
     """Services that did not come back, or what keeps the truck from driving."""
+    blocked: bool = False
+    """The truck is whole, but stands before something: it has to be set back by hand."""
     violations: tuple[Violation, ...] = ()
 
     @property
@@ -76,6 +78,8 @@ class Outcome:
             return "UNSAFE"
         if self.stuck:
             return "stuck"
+        if self.blocked:
+            return "blocked"
         return "drove on" if self.standstill_s is None else "stopped"
 
     @property
@@ -110,6 +114,11 @@ class Report:
         """Mean, 0..100."""
         return float(np.mean([outcome.score for outcome in self.outcomes])) if self.outcomes else 0.0
 
+    @property
+    def blocked(self) -> int:
+        """Faults after which the truck stood before something."""
+        return sum(outcome.blocked for outcome in self.outcomes)
+
     def recovery(self, percent: float) -> float | None:
         """Percentile of the recoveries, s, of those faults after which anything had to recover."""
         times = [outcome.recovered_s for outcome in self.outcomes if outcome.recovered_s]
@@ -127,6 +136,7 @@ class Report:
             "faults": len(self.outcomes),
             "unsafe": self.unsafe,
             "stuck": self.stuck,
+            "blocked": self.blocked,
             "score": round(self.score, 2),
             "recovery_p50_s": self.recovery(50),
             "recovery_p99_s": self.recovery(99),
@@ -228,7 +238,7 @@ class _Driver:
                     if outcome is None:
                         break
                     self._outcomes.append(outcome)
-                    if outcome.stuck:
+                    if outcome.stuck or outcome.blocked:
                         break
             done = len(self._outcomes) - before
             if not done:  # a new truck cannot even be driven
@@ -301,6 +311,9 @@ class _Truck:
         held = self.held()
         if not held and not await self._drive():
             held = tuple(self._state.latest.reasons) if self._state.latest is not None else ("gate",)
+        blocked = Reason.OBSTACLE_STOP in held and self.observer.before_something()
+        if blocked:
+            held = ()
         lost = standstill is not None and standstill > fault.hold  # it stood only because it was disarmed
         return Outcome(
             fault.name,
@@ -312,6 +325,7 @@ class _Truck:
             metres=metres,
             recovered_s=None if held else recovered,
             stuck=held,
+            blocked=blocked,
             violations=observer.violations(),
         )
 

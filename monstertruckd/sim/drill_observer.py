@@ -26,6 +26,8 @@ STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
 CLOSEST: Final = 0.03
 """Nothing nearer than this, m, may be driven towards."""
+NEAR: Final = 0.6
+"""Metres from the camera within which things are near."""
 SPEED_MARGIN: Final = 1.05
 """True speed over the greatest commanded one: the motor's overshoot."""
 ANGLE_MARGIN: Final = 0.01
@@ -140,6 +142,10 @@ class Observer:
     def standstill_after(self) -> float | None:
         """Seconds from the fault to standstill."""
         return None if self._stood is None else (self._stood - self._began) / SECOND
+
+    def before_something(self) -> bool:
+        """Whether anything in front is so near that a truck may be right not to set off."""
+        return bool(self._world.view.ranges(self._clock.now(), FAN).min() < NEAR)
 
     def metres(self) -> float:
         """Truly travelled since the fault, to standstill or until now."""

@@ -157,6 +157,19 @@ def test_target_speeds_beyond_the_limit_are_seen():
     assert watched(lambda bare: bare.ports["drive"].device.take(frame.body)) == {"speed bytes"}
 
 
+def test_a_truck_before_something_is_told_from_one_in_the_open():
+    async def main(clock: VirtualClock) -> tuple[bool, bool]:
+        world = World(demo().sim.world, seed=1)
+        ports = {role: MemoryPort(role) for role in ("drive", "steering")}
+        observer = Observer(demo(), world, ports, clock)
+        truth = world.truth(clock.now())
+        free = observer.before_something()
+        world.add(clock.now(), Disc(truth.x + 0.6 * math.cos(truth.yaw), truth.y + 0.6 * math.sin(truth.yaw), 0.1))
+        return free, observer.before_something()
+
+    assert run_virtual(main) == (False, True)
+
+
 # Scores and configuration
 
 
