@@ -111,7 +111,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             scan=bus.subscribe(topics.SCAN, latest()),
             pose=bus.subscribe(topics.POSE, latest()),
             path=bus.subscribe(topics.PATH, latest()),
-            tracker=bus.subscribe(topics.TRACKER, latest()),
+            tracker=bus.subscribe(topics.TRACKER, fifo(256)),
             events=bus.event_sink(),
         )
 

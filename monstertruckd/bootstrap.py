@@ -28,6 +28,11 @@ UV_SHA256 = {
 }
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
+GATED = (
+    *("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/test_wire.py", "tests/unit/drivers"),
+    *("-m", "not wall and not virtual", "-k", "protocol or parser or codec or not drivers"),
+)
+"""Tests of the parts whose coverage is a gate, run a second time under the tracer, which would slow all others."""
 EXTRAS = {"demo": ("robot", "sim", "plot"), "check": ("dev",), "sync": ("dev",)}
 
 
@@ -119,7 +124,8 @@ def check(arguments: list[str]) -> int:
         (tools / "ruff", ["format", "--check", "."]),
         (tools / "mypy", []),
         (tools / "lint-imports", []),
-        (pytest, ["-n", "2", "-m", "not wall and not virtual", "--cov", "--cov-report=", *arguments]),
+        (pytest, ["-n", "2", "-m", "not wall and not virtual", *arguments]),
+        (pytest, ["-n", "2", "--quiet", "--cov", "--cov-report=", *GATED]),
         (tools / "coverage", ["report"]),
         (pytest, ["-n", "2", "-m", "virtual", *arguments]),
         (pytest, ["-m", "wall", *arguments]),

@@ -7,6 +7,7 @@ import numpy as np
 
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Ready, Subscription
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
@@ -48,7 +49,7 @@ class MapService:
         scan: Subscription[LaserScan],
         pose: Subscription[Odometry],
         path: Subscription[Path],
-        tracker: Subscription[TrackerState],
+        tracker: Mailbox[TrackerState],
         events: EventSink,
     ) -> None:
         self._config = config
@@ -61,6 +62,7 @@ class MapService:
         self._events = events
         self._driven: list[tuple[float, float, float]] = []
         self._spacing = SPACING
+        self._before = Reason.DRIVING
 
     async def run(self, ready: Ready) -> None:
         """Feed the worker until cancelled.
@@ -72,19 +74,26 @@ class MapService:
         async with worker:
             await worker.start()
             ready()
-            drawn = Reason.DRIVING
             while True:
                 await self._clock.sleep(self._config.period)
                 scans = self._new_scan()
-                outcome = self._tracker.latest.outcome if self._tracker.latest is not None else Reason.DRIVING
-                if self._config.picture is not None and outcome is not drawn and outcome is not Reason.DRIVING:
+                ended = self._ended()
+                if self._config.picture is not None and ended is not None:
                     file = str(self._config.picture)
-                    outputs = await worker.step({"scans": scans, "render": self._picture(outcome), "file": file})
+                    outputs = await worker.step({"scans": scans, "render": self._picture(ended), "file": file})
                     if (error := outputs.get("error")) is not None:
                         self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"picture not saved: {error}")
                 elif scans:
                     await worker.step({"scans": scans})
-                drawn = outcome
+
+    def _ended(self) -> TrackerState | None:
+        """The state in which a path came to its end since the last look, however briefly it was reported."""
+        ended = None
+        for state in self._tracker.drain():
+            if state.outcome is not Reason.DRIVING and self._before is Reason.DRIVING:
+                ended = state
+            self._before = state.outcome
+        return ended
 
     def _new_scan(self) -> list[tuple[tuple[float, float, float], Any]]:
         scan, odometry = self._scan.latest, self._pose.latest
@@ -100,11 +109,11 @@ class MapService:
             return []
         return [(pose, scan_points(scan, self._mount))]
 
-    def _picture(self, outcome: Reason) -> dict[str, Any]:
-        path, state = self._path.latest, self._tracker.latest
+    def _picture(self, ended: TrackerState) -> dict[str, Any]:
+        path = self._path.latest
         paths = [{"name": "driven (estimated)", "style": "driven", "poses": np.array(self._driven).reshape(-1, 3)}]
         if path is not None:
             paths.insert(0, {"name": "planned", "style": "planned", "poses": path.poses.reshape(-1, 3)})
-        along = f"{state.along:.2f} of {state.length:.2f} m" if state is not None else ""
+        along = f"{ended.along:.2f} of {ended.length:.2f} m"
         title = f"Path {path.name if path else ''} over the scan map"
-        return {"title": title, "subtitle": f"{outcome.text}, {along}", "paths": paths}
+        return {"title": title, "subtitle": f"{ended.outcome.text}, {along}", "paths": paths}

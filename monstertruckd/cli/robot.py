@@ -1,10 +1,14 @@
 """Commands of the robot itself: run the daemon, check its configuration, print its topic table."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+PIPE_WIDTH = 200
+"""Columns of a table nobody looks at on a terminal: wide enough to cut nothing."""
 
 ConfigOption = Annotated[
     Path, typer.Option("--config", "-c", help="Configuration of this robot or experiment (YAML).", show_default=False)
@@ -88,4 +92,4 @@ def topics(json_output: JsonOption = False) -> None:
             kept,
             topic.doc,
         )
-    Console().print(table)
+    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)

@@ -34,7 +34,7 @@ class Follower:
     """Keeps a ``ScreenState`` up to date from a client's subscriptions."""
 
     def __init__(self, client: TruckClient, clock: Clock) -> None:
-        self.state = ScreenState(client.robot, clock.now())
+        self.state = ScreenState(f"{client.robot} at {client.endpoint}", clock.now())
         self._clock = clock
         self._newest = [client.subscribe(topic, latest()) for topic in SHOWN]
         self._events = client.subscribe(topics.EVENT, fifo(64))

@@ -40,4 +40,5 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
         *log_figures(folder),
         digest=rig.daemon.digest.hexdigest(),
         speedup=speed,
+        closed=config.path is not None and config.path.closed,
     )

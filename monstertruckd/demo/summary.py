@@ -42,6 +42,8 @@ class Summary:
     """sha256 over (key, stamp, payload) of every logged message; virtual clock only."""
     speedup: float | None = None
     """Simulated seconds per real second; virtual clock only."""
+    closed: bool = True
+    """The path is a lap: its true closing error counts."""
 
     def _driven(self) -> NDArray[np.float64]:
         times = self.truth[:, 0]
@@ -71,7 +73,7 @@ class Summary:
             ("lap time", f"{self.lap.seconds:.1f} s"),
             ("distance, true", f"{self.distance:.2f} m"),
             ("cross-track RMS", f"{self.lap.cross_track_rms * 100:.2f} cm"),
-            ("true closing error", f"{self.closing_error * 100:.1f} cm (goal {GOAL_CLOSING * 100:.0f} cm)"),
+            *self._closing_row(),
             ("tick lateness p99", f"{self.lateness_p99 * 1e3:.2f} ms (max {self.lateness_max * 1e3:.2f} ms)"),
             ("messages", f"{sum(self.messages.values())} in {len(self.messages)} topics"),
             ("log size", f"{self.log_bytes / 1e6:.2f} MB"),
@@ -82,6 +84,11 @@ class Summary:
             rows.append(("sha256", self.digest))
         return rows + [("file", str(file)) for file in self.files]
 
+    def _closing_row(self) -> list[tuple[str, str]]:
+        if not self.closed:
+            return []
+        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal {GOAL_CLOSING * 100:.0f} cm)")]
+
     def as_json(self) -> dict[str, object]:
         """Everything as plain data."""
         return {
@@ -90,7 +97,7 @@ class Summary:
             "lap_s": self.lap.seconds,
             "distance_m": self.distance,
             "cross_track_rms_m": self.lap.cross_track_rms,
-            "closing_error_m": self.closing_error,
+            "closing_error_m": self.closing_error if self.closed else None,
             "lateness_p99_s": self.lateness_p99,
             "lateness_max_s": self.lateness_max,
             "messages": self.messages,

@@ -22,7 +22,7 @@ from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruckd.cli.screen import draw
 from monstertruckd.cli.watch import PERIOD, Follower
 from monstertruckd.config.yaml_tree import load_tree
-from monstertruckd.demo.operator import Lap, drive_lap
+from monstertruckd.demo.operator import drive_lap
 from monstertruckd.demo.summary import Summary, log_figures
 
 PATIENCE = 60.0
@@ -48,6 +48,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
     simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
     async with (
         program(folder / "simulate.txt", *simulate),
+        _ready((folder / "simulate.txt").read_bytes, clock),
         program(folder / "daemon.txt", "run", "--config", str(overlay)),
         await connect(clock, load_tree(config).data.get("robot", "truck"), endpoint) as client,
     ):
@@ -56,18 +57,34 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         try:
             lap = await drive_lap(client, clock, patience=PATIENCE)
             await clock.sleep(1.0)
-            await _appear((folder / "map.png").exists, clock)
+            if "map" in load_tree(overlay).data:
+                await _appear((folder / "map.png").exists, clock)
         finally:
             watching.cancel()
             await asyncio.wait([watching])
         loop = follower.state.loop
-    return _summary(lap, folder, truth, loop.lateness_p99 if loop else 0.0, loop.lateness_max if loop else 0.0)
-
-
-def _summary(lap: Lap, folder: Path, truth: Path, p99: float, worst: float) -> Summary:
     with np.load(truth) as archive:
         rows = archive["truth"]
-    return Summary(lap, rows, p99, worst, *log_figures(folder))
+    return Summary(
+        lap,
+        rows,
+        loop.lateness_p99 if loop else 0.0,
+        loop.lateness_max if loop else 0.0,
+        *log_figures(folder),
+        closed=load_tree(overlay).data.get("path", {}).get("closed", False),
+    )
+
+
+@asynccontextmanager
+async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]:
+    """Enter once the simulator has said that its devices are plugged in."""
+    try:
+        async with clock.deadline(PATIENCE):
+            while b"ready" not in said():
+                await clock.sleep(0.05)
+    except TimeoutError:
+        raise NoAnswerError(f"the simulator did not come up within {PATIENCE:g} s: {said()!r}") from None
+    yield
 
 
 def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
