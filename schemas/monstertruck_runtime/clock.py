@@ -14,6 +14,7 @@ import heapq
 import selectors
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol, TypeVar, TypeVarTuple
 
@@ -48,11 +49,11 @@ class Clock(Protocol):
         ...
 
 
-class _LoopClock:
+class _LoopClock(ABC):
     """Shared part: sleeping rests on the running loop, whatever carries it."""
 
-    def now(self) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def now(self) -> int: ...
 
     async def sleep(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
