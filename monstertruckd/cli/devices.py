@@ -55,6 +55,8 @@ def probe(
     kind = find_kind(device)
     if kind.asked == "port" and port is None:
         raise InputError(f"{device}: say where it hangs with --port")
+    if kind.asked == "machine" and port is not None:
+        raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
 
     async def main(clock: Clock) -> dict[str, Any]:
         if port is None:

@@ -103,7 +103,8 @@ def plain(state: ScreenState) -> list[str]:
         pose = state.odometry.pose
         lines.append(f"pose      x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.yaw:.3f} rad in {state.odometry.frame}")
     if state.battery is not None:
-        lines.append(f"battery   {state.battery.voltage} V, {state.battery.level.value}")
+        volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.2f}"
+        lines.append(f"battery   {volts} V, {state.battery.level.value}")
     if state.loop is not None:
         late = state.loop
         lines.append(f"tick      late p99 {late.lateness_p99 * 1e3:.2f} ms, max {late.lateness_max * 1e3:.2f} ms")

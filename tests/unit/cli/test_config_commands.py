@@ -119,6 +119,14 @@ def test_unknown_device_and_topic_are_named(monkeypatch: pytest.MonkeyPatch, cap
     assert "no topic 'sensor/smell'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("device", ["host", "link", "battery"])
+def test_what_hangs_on_no_port_says_so(
+    device: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run(monkeypatch, "probe", device, "--port", "/dev/null") == 3
+    assert "hangs on no port" in capsys.readouterr().err
+
+
 def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     assert run(monkeypatch, "--version") == 0
     assert capsys.readouterr().out.strip().count(".") == 2

@@ -105,4 +105,8 @@ def test_plain_words_for_pipes():
     text = "\n".join(plain(full()))
     assert "driving, driver tracker, why tilt_slow" in text
     assert "lidar        backoff   restarts 3 lost" in text
+    assert "battery   - V, sensor_fault" in text
     assert plain(ScreenState("truck", 0)) == []
+    state = ScreenState("truck", 0)
+    state.take(Battery(**HEADER, voltage=24.82368826, raw_voltage=24.8, cells=6, level=BatteryLevel.NORMAL))
+    assert plain(state) == ["battery   24.82 V, normal"]
