@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from monstertruck_drivers.ax12 import protocol as ax12
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos import protocol as epos
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.hokuyo_urg import protocol as scip
-from monstertruck_drivers.link import MemoryPort
 from monstertruck_drivers.maestro import protocol as maestro
 from monstertruck_drivers.os4000 import protocol as os4000
 from monstertruck_drivers.webcam import jpeg, packets

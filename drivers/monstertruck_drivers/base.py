@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.link import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd
 
 
 class Emulator(Protocol):

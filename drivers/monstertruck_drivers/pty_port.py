@@ -6,7 +6,7 @@ import os
 import tty
 from pathlib import Path
 
-from monstertruck_drivers.link import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd
 
 
 class PtyPort:

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from pathlib import Path
 
-from monstertruck_drivers.link import DeviceEnd, EmulatedPort
+from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.tree import ancestors

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, TextIO
 
 from monstertruck_drivers.base import Emulator
-from monstertruck_drivers.link import EmulatedPort, LineFaults
+from monstertruck_drivers.cable import EmulatedPort, LineFaults
 from monstertruck_runtime.errors import InputError
 
 HELP = (

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from monstertruck_drivers.link import EmulatedPort
+from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.world.obstacles import Disc
 from monstertruck_runtime.clock import Clock, VirtualClock

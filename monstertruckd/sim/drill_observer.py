@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
-from monstertruck_drivers.link import MemoryPort
 from monstertruck_drivers.maestro.protocol import Code, Command, Decoder
 from monstertruck_drivers.world.config import ServoConfig
 from monstertruck_drivers.world.truck_plant import TruthState

@@ -3,9 +3,9 @@
 from contextlib import suppress
 from typing import Final
 
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
-from monstertruck_drivers.link import MemoryPort
 from monstertruck_runtime.clock import Clock
 
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))

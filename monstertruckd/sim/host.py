@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
-from monstertruck_drivers.link import EmulatedPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND, Clock

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline

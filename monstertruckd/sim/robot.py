@@ -12,11 +12,11 @@ from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.ax12.protocol import BAUD, STEP
 from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.battery.emulator import IioEmulator
+from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, RecordedRanges
 from monstertruck_drivers.host_health.emulator import HostEmulator
-from monstertruck_drivers.link import EmulatedPort
 from monstertruck_drivers.link_quality.emulator import NetworkEmulator
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
 from monstertruck_drivers.os4000.emulator import Os4000Emulator

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import write_request
-from monstertruck_drivers.link import MemoryPort
 from monstertruck_drivers.world.obstacles import Disc
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
-from monstertruck_drivers.link import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 

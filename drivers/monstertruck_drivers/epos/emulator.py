@@ -11,6 +11,7 @@ from contextlib import suppress
 import numpy as np
 
 from monstertruck_drivers.base import MotorPlant
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
 from monstertruck_drivers.epos.protocol import (
@@ -31,7 +32,6 @@ from monstertruck_drivers.epos.protocol import (
     join,
     split,
 )
-from monstertruck_drivers.link import DeviceEnd
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.base import RangeSource
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.hokuyo_urg.identity import build_fields
 from monstertruck_drivers.hokuyo_urg.orders import (
     LEAST_MM,
@@ -28,7 +29,6 @@ from monstertruck_drivers.hokuyo_urg.orders import (
     scan_lines,
 )
 from monstertruck_drivers.hokuyo_urg.protocol import COUNTER_MASK, TAG_LIMIT, build_reply
-from monstertruck_drivers.link import DeviceEnd
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 

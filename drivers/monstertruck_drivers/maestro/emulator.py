@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from monstertruck_drivers.base import ServoPlant
-from monstertruck_drivers.link import DeviceEnd, EmulatedPort
+from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
     CHANNELS,

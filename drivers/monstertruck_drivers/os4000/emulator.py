@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from monstertruck_drivers.base import AttitudeSource, CompassReading
-from monstertruck_drivers.link import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.os4000.protocol import (
     BAUDS,
     ESC,

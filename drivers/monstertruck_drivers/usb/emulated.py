@@ -12,7 +12,8 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.link import EmulatedPort, MemoryPort, Port, SerialPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_drivers.link import Port, SerialPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.sysfs import Sysfs

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.base import ViewSource
-from monstertruck_drivers.link import DeviceEnd, EmulatedPort
+from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.webcam.packets import Kind, Packet, encode_mode
 from monstertruck_drivers.webcam.render import Renderer
 from monstertruck_drivers.webcam.source import Mode

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers.link import BUFFER_LIMIT, MemoryPort, SerialPort
+from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.link import BUFFER_LIMIT, SerialPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError

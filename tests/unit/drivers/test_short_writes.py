@@ -1,6 +1,6 @@
 """Writes of the host that end half-way."""
 
-from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import run_virtual
 from monstertruckd.sim.console import set_line_fault
 

@@ -10,7 +10,8 @@ from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Packet, Parser
 from monstertruck_drivers.ax12.unit import Unit
-from monstertruck_drivers.link import EmulatedPort, Link, MemoryPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.event import Severity

@@ -7,7 +7,7 @@ import pytest
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import AlarmConfig, Ax12Config, JointConfig
 from monstertruck_drivers.ax12.probe import probe
-from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,

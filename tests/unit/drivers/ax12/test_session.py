@@ -8,7 +8,7 @@ import pytest
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import Alarm, Packet
 from monstertruck_drivers.ax12.session import Session
-from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from tests.unit.drivers.ax12.rig import background

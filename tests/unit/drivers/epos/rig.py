@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.driver import RESTART_POLICY, EposDriver
@@ -15,7 +16,7 @@ from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
 from monstertruck_drivers.epos.protocol import Opcode
-from monstertruck_drivers.link import EmulatedPort, Link, MemoryPort
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.service import supervise
 from monstertruck_schemas.cmd import DriveAction, DriveCommand

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.driver import SAFE_DEADLINE
 from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
 from monstertruck_drivers.epos.probe import probe
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
-from monstertruck_drivers.link import DeviceEnd, SerialPort
+from monstertruck_drivers.link import SerialPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
-from monstertruck_drivers.link import EmulatedPort, MemoryPort
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason

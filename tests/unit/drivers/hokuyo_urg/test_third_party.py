@@ -26,8 +26,8 @@ from hokuyolx.exceptions import HokuyoStatusException
 from numpy.typing import NDArray
 
 from monstertruck_drivers.base import RangeSource
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
-from monstertruck_drivers.link import DeviceEnd
 from monstertruck_drivers.world.config import WorldConfig
 from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import WallClock

@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Any, Generic, TypeVar
 
-from monstertruck_drivers.link import EmulatedPort, MemoryPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.emulator import MaestroEmulator

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_drivers.link import DeviceEnd, MemoryPort, SerialPort
+from monstertruck_drivers.cable import DeviceEnd, MemoryPort
+from monstertruck_drivers.link import SerialPort
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.emulator import MaestroEmulator

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_drivers.link import DeviceEnd, Link, MemoryPort
+from monstertruck_drivers.cable import DeviceEnd, MemoryPort
+from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.emulator import MaestroEmulator, Ramp
 from monstertruck_drivers.maestro.protocol import Encoder, Error, words
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual

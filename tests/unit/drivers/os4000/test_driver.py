@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_drivers.link import DeviceEnd, MemoryPort, SerialPort
+from monstertruck_drivers.cable import DeviceEnd, MemoryPort
+from monstertruck_drivers.link import SerialPort
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.driver import Os4000Driver
 from monstertruck_drivers.os4000.emulator import Os4000Emulator

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from monstertruck_drivers.link import MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.hub import HubCoordinator

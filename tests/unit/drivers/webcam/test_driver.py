@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_drivers.link import EmulatedPort, MemoryPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig

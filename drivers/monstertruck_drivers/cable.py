@@ -1,0 +1,199 @@
+"""The device's side of a cable, for emulators: its end of the bytes, what can be wrong on the way, a port in memory."""
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from typing import Protocol
+
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.errors import DeviceLostError, PortBusyError
+
+
+class DeviceEnd:
+    """The device's side of a port: what an emulator reads and writes, whoever has the host side open.
+
+    Bytes for nobody are dropped, as a USB device's are. ``baud`` paces both directions like a real
+    line (10 bits a byte). Faults of the cable live here too.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.baud: int | None = None
+        self.faults = LineFaults()
+        self.on_plug: Callable[[bool], None] | None = None
+        """Told True/False when the cable is plugged/unplugged."""
+        self.on_bytes: Callable[[bool, bytes], None] | None = None
+        """Told of all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
+        self._received = Link(name, lambda _: None, lambda: None)
+        self._out_free = 0.0
+        self._in_free = 0.0
+        self._deliver: Callable[[bytes], None] | None = None
+
+    def connect(self, deliver: Callable[[bytes], None] | None) -> None:
+        """A host opened the port (or closed it: None)."""
+        self._deliver = deliver
+
+    async def read(self, within: float | None = None) -> bytes:
+        """Bytes from the host, at least one; waits for ever while nothing is plugged in or open.
+
+        Raises:
+            TimeoutError: nothing came ``within`` that many seconds.
+        """
+        return await self._received.read(within)
+
+    def write(self, data: bytes, after: float = 0.0) -> None:
+        """Send to the host ``after`` seconds, through baud pacing and line faults."""
+        for chunk in self.faults.corrupt(data):
+            self._out_free = self._paced(self._out_free, len(chunk), partial(self._emit, chunk), after)
+
+    def take(self, data: bytes) -> None:
+        """Bytes from the host enter the line."""
+        data = self.faults.shorten(data)
+        self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
+
+    def _paced(self, free: float, count: int, act: Callable[[], None], after: float = 0.0) -> float:
+        """Act when ``count`` bytes are through; ``free`` is when those before them are, the result when these are."""
+        delay = self.faults.delay + after
+        loop = asyncio.get_running_loop()
+        if self.baud is None and delay <= 0 and free <= loop.time():
+            act()
+            return free
+        # Timers of one instant fire in any order, bytes may not: keep them 0.1 us apart.
+        done = max(free + 1e-7, loop.time() + delay) + (count * 10 / self.baud if self.baud else 0.0)
+        loop.call_at(done, act)
+        return done
+
+    def _emit(self, data: bytes) -> None:
+        if self._deliver is not None and not self.faults.stalled:
+            if self.on_bytes is not None:
+                self.on_bytes(False, data)
+            self._deliver(data)
+
+    def _accept(self, data: bytes) -> None:
+        if not self.faults.deaf:
+            if self.on_bytes is not None:
+                self.on_bytes(True, data)
+            self._received.feed(data)
+
+
+class LineFaults:
+    """What can be wrong with a cable; all off by default. Randomness is set by ``seed``."""
+
+    def __init__(self) -> None:
+        self.stalled = False
+        """Nothing reaches the host."""
+        self.deaf = False
+        """Nothing reaches the device."""
+        self.delay = 0.0
+        """Seconds added to every transfer."""
+        self.chunk: int | None = None
+        """Deliver at most this many bytes at a time (1 = one-byte reads)."""
+        self.flip_rate = 0.0
+        """Probability that one bit of a byte is flipped."""
+        self.drop_rate = 0.0
+        """Probability that a byte is lost."""
+        self.garbage = b""
+        """Sent once before the next bytes."""
+        self.short_writes = 0
+        """So many of the host's next writes of several bytes end half-way."""
+        self._state = 0x9E3779B9
+
+    def seed(self, seed: int) -> None:
+        """Make the faults reproducible."""
+        self._state = (seed * 2654435761 + 1) & 0xFFFFFFFF
+
+    def corrupt(self, data: bytes) -> list[bytes]:
+        """Apply the faults; returns the chunks to deliver."""
+        if self.garbage:
+            data, self.garbage = self.garbage + data, b""
+        if self.flip_rate or self.drop_rate:
+            out = bytearray()
+            for byte in data:
+                if self._random() < self.drop_rate:
+                    continue
+                out.append(byte ^ (1 << int(self._random() * 8)) if self._random() < self.flip_rate else byte)
+            data = bytes(out)
+        if self.chunk is None:
+            return [data] if data else []
+        return [data[i : i + self.chunk] for i in range(0, len(data), self.chunk)]
+
+    def shorten(self, data: bytes) -> bytes:
+        """What of one write of the host enters the line."""
+        if self.short_writes <= 0 or len(data) < 2:
+            return data
+        self.short_writes -= 1
+        return data[: len(data) // 2]
+
+    def _random(self) -> float:
+        self._state ^= (self._state << 13) & 0xFFFFFFFF
+        self._state ^= self._state >> 17
+        self._state ^= (self._state << 5) & 0xFFFFFFFF
+        return self._state / 2**32
+
+
+class EmulatedPort(Protocol):
+    """A port whose device is emulated: can be plugged and unplugged."""
+
+    name: str
+    device: DeviceEnd
+
+    def plug(self) -> None:
+        """Connect the cable."""
+        ...
+
+    def unplug(self) -> None:
+        """Pull the cable: the host's link is lost."""
+        ...
+
+
+class MemoryPort:
+    """Port and device end in one process, for the virtual clock."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.device = DeviceEnd(name)
+        self._plugged = False
+        self._link: Link | None = None
+
+    @property
+    def plugged(self) -> bool:
+        """True while the cable is in."""
+        return self._plugged
+
+    def plug(self) -> None:
+        """Connect the cable."""
+        if not self._plugged:
+            self._plugged = True
+            if self.device.on_plug is not None:
+                self.device.on_plug(True)
+
+    def unplug(self) -> None:
+        """Pull the cable: an open link is lost."""
+        if self._plugged:
+            self._plugged = False
+            self.device.connect(None)
+            link, self._link = self._link, None
+            if link is not None:
+                link.lose("unplugged")
+            if self.device.on_plug is not None:
+                self.device.on_plug(False)
+
+    async def open(self) -> Link:
+        """Open the host side.
+
+        Raises:
+            DeviceLostError: nothing is plugged in.
+            PortBusyError: it is open already.
+        """
+        if not self._plugged:
+            raise DeviceLostError(f"{self.name}: not plugged in")
+        if self._link is not None:
+            raise PortBusyError(f"{self.name}: held by another process")
+        link = Link(self.name, self.device.take, self._hang_up)
+        self._link = link
+        self.device.connect(link.feed)
+        return link
+
+    def _hang_up(self) -> None:
+        self._link = None
+        self.device.connect(None)
