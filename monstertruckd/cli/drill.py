@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.cli.robot import JsonOption
+from monstertruckd.cli.output import JsonOption
 
 if TYPE_CHECKING:
     from monstertruckd.sim.drill import Drill, Outcome, Report

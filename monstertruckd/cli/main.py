@@ -1,16 +1,14 @@
-"""The ``monstertruckd`` command: mounts the command groups and turns expected errors into exit codes."""
-
-import os
-import sys
+"""The ``monstertruckd`` command: mounts the command groups."""
 
 import typer
 
-from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruckd import __version__
 from monstertruckd.cli import demo, devices, drill, kinematics, live, logs, robot, usb
+from monstertruckd.cli.output import CommandGroup
 
 app = typer.Typer(
     name="monstertruckd",
+    cls=CommandGroup,
     help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -49,16 +47,8 @@ app.add_typer(kinematics.app, name="kinematics")
 
 
 def main() -> None:
-    """Run the command line; expected errors become one line and the reason's exit code."""
-    try:
-        app()
-    except TruckError as error:
-        print(error, file=sys.stderr)
-        reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
-        sys.exit(reason.exit_code)
-    except BrokenPipeError:  # e.g. `monstertruckd echo | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+    """Run the command line."""
+    app()
 
 
 if __name__ == "__main__":

@@ -1,19 +1,16 @@
 """Commands of the robot itself: run the daemon, check its configuration, print its topic table."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-PIPE_WIDTH = 200
-"""Columns of a table nobody looks at on a terminal: wide enough to cut nothing."""
+from monstertruckd.cli.output import JsonOption, print_json, print_table
 
 ConfigOption = Annotated[
     Path, typer.Option("--config", "-c", help="Configuration of this robot or experiment (YAML).", show_default=False)
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
 
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
@@ -54,9 +51,6 @@ def _short(value: Any) -> str:
 
 def topics(json_output: JsonOption = False) -> None:
     """Print the topic table: every key, its message, rate, writer and who keeps it."""
-    from rich.console import Console
-    from rich.table import Table
-
     from monstertruck_schemas.topics import TOPICS
 
     if json_output:
@@ -74,22 +68,22 @@ def topics(json_output: JsonOption = False) -> None:
             }
             for topic in TOPICS
         ]
-        typer.echo(json.dumps(rows, indent=2))
+        print_json(rows)
         return
-    table = Table(title="Topics: mt/<robot>/<name>", box=None, header_style="bold")
-    for heading in ("name", "schema", "Hz", "stale s", "writer", "kept", "what"):
-        table.add_column(
-            heading, no_wrap=heading != "what", justify="right" if heading in ("Hz", "stale s") else "left"
-        )
-    for topic in TOPICS:
-        kept = " ".join(word for word, is_so in (("logged", topic.logged), ("retained", topic.retained)) if is_so)
-        table.add_row(
-            topic.name,
-            topic.schema_name,
-            "" if topic.rate is None else f"{topic.rate:g}",
-            "" if topic.stale_after is None else f"{topic.stale_after:g}",
-            topic.writer.value,
-            kept,
-            topic.doc,
-        )
-    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)
+    print_table(
+        ("name", "schema", "Hz", "stale s", "writer", "kept", "what"),
+        [
+            (
+                topic.name,
+                topic.schema_name,
+                "" if topic.rate is None else f"{topic.rate:g}",
+                "" if topic.stale_after is None else f"{topic.stale_after:g}",
+                topic.writer.value,
+                " ".join(word for word, is_so in (("logged", topic.logged), ("retained", topic.retained)) if is_so),
+                topic.doc,
+            )
+            for topic in TOPICS
+        ],
+        right=("Hz", "stale s"),
+        title="Topics: mt/<robot>/<name>",
+    )

@@ -1,0 +1,196 @@
+"""One habit for every command: ``--json``, plain text in pipes, progress on long work, exit codes by reason.
+
+Results go to standard output, everything else (remarks, progress, errors) to standard error. Errors are raised as
+``TruckError``; ``CommandGroup`` prints them as one sentence and ends with their reason's exit code. Ctrl-C and SIGTERM
+mean the same: commands that run until they are told to end do so with 0 (``until_stopped``), all others give up with
+``CANCELLED``.
+"""
+
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from enum import Enum
+from pathlib import PurePath
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from pydantic import BaseModel
+from typer.core import TyperGroup
+
+from monstertruck_runtime.clock import WallClock, run_wall
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
+from monstertruck_schemas.reasons import Reason
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from typer._click import Context
+
+PIPE_WIDTH: Final = 200
+"""Columns of text nobody looks at on a terminal: wide enough to cut nothing."""
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
+
+
+def print_json(value: Any, *, indent: int | None = 2) -> None:
+    """Print one JSON value; models and enums become plain, what is not finite becomes null.
+
+    Args:
+        value: built of mappings, sequences, models, scalars.
+        indent: None = on one line, for streams of values.
+    """
+    print(json.dumps(_plain(value), indent=indent, allow_nan=False), flush=indent is None)
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case BaseModel():
+            return _plain(value.model_dump(mode="json"))
+        case Enum():
+            return value.value
+        case PurePath():
+            return str(value)
+        case float():
+            return value if math.isfinite(value) else None
+        case Mapping():
+            return {str(key): _plain(inner) for key, inner in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [_plain(inner) for inner in value]
+        case _:
+            return value
+
+
+def console(*, error: bool = False) -> "Console":
+    """Where styled text goes: plain and uncut unless somebody looks at it."""
+    from rich.console import Console
+
+    class PipedConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    stream = sys.stderr if error else sys.stdout
+    width = None if stream.isatty() else PIPE_WIDTH
+    return PipedConsole(stderr=error, width=width, highlight=False, soft_wrap=not stream.isatty())
+
+
+def print_table(
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    right: Sequence[str] = (),
+    title: str | None = None,
+) -> None:
+    """Print rows under headings: on a terminal as a table that folds, in a pipe one unfolded line for each row.
+
+    Args:
+        headings: one per column.
+        rows: cells.
+        right: headings of the columns set to the right, the numbers.
+        title: a line above, on terminals only.
+    """
+    if not sys.stdout.isatty():
+        print("\n".join(_aligned(headings, rows, right)))
+        return
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", pad_edge=False, title=title, title_justify="left")
+    for heading in headings:
+        last = heading == headings[-1]
+        table.add_column(heading, justify="right" if heading in right else "left", no_wrap=not last, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[str]) -> list[str]:
+    lines = [list(headings), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    to_the_right = [heading in right for heading in headings]
+    return [
+        "  ".join(
+            cell.rjust(width) if on_right else cell.ljust(width)
+            for cell, width, on_right in zip(line, widths, to_the_right, strict=True)
+        ).rstrip()
+        for line in lines
+    ]
+
+
+def remark(text: str) -> None:
+    """Say something beside the result."""
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def progress(what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
+    """A bar on standard error, if somebody looks at it; yields a function that sets how much of ``total`` is done.
+
+    Args:
+        what: is being done, in a word or two.
+        total: amount; None = unknown.
+    """
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=console(error=True), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def finish(reason: Reason, text: str = "") -> None:
+    """End the command by ``reason``: with its exit code, and a sentence if that is not zero.
+
+    Raises:
+        Exit: the reason is no success.
+    """
+    if reason.exit_code:
+        remark(text or reason.text)
+        raise typer.Exit(reason.exit_code)
+
+
+def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> None:
+    """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM: its ordinary ends."""
+    with suppress(KeyboardInterrupt):
+        run_wall(main)
+
+
+class CommandGroup(TyperGroup):
+    """The root of the command line: turns expected errors, interrupts and closed pipes into exit codes."""
+
+    def invoke(self, ctx: "Context") -> Any:
+        """Run the chosen command."""
+        before = signal.signal(signal.SIGTERM, _interrupt)
+        try:
+            return self._invoke_and_flush(ctx)
+        except TruckError as error:
+            reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+            remark(str(error) or reason.text)
+            raise typer.Exit(reason.exit_code) from None
+        except KeyboardInterrupt:
+            remark(Reason.CANCELLED.text)
+            raise typer.Exit(Reason.CANCELLED.exit_code) from None
+        except BrokenPipeError:  # e.g. `monstertruckd echo | head`: the reader has all it wants
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit from None
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+    def _invoke_and_flush(self, ctx: "Context") -> Any:
+        try:
+            return super().invoke(ctx)
+        finally:
+            sys.stdout.flush()
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """SIGTERM does what Ctrl-C does at that moment, even where a shell made a job in the background ignore that."""
+    handler = signal.getsignal(signal.SIGINT)
+    if callable(handler):
+        handler(signal.SIGINT, frame)
+    else:
+        raise KeyboardInterrupt

@@ -1,0 +1,124 @@
+"""The habit all commands share: values, tables, progress and ends."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+
+from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.cli.output import CommandGroup, finish, print_json, print_table, progress, until_stopped
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def ending(command: Callable[[], None]) -> int:
+    """Exit code of a command line with this one command."""
+    app = typer.Typer(cls=CommandGroup)
+    app.callback()(lambda: None)
+    app.command("do")(command)
+    with pytest.raises(SystemExit) as ended:
+        app(["do"])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ConfigError("a.yaml:3: wrong"), 2),
+        (NotFoundError("no such robot"), 4),
+        (RequestRefusedError(Reason.OBSTACLE_STOP, "a wall"), 56),
+    ],
+)
+def test_an_error_is_one_sentence_and_its_reasons_code(
+    error: TruckError, code: int, capsys: pytest.CaptureFixture[str]
+):
+    def command() -> None:
+        raise error
+
+    assert ending(command) == code
+    streams = capsys.readouterr()
+    assert (streams.out, streams.err) == ("", f"{error}\n")
+
+
+def test_an_interrupt_gives_up_but_is_the_ordinary_end_of_what_runs_until_stopped():
+    def finite() -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    def endless() -> None:
+        async def main(clock: object) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            await clock.sleep(10.0)  # type: ignore[attr-defined]
+
+        until_stopped(main)
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert ending(finite) == Reason.CANCELLED.exit_code
+    assert ending(endless) == 0
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_sigterm_counts_where_ctrl_c_is_ignored():
+    """As for a job that a script starts in the background."""
+
+    def command() -> None:
+        async def main(clock: object) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            await clock.sleep(10.0)  # type: ignore[attr-defined]
+
+        until_stopped(main)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert ending(command) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_reader_that_leaves_is_no_failure():
+    read, write = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "monstertruckd", "topics"], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True
+    )
+    os.close(read)
+    os.close(write)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (0, "")
+
+
+def test_finish_is_silent_about_success_only(capsys: pytest.CaptureFixture[str]):
+    finish(Reason.GOAL_REACHED)
+    with pytest.raises(typer.Exit) as ended:
+        finish(Reason.PATH_LOST)
+    assert ended.value.exit_code == Reason.PATH_LOST.exit_code
+    assert capsys.readouterr().err == f"{Reason.PATH_LOST.text}\n"
+
+
+def test_json_is_strict_whatever_it_is_made_of(capsys: pytest.CaptureFixture[str]):
+    print_json({"pose": Pose2D(x=1.0, y=2.0, yaw=0.5), "far": (float("inf"), 1.5), "why": Reason.OK, "at": Path("a/b")})
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == {"pose": {"x": 1.0, "y": 2.0, "yaw": 0.5}, "far": [None, 1.5], "why": "ok", "at": "a/b"}
+    print_json([1, 2], indent=None)
+    assert capsys.readouterr().out == "[1, 2]\n"
+
+
+def test_a_piped_table_is_a_line_for_each_row_whatever_its_width(capsys: pytest.CaptureFixture[str]):
+    print_table(("name", "Hz", "what"), [("a", "5", "word " * 60), ("long", "12.5", "")], right=("Hz",), title="seen")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "name    Hz  what"
+    assert lines[1].startswith("a        5  word word")
+    assert lines[2] == "long  12.5"
+    assert not any(line.endswith(" ") for line in lines)
+
+
+def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture[str]):
+    with progress("reading", total=10) as done:
+        done(5)
+    assert capsys.readouterr() == ("", "")
