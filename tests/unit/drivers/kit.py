@@ -2,9 +2,11 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
-from typing import Any, Generic, TypeVar
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any, Generic, Protocol, TypeVar
 
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -30,24 +32,16 @@ class Kept(Generic[M]):
         self.kept.append(message)
         self._more.set()
 
-    async def count(self, more: int) -> None:
-        """Wait for so many messages from now on."""
-        wanted = len(self.kept) + more
-        async with asyncio.timeout(30):
+    async def total(self, wanted: int) -> None:
+        """Wait until so many messages have come in all."""
+        async with asyncio.timeout(60):
             while len(self.kept) < wanted:
                 self._more.clear()
                 await self._more.wait()
 
-
-class Latest(Generic[M]):
-    """Subscription of which only ``latest`` is used."""
-
-    def __init__(self) -> None:
-        self.latest: M | None = None
-        self.drops = 0
-
-    async def next(self) -> M:
-        raise NotImplementedError
+    async def count(self, more: int) -> None:
+        """Wait for so many messages from now on."""
+        await self.total(len(self.kept) + more)
 
 
 class Events:
@@ -62,7 +56,7 @@ class Events:
 
 
 @contextlib.asynccontextmanager
-async def background(coroutine: Any) -> AsyncIterator[asyncio.Task[Any]]:
+async def background(coroutine: Coroutine[Any, Any, Any]) -> AsyncIterator[asyncio.Task[Any]]:
     """Runs beside the test; a failure is raised at the end."""
     task = asyncio.create_task(coroutine)
     try:
@@ -71,3 +65,46 @@ async def background(coroutine: Any) -> AsyncIterator[asyncio.Task[Any]]:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+
+
+class Driver(Protocol):
+    async def run(self, ready: Callable[[], None]) -> None: ...
+
+
+class DriverRig:
+    """One driver on its port, and what came out; a device's own rig adds the emulator and the topics."""
+
+    driver: Driver
+
+    def __init__(self, clock: Clock, port: EmulatedPort | None) -> None:
+        self.clock = clock
+        self.port: EmulatedPort = port or MemoryPort("/dev/test")
+        self.events = Events()
+        self.ready_at: list[int] = []
+
+    def ready(self) -> None:
+        self.ready_at.append(self.clock.now())
+
+    async def session(self) -> None:
+        """One session of the driver, to its end."""
+        await self.driver.run(self.ready)
+
+    def driving(self) -> contextlib.AbstractAsyncContextManager[asyncio.Task[Any]]:
+        """The driver serves in the background; a failure of its session is raised at the end."""
+        return background(self.session())
+
+    async def settle(self, seconds: float) -> None:
+        await self.clock.sleep(seconds)
+
+    @contextlib.asynccontextmanager
+    async def plugged_in(self, *devices: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+        """The emulator, and what else belongs to the bench, runs and the cable is in."""
+        async with contextlib.AsyncExitStack() as stack:
+            for device in devices:
+                await stack.enter_async_context(background(device))
+            await asyncio.sleep(0)  # the emulator watches its plug now
+            self.port.plug()
+            try:
+                yield
+            finally:
+                self.port.unplug()

@@ -22,7 +22,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
-from tests.unit.drivers.ax12.rig import background
+from tests.unit.drivers.kit import background
 
 CONFIG = StabiliserConfig()
 angles = st.floats(-1.2, 1.2)

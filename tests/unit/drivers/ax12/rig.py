@@ -1,8 +1,7 @@
 """Bench for the stabiliser's servos: emulated bus, port, driver, what was wished and what came out."""
 
-import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
 from monstertruck_drivers.ax12.config import Ax12Config
@@ -10,79 +9,28 @@ from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Packet, Parser
 from monstertruck_drivers.ax12.unit import Unit
-from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox, latest
-from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import StabiliserCommand
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import StabiliserFeedback
+from tests.unit.drivers.kit import DriverRig, Kept
 
 LEVEL = {1: 511.0, 2: 204.0}
 """Shafts with the lidar level."""
 FAST = Ax12Config(usb_latency=0.001)
 
 
-class Kept:
-    """Publisher that keeps everything."""
-
-    def __init__(self) -> None:
-        self.kept: list[StabiliserFeedback] = []
-
-    def next_seq(self) -> int:
-        return len(self.kept)
-
-    def put(self, message: StabiliserFeedback) -> None:
-        self.kept.append(message)
-
-
-class Events:
-    def __init__(self) -> None:
-        self.kept: list[tuple[Reason, Severity, str, dict[str, Any]]] = []
-
-    def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Any) -> None:
-        self.kept.append((reason, severity, text, values))
-
-    def reasons(self) -> list[Reason]:
-        return [reason for reason, *_ in self.kept]
-
-
-@contextlib.asynccontextmanager
-async def background(coroutine: Coroutine[Any, Any, None]) -> AsyncIterator[asyncio.Task[None]]:
-    task = asyncio.create_task(coroutine)
-    try:
-        yield task
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-class Rig:
-    def __init__(self, clock: Clock, port: EmulatedPort, config: Ax12Config, **bus: Any) -> None:
-        self.clock = clock
-        self.port = port
+class Rig(DriverRig):
+    def __init__(self, clock: Clock, port: EmulatedPort | None, config: Ax12Config, **bus: Any) -> None:
+        super().__init__(clock, port)
         self.config = config
         self.bus = Ax12Bus(clock, **({"positions": LEVEL} | bus))
         self.commands: Mailbox[StabiliserCommand] = Mailbox(latest())
-        self.out = Kept()
-        self.events = Events()
-        self.ready_at: list[int] = []
-        self.driver = Ax12Driver(config, port, clock, self.commands, self.out, self.events)
+        self.out: Kept[StabiliserFeedback] = Kept()
+        self.driver = Ax12Driver(config, self.port, clock, self.commands, self.out, self.events)
         self._seq = 0
-
-    def ready(self) -> None:
-        self.ready_at.append(self.clock.now())
-
-    async def session(self) -> None:
-        await self.driver.run(self.ready)
-
-    @contextlib.asynccontextmanager
-    async def driving(self) -> AsyncIterator[asyncio.Task[None]]:
-        """The driver serves in the background; a failure of its session is raised at the end."""
-        async with background(self.session()) as task:
-            yield task
 
     def wish(self, pitch: float, roll: float, age: float = 0.0) -> None:
         now = self.clock.now() - round(age * 1e9)
@@ -97,9 +45,6 @@ class Rig:
 
     def unit(self, ident: int) -> Unit:
         return next(unit for unit in self.bus.units if unit.get(ID) == ident)
-
-    async def settle(self, seconds: float) -> None:
-        await self.clock.sleep(seconds)
 
 
 class Host:
@@ -131,14 +76,10 @@ async def bench(
     clock: Clock, config: Ax12Config | None = None, *, port: EmulatedPort | None = None, **bus: Any
 ) -> AsyncIterator[Rig]:
     """Bus plugged in and running; the driver is started by the test."""
-    rig = Rig(clock, port or MemoryPort("/dev/test"), config or FAST, **bus)
+    rig = Rig(clock, port, config or FAST, **bus)
     rig.port.device.baud = BAUD
-    async with background(rig.bus.run(rig.port.device)):
-        rig.port.plug()
-        try:
-            yield rig
-        finally:
-            rig.port.unplug()
+    async with rig.plugged_in(rig.bus.run(rig.port.device)):
+        yield rig
 
 
 @contextlib.asynccontextmanager

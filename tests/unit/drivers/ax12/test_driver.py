@@ -19,7 +19,8 @@ from monstertruck_runtime.errors import (
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import TorqueState
-from tests.unit.drivers.ax12.rig import FAST, Rig, background, bench
+from tests.unit.drivers.ax12.rig import FAST, Rig, bench
+from tests.unit.drivers.kit import background
 
 STEP = p.STEP
 ALARM = AlarmConfig(rest=1.0, rest_max=4.0, settled_after=10.0)

@@ -11,7 +11,8 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
-from tests.unit.drivers.ax12.rig import FAST, Rig, background, bench
+from tests.unit.drivers.ax12.rig import FAST, Rig, bench
+from tests.unit.drivers.kit import background
 
 pytestmark = pytest.mark.virtual
 

@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import TorqueState
-from tests.unit.drivers.ax12.rig import Events, Kept, background
+from tests.unit.drivers.kit import Events, Kept, background
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ from monstertruck_drivers.ax12.session import Session
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
-from tests.unit.drivers.ax12.rig import background
+from tests.unit.drivers.kit import background
 
 
 class Script:

@@ -12,10 +12,11 @@ from monstertruck_drivers.battery.driver import IioBatteryDriver
 from monstertruck_drivers.battery.emulator import IioEmulator
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, InputError, ProtocolError
+from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
-from tests.unit.drivers.kit import Events, Kept, Latest, background
+from tests.unit.drivers.kit import Events, Kept, background
 
 pytestmark = pytest.mark.virtual
 
@@ -27,7 +28,7 @@ class Rig:
         self.emulator = IioEmulator(root, clock, lambda _: self.volts / 10)
         self.out: Kept[Battery] = Kept()
         self.events = Events()
-        self.drive: Latest[DriveFeedback] = Latest()
+        self.drive: Mailbox[DriveFeedback] = Mailbox(latest())
         self.ready = 0
         self.driver = IioBatteryDriver(
             IioConfig(**config), clock, self.out, self.events, self.drive, root=root, offload=inline
@@ -35,9 +36,10 @@ class Rig:
 
     def current(self, amperes: float | None) -> None:
         now = self.clock.now()
-        self.drive.latest = DriveFeedback(
+        feedback = DriveFeedback(
             stamp=now, received=now, seq=0, position=0.0, velocity=0.0, current=amperes, mode=DriveMode.ENABLED
         )
+        self.drive.put(feedback)
 
     async def session(self) -> None:
         def ready() -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Coroutine
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,64 +18,20 @@ from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
 from monstertruck_drivers.epos.protocol import Opcode
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.service import supervise
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
-from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
+from tests.unit.drivers.kit import DriverRig, Kept, background
 
-M = TypeVar("M")
 BAUD = 38_400
-
-
-class Kept(Generic[M]):
-    """Publisher that keeps everything."""
-
-    def __init__(self) -> None:
-        self.kept: list[M] = []
-
-    def next_seq(self) -> int:
-        return len(self.kept)
-
-    def put(self, message: M) -> None:
-        self.kept.append(message)
-
-
-class Commands:
-    """Latest-only subscription that a test fills."""
-
-    def __init__(self) -> None:
-        self.latest: DriveCommand | None = None
-        self.drops = 0
-        self._new = asyncio.Event()
-
-    def put(self, command: DriveCommand) -> None:
-        self.latest = command
-        self._new.set()
-
-    async def next(self) -> DriveCommand:
-        await self._new.wait()
-        self._new.clear()
-        assert self.latest is not None
-        return self.latest
-
-
-class Events:
-    def __init__(self) -> None:
-        self.kept: list[tuple[Reason, Severity, str, dict[str, Any]]] = []
-
-    def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Any) -> None:
-        self.kept.append((reason, severity, text, values))
-
-    def reasons(self) -> list[Reason]:
-        return [reason for reason, *_ in self.kept]
 
 
 class Gate:
     """Sends drive commands at 50 Hz while ``talking``, and at once when told."""
 
-    def __init__(self, clock: Clock, commands: Commands) -> None:
+    def __init__(self, clock: Clock, commands: Mailbox[DriveCommand]) -> None:
         self.action = DriveAction.DISABLE
         self.rpm = 0.0
         self.talking = True
@@ -100,32 +56,16 @@ class Gate:
             await self._clock.sleep(0.02)
 
 
-class Rig:
-    def __init__(self, clock: Clock, port: EmulatedPort, config: EposConfig, **emulator: Any) -> None:
-        self.clock = clock
-        self.port = port
+class Rig(DriverRig):
+    def __init__(self, clock: Clock, port: EmulatedPort | None, config: EposConfig, **emulator: Any) -> None:
+        super().__init__(clock, port)
         self.motor = FreeMotor()
         self.emulator = EposEmulator(clock, self.motor, **emulator)
-        self.commands = Commands()
+        self.commands: Mailbox[DriveCommand] = Mailbox(latest())
         self.gate = Gate(clock, self.commands)
         self.out: Kept[DriveFeedback] = Kept()
-        self.events = Events()
-        self.ready_at: list[int] = []
         self.health: list[ServiceHealth] = []
-        self.driver = EposDriver(config, port, clock, self.commands, self.out, self.events)
-
-    def ready(self) -> None:
-        self.ready_at.append(self.clock.now())
-
-    async def session(self) -> None:
-        """One session of the driver, to its end."""
-        await self.driver.run(self.ready)
-
-    @contextlib.asynccontextmanager
-    async def driving(self) -> AsyncIterator[asyncio.Task[Any]]:
-        """One session in the background; a failure of it is raised at the end."""
-        async with background(self.session()) as task:
-            yield task
+        self.driver = EposDriver(config, self.port, clock, self.commands, self.out, self.events)
 
     @contextlib.asynccontextmanager
     async def supervised(self) -> AsyncIterator[asyncio.Task[Any]]:
@@ -143,9 +83,6 @@ class Rig:
     @property
     def newest(self) -> DriveFeedback:
         return self.out.kept[-1]
-
-    async def settle(self, seconds: float) -> None:
-        await self.clock.sleep(seconds)
 
     async def until(self, true: Callable[[], bool], limit: float = 5.0) -> float:
         """Wait for a condition; seconds it took."""
@@ -173,31 +110,14 @@ class Rig:
 
 
 @contextlib.asynccontextmanager
-async def background(coroutine: Coroutine[Any, Any, Any]) -> AsyncIterator[asyncio.Task[Any]]:
-    task = asyncio.create_task(coroutine)
-    try:
-        yield task
-    finally:
-        if not task.done():  # otherwise the test has seen how it ended
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
-
-
-@contextlib.asynccontextmanager
 async def bench(
     clock: Clock, config: EposConfig | None = None, *, port: EmulatedPort | None = None, **emulator: Any
 ) -> AsyncIterator[Rig]:
     """Emulator plugged in and running, gate talking (DISABLE at first); the driver is started by the test."""
-    rig = Rig(clock, port or MemoryPort("/dev/test"), config or EposConfig(), **emulator)
+    rig = Rig(clock, port, config or EposConfig(), **emulator)
     rig.port.device.baud = BAUD
-    async with background(rig.emulator.run(rig.port.device)), background(rig.gate.run()):
-        await asyncio.sleep(0)
-        rig.port.plug()
-        try:
-            yield rig
-        finally:
-            rig.port.unplug()
+    async with rig.plugged_in(rig.emulator.run(rig.port.device), rig.gate.run()):
+        yield rig
 
 
 def on_bench(

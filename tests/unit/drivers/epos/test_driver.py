@@ -31,7 +31,8 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveMode
-from tests.unit.drivers.epos.rig import Rig, background, bench, on_bench
+from tests.unit.drivers.epos.rig import Rig, bench, on_bench
+from tests.unit.drivers.kit import background
 
 
 def controls(rig: Rig) -> list[int]:
@@ -520,13 +521,13 @@ def test_after_a_stall_it_stops_within_the_limit(seconds: float):
 
 def test_silence_ends_the_session():
     async def test(rig: Rig) -> None:
-        async with rig.driving() as task:
-            await rig.drive(1_000)
-            rig.emulator.inject("silent", "on")
-            start = rig.clock.now()
-            with pytest.raises(DeviceTimeoutError):
+        with pytest.raises(DeviceTimeoutError):
+            async with rig.driving() as task:
+                await rig.drive(1_000)
+                rig.emulator.inject("silent", "on")
+                start = rig.clock.now()
                 await task
-            assert 1.0 < (rig.clock.now() - start) / SECOND < 2.5
+        assert 1.0 < (rig.clock.now() - start) / SECOND < 2.5
 
     on_bench(test)
 
@@ -606,11 +607,11 @@ def test_after_a_loss_in_the_middle_of_an_exchange_nothing_is_sent_before_the_co
 
 def test_a_quick_restart_is_noticed_by_the_state():
     async def test(rig: Rig) -> None:
-        async with rig.driving() as task:
-            await rig.drive(6_000)
-            rig.emulator.firmware.shut_down()
-            rig.emulator.firmware.boot()
-            with pytest.raises(DeviceLostError, match="restarted"):
+        with pytest.raises(DeviceLostError, match="restarted"):
+            async with rig.driving() as task:
+                await rig.drive(6_000)
+                rig.emulator.firmware.shut_down()
+                rig.emulator.firmware.boot()
                 await task
 
     on_bench(test)
@@ -704,9 +705,9 @@ def test_a_fault_that_comes_back_on_enabling_uses_up_the_resets():
                 await rig.until(lambda: rig.emulator.state is State.ENABLED, 60)
                 rig.emulator.inject("fault", "over_current", "passing")
 
-        async with background(failing()), rig.driving() as task:
-            rig.gate.say(DriveAction.RUN, 6_000)
-            with pytest.raises(DeviceFaultError):
+        with pytest.raises(DeviceFaultError):
+            async with background(failing()), rig.driving() as task:
+                rig.gate.say(DriveAction.RUN, 6_000)
                 await task
         assert controls(rig).count(Control.FAULT_RESET) == 3
 

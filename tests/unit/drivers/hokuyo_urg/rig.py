@@ -1,9 +1,7 @@
 """Bench for the scanner: emulator, port, driver and what came out of it."""
 
-import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,9 +12,8 @@ from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_schemas.event import Severity
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
+from tests.unit.drivers.kit import DriverRig, Kept
 
 STEP_NS = SECOND / 10 / 1024
 
@@ -34,66 +31,14 @@ class Pattern:
         return values
 
 
-class Scans:
-    """Publisher that keeps everything."""
-
-    def __init__(self) -> None:
-        self.kept: list[LaserScan] = []
-        self._seq = -1
-        self._more = asyncio.Event()
-
-    def next_seq(self) -> int:
-        self._seq += 1
-        return self._seq
-
-    def put(self, message: LaserScan) -> None:
-        self.kept.append(message)
-        self._more.set()
-
-    async def count(self, wanted: int) -> None:
-        while len(self.kept) < wanted:
-            self._more.clear()
-            await self._more.wait()
-
-
-@dataclass
-class Events:
-    """Event sink that keeps everything."""
-
-    kept: list[tuple[Reason, Severity, str, dict[str, Any]]] = field(default_factory=list)
-
-    def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Any) -> None:
-        self.kept.append((reason, severity, text, values))
-
-    def reasons(self) -> list[Reason]:
-        return [kept[0] for kept in self.kept]
-
-
-class Rig:
+class Rig(DriverRig):
     """Everything on one bench."""
 
     def __init__(self, clock: Clock, port: EmulatedPort, emulator: HokuyoEmulator, config: HokuyoConfig) -> None:
-        self.clock = clock
-        self.port = port
+        super().__init__(clock, port)
         self.emulator = emulator
-        self.out = Scans()
-        self.events = Events()
-        self.ready_at: list[int] = []
+        self.out: Kept[LaserScan] = Kept()
         self.driver = HokuyoDriver(config, port, clock, self.out, self.events)
-
-    async def session(self) -> None:
-        await self.driver.run(lambda: self.ready_at.append(self.clock.now()))
-
-    @contextlib.asynccontextmanager
-    async def driving(self) -> AsyncIterator["asyncio.Task[None]"]:
-        """A running session, cancelled at the end; its failure surfaces."""
-        task = asyncio.create_task(self.session())
-        try:
-            yield task
-        finally:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
 
 
 @contextlib.asynccontextmanager
@@ -109,15 +54,9 @@ async def bench(
     """Emulator plugged in and running."""
     port = port or MemoryPort("lidar")
     emulator = emulator or HokuyoEmulator(clock, source or Pattern(), **kwargs)
-    port.plug()
-    device = asyncio.create_task(emulator.run(port.device))
-    try:
-        yield Rig(clock, port, emulator, config or HokuyoConfig())
-    finally:
-        port.unplug()
-        device.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await device
+    rig = Rig(clock, port, emulator, config or HokuyoConfig())
+    async with rig.plugged_in(emulator.run(port.device)):
+        yield rig
 
 
 async def talk(port: MemoryPort, clock: Clock, *requests: str, wait: float = 0.05) -> bytes:

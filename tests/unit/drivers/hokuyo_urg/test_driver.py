@@ -23,7 +23,8 @@ from monstertruck_runtime.errors import (
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from tests.unit.drivers.hokuyo_urg.rig import STEP_NS, Events, Pattern, Rig, Scans, bench
+from tests.unit.drivers.hokuyo_urg.rig import STEP_NS, Pattern, Rig, bench
+from tests.unit.drivers.kit import Events, Kept
 
 MS = 1_000_000
 
@@ -34,7 +35,7 @@ def test_every_start_state_ends_in_a_stream(state: str):
         async with bench(clock, state=state) as rig:
             start = clock.now()
             async with rig.driving():
-                await rig.out.count(5)
+                await rig.out.total(5)
             assert rig.ready_at[0] - start < 1.2 * SECOND
             return rig
 
@@ -54,7 +55,7 @@ def test_every_start_state_ends_in_a_stream(state: str):
 def test_ranges_and_codes_are_those_of_the_world():
     async def main(clock: VirtualClock) -> list[Any]:
         async with bench(clock) as rig, rig.driving():
-            await rig.out.count(4)
+            await rig.out.total(4)
             return rig.out.kept
 
     scans = run_virtual(main)
@@ -76,7 +77,7 @@ def test_stamps_are_those_of_the_first_beam(drift_ppm: float):
         source = Pattern()
         wrap = (1 << 24) - 2000
         async with bench(clock, source, timer_start=wrap, drift_ppm=drift_ppm, jitter=0.008) as rig, rig.driving():
-            await rig.out.count(300)
+            await rig.out.total(300)
             stamps = [scan.stamp for scan in rig.out.kept]
             received = [scan.received for scan in rig.out.kept]
             return stamps, received, source.times
@@ -93,9 +94,9 @@ def test_a_restarted_counter_is_reported_and_stamps_go_on():
     async def main(clock: VirtualClock) -> tuple[Rig, list[int]]:
         source = Pattern()
         async with bench(clock, source, timer_start=5_000_000) as rig, rig.driving():
-            await rig.out.count(70)
+            await rig.out.total(70)
             rig.emulator.inject("timer", "0")
-            await rig.out.count(100)
+            await rig.out.total(100)
             return rig, source.times
 
     rig, begun = run_virtual(main)
@@ -109,7 +110,7 @@ def test_cluster_skip_and_short_format():
 
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock, config=config) as rig, rig.driving():
-            await rig.out.count(3)
+            await rig.out.total(3)
             return rig
 
     rig = run_virtual(main)
@@ -128,7 +129,7 @@ def test_an_old_unit_is_polled_in_its_own_dialect():
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock, firmware="2.2.5(04/Jun./2004)") as rig:
             async with rig.driving():
-                await rig.out.count(20)
+                await rig.out.total(20)
             return rig
 
     rig = run_virtual(main)
@@ -145,7 +146,7 @@ def test_chunks_of_any_size(chunk: int | None):
         async with bench(clock) as rig:
             rig.port.device.faults.chunk = chunk
             async with rig.driving():
-                await rig.out.count(5)
+                await rig.out.total(5)
             return rig
 
     assert run_virtual(main).driver.dropped == 0
@@ -156,7 +157,7 @@ def test_everything_in_one_read():
 
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock) as rig, rig.driving():
-            await rig.out.count(10)
+            await rig.out.total(10)
             held: list[bytes] = []
             deliver = rig.port.device._deliver
             assert deliver is not None
@@ -165,7 +166,7 @@ def test_everything_in_one_read():
                 await clock.sleep(0.05)
             rig.port.device.connect(deliver)
             deliver(b"".join(held))
-            await rig.out.count(16)
+            await rig.out.total(16)
             return rig
 
     rig = run_virtual(main)
@@ -181,11 +182,11 @@ def test_damaged_scans_are_dropped_and_the_rest_is_exact(flip: float, drop: floa
         source = Pattern()
         config = HokuyoConfig(max_bad_scans=20, stale_periods=20)
         async with bench(clock, source, config=config) as rig, rig.driving():
-            await rig.out.count(3)
+            await rig.out.total(3)
             faults = rig.port.device.faults
             faults.seed(4)
             faults.flip_rate, faults.drop_rate = flip, drop
-            await rig.out.count(30)
+            await rig.out.total(30)
             return rig, len(source.times)
 
     rig, sent = run_virtual(main)
@@ -204,11 +205,11 @@ def test_a_cut_line_costs_one_scan_and_garbage_none():
     async def main(clock: VirtualClock) -> tuple[Rig, int]:
         source = Pattern()
         async with bench(clock, source) as rig, rig.driving():
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.emulator.inject("cut")
-            await rig.out.count(10)
+            await rig.out.total(10)
             rig.port.device.faults.garbage = b"\x00\xff%%\nrubbish"
-            await rig.out.count(20)
+            await rig.out.total(20)
             return rig, len(source.times)
 
     rig, sent = run_virtual(main)
@@ -220,7 +221,7 @@ def test_too_many_damaged_scans_end_the_session():
     async def main(clock: VirtualClock) -> None:
         async with bench(clock, config=HokuyoConfig(stale_periods=50)) as rig:
             task = asyncio.create_task(rig.session())
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.port.device.faults.flip_rate = 0.02
             await task
 
@@ -232,7 +233,7 @@ def test_a_stall_ends_the_session_within_five_periods():
     async def main(clock: VirtualClock) -> int:
         async with bench(clock) as rig:
             task = asyncio.create_task(rig.session())
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.port.device.faults.stalled = True
             start = clock.now()
             with pytest.raises(DeviceTimeoutError, match="no good scan"):
@@ -245,12 +246,12 @@ def test_a_stall_ends_the_session_within_five_periods():
 def test_verification_is_waited_for():
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock) as rig, rig.driving():
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.emulator.inject("status", "21")
             await clock.sleep(3)
             assert len(rig.out.kept) == 3
             rig.emulator.inject("status", "98")
-            await rig.out.count(10)
+            await rig.out.total(10)
             return rig
 
     rig = run_virtual(main)
@@ -277,7 +278,7 @@ def test_hardware_trouble_resets_the_sensor_once_and_is_reported(fault: tuple[st
                 rig.emulator.inject(*fault)
             task = asyncio.create_task(rig.session())
             if fault[0] == "status":
-                await rig.out.count(2)
+                await rig.out.total(2)
                 rig.emulator.inject(*fault)
             with pytest.raises(DeviceFaultError):
                 await task
@@ -291,7 +292,7 @@ def test_a_lying_seri_line_split_by_an_empty_line_is_accepted():
         async with bench(clock, serial="H1234567") as rig:
             rig.emulator.inject("seri")
             async with rig.driving():
-                await rig.out.count(2)
+                await rig.out.total(2)
             return rig
 
     assert run_virtual(main).events.kept[0][3]["serial"] == "H1234567"
@@ -301,7 +302,7 @@ def test_cancellation_silences_the_sensor():
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock) as rig:
             async with rig.driving():
-                await rig.out.count(2)
+                await rig.out.total(2)
             heard = list(rig.emulator.received)
             assert heard[-1] == "QT"
             assert rig.emulator._order is None
@@ -314,7 +315,7 @@ def test_cancellation_does_not_wait_for_a_deaf_sensor():
     async def main(clock: VirtualClock) -> int:
         async with bench(clock) as rig:
             async with rig.driving():
-                await rig.out.count(2)
+                await rig.out.total(2)
                 rig.emulator.inject("deaf")
                 start = clock.now()
             return clock.now() - start
@@ -337,7 +338,7 @@ def test_a_killed_host_leaves_it_streaming_and_the_next_takes_over():
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock) as rig:
             task = asyncio.create_task(rig.session())
-            await rig.out.count(3)
+            await rig.out.total(3)
             assert isinstance(rig.port, MemoryPort)
             rig.port.device.connect(None)  # the process is gone: no QT reaches the sensor
             link = rig.port._link
@@ -349,7 +350,7 @@ def test_a_killed_host_leaves_it_streaming_and_the_next_takes_over():
             rig.port.device.take(b"MD00")  # and half a line was in its pipe
             await clock.sleep(1)
             async with rig.driving():
-                await rig.out.count(6)
+                await rig.out.total(6)
             return rig
 
     rig = run_virtual(main)
@@ -369,7 +370,7 @@ def test_another_device_on_the_port(answer: bytes):
 
         device = asyncio.create_task(other())
         try:
-            await HokuyoDriver(HokuyoConfig(), port, clock, Scans(), Events()).run(lambda: None)
+            await HokuyoDriver(HokuyoConfig(), port, clock, Kept(), Events()).run(lambda: None)
         finally:
             device.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -415,7 +416,7 @@ def test_another_scanner_that_speaks_scip(monkeypatch: pytest.MonkeyPatch):
 def test_two_hosts_on_one_port():
     async def main(clock: VirtualClock) -> None:
         async with bench(clock) as rig, rig.driving():
-            await rig.out.count(1)
+            await rig.out.total(1)
             await rig.session()
 
     with pytest.raises(PortBusyError):
@@ -431,7 +432,7 @@ def test_unplugged_and_replugged_is_back_within_two_seconds(powered: bool):
         async with bench(clock) as rig:
             service = supervise(rig.driver, RestartPolicy(), clock, health.append, np.random.default_rng(0))
             task = asyncio.create_task(service)
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.port.unplug()
             await clock.sleep(3)
             before = len(rig.out.kept)
@@ -439,7 +440,7 @@ def test_unplugged_and_replugged_is_back_within_two_seconds(powered: bool):
                 rig.emulator.power_cycle()
             rig.port.plug()
             start = clock.now()
-            await rig.out.count(before + 1)
+            await rig.out.total(before + 1)
             took = clock.now() - start
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -459,11 +460,11 @@ def test_a_sensor_that_restarts_under_the_driver_is_found_again():
         async with bench(clock) as rig:
             service = supervise(rig.driver, RestartPolicy(), clock, lambda _: None, np.random.default_rng(0))
             task = asyncio.create_task(service)
-            await rig.out.count(3)
+            await rig.out.total(3)
             rig.emulator.power_cycle()
             start = clock.now()
             before = len(rig.out.kept)
-            await rig.out.count(before + 2)
+            await rig.out.total(before + 2)
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
@@ -479,7 +480,7 @@ def test_over_rs232_a_clustered_scan_fits():
         async with bench(clock, config=config) as rig:
             rig.port.device.baud = 115200
             async with rig.driving():
-                await rig.out.count(30)
+                await rig.out.total(30)
             return rig
 
     rig = run_virtual(main)
@@ -489,7 +490,7 @@ def test_over_rs232_a_clustered_scan_fits():
 def test_two_runs_are_identical():
     async def main(clock: VirtualClock) -> list[Any]:
         async with bench(clock, jitter=0.01, drift_ppm=50, seed=3) as rig, rig.driving():
-            await rig.out.count(30)
+            await rig.out.total(30)
             return rig.out.kept
 
     assert run_virtual(main) == run_virtual(main)

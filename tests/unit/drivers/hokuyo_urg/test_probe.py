@@ -79,7 +79,7 @@ def test_probe_then_drive_over_a_real_pty(tmp_path: Path):
             found = await probe(rig.driver._port, clock)
             assert found["dialect"] == "SCIP 2.0"
             async with rig.driving(), asyncio.timeout(5):
-                await rig.out.count(3)
+                await rig.out.total(3)
             return rig
 
     rig = run_wall(main)

@@ -16,7 +16,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import build_reply
 from monstertruck_drivers.hokuyo_urg.session import Dialect, ScipSession
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
-from tests.unit.drivers.hokuyo_urg.rig import Events, Scans
+from tests.unit.drivers.kit import Events, Kept
 
 VV = {"VEND": "H", "PROD": "SOKUIKI Sensor URG-04LX", "FIRM": "3.1", "PROT": "SCIP 2.0", "SERI": "H1"}
 PP = {"MODL": "URG-04LX", "DMIN": 20, "DMAX": 5600, "ARES": 1024, "AMIN": 44, "AMAX": 725, "AFRT": 384, "SCAN": 600}
@@ -74,7 +74,7 @@ def drive(script: Script) -> None:
         port.plug()
         device = asyncio.create_task(script.run(port))
         try:
-            await HokuyoDriver(HokuyoConfig(), port, clock, Scans(), Events()).run(lambda: None)
+            await HokuyoDriver(HokuyoConfig(), port, clock, Kept(), Events()).run(lambda: None)
         finally:
             device.cancel()
             with contextlib.suppress(asyncio.CancelledError):

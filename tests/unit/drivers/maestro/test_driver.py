@@ -22,11 +22,13 @@ from monstertruck_runtime.errors import (
     ProtocolError,
     WrongDeviceError,
 )
+from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.health import ServiceHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import BatteryLevel, DriveFeedback, DriveMode
-from tests.unit.drivers.maestro.rig import Commands, Events, Gate, Kept, Rig, background, bench
+from tests.unit.drivers.kit import Events, Kept, background
+from tests.unit.drivers.maestro.rig import Gate, Rig, bench
 
 LINE = MaestroConfig(deadman_channel=2)
 
@@ -293,9 +295,10 @@ def test_the_motors_current_explains_the_batterys_sag():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("battery", "22.0")
         now = rig.clock.now()
-        rig.drive.latest = DriveFeedback(
+        feedback = DriveFeedback(
             stamp=now, received=now, seq=0, position=0.0, velocity=0.0, current=5.0, mode=DriveMode.ENABLED
         )
+        rig.drive.put(feedback)
         async with rig.driving():
             await rig.settle(0.5)
             battery = rig.battery.kept[-1]
@@ -520,7 +523,7 @@ async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
     clock = WallClock()
     pty = PtyPort(tmp_path / "servos")
     emulator = MaestroEmulator(clock)
-    commands, out, battery = Commands(), Kept(), Kept()
+    commands, out, battery = Mailbox(latest()), Kept(), Kept()
     gate = Gate(clock, commands)
     gate.front = 0.1
     driver = MaestroDriver(MaestroConfig(), SerialPort(tmp_path / "servos"), clock, commands, out, battery, Events())

@@ -13,7 +13,7 @@ from monstertruck_drivers.maestro.emulator import MaestroEmulator, Ramp
 from monstertruck_drivers.maestro.protocol import Encoder, Error, words
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, InputError
-from tests.unit.drivers.maestro.rig import background
+from tests.unit.drivers.kit import background
 
 E = Encoder()
 

@@ -27,7 +27,8 @@ from monstertruck_runtime.errors import (
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from tests.unit.drivers.os4000.rig import Attitudes, Events, Rig, background, bench
+from tests.unit.drivers.kit import Events, Kept, background
+from tests.unit.drivers.os4000.rig import Rig, bench
 
 
 def on_bench(test, config: Os4000Config | None = None, **options):
@@ -102,7 +103,7 @@ def test_every_start_state_ends_in_a_stream_as_configured(faults: list[tuple[str
         assert rig.emulator.settings.fields == 335
         assert rig.emulator.settings.format == 1
         assert rig.out.kept[-1].acceleration is not None
-        assert all(severity is Severity.INFO for _, severity, _ in rig.events.kept)
+        assert all(severity is Severity.INFO for _, severity, *_ in rig.events.kept)
 
     on_bench(test, **options)
 
@@ -126,7 +127,7 @@ def test_a_setting_that_does_not_stick_is_reported_and_lived_with():
         rig.emulator.inject("drift", "-0.5")
         async with rig.driving():
             await rig.out.count(5)
-        assert [severity for _, severity, _ in rig.events.kept] == [Severity.INFO, Severity.WARNING]
+        assert [severity for _, severity, *_ in rig.events.kept] == [Severity.INFO, Severity.WARNING]
         assert "even after setting it" in rig.events.kept[-1][2]
 
     on_bench(test)
@@ -353,7 +354,7 @@ async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
     clock = WallClock()
     pty = PtyPort(tmp_path / "compass")
     emulator = Os4000Emulator(clock)
-    out = Attitudes()
+    out = Kept()
     driver = Os4000Driver(Os4000Config(), SerialPort(tmp_path / "compass", 19200), clock, out, Events())
     pty.plug()
     try:
