@@ -521,12 +521,12 @@ def test_after_a_stall_it_stops_within_the_limit(seconds: float):
 
 def test_silence_ends_the_session():
     async def test(rig: Rig) -> None:
+        session = asyncio.create_task(rig.session())
+        await rig.drive(1_000)
+        rig.emulator.inject("silent", "on")
+        start = rig.clock.now()
         with pytest.raises(DeviceTimeoutError):
-            async with rig.driving() as task:
-                await rig.drive(1_000)
-                rig.emulator.inject("silent", "on")
-                start = rig.clock.now()
-                await task
+            await session
         assert 1.0 < (rig.clock.now() - start) / SECOND < 2.5
 
     on_bench(test)
@@ -607,12 +607,12 @@ def test_after_a_loss_in_the_middle_of_an_exchange_nothing_is_sent_before_the_co
 
 def test_a_quick_restart_is_noticed_by_the_state():
     async def test(rig: Rig) -> None:
+        session = asyncio.create_task(rig.session())
+        await rig.drive(6_000)
+        rig.emulator.firmware.shut_down()
+        rig.emulator.firmware.boot()
         with pytest.raises(DeviceLostError, match="restarted"):
-            async with rig.driving() as task:
-                await rig.drive(6_000)
-                rig.emulator.firmware.shut_down()
-                rig.emulator.firmware.boot()
-                await task
+            await session
 
     on_bench(test)
 
@@ -705,10 +705,11 @@ def test_a_fault_that_comes_back_on_enabling_uses_up_the_resets():
                 await rig.until(lambda: rig.emulator.state is State.ENABLED, 60)
                 rig.emulator.inject("fault", "over_current", "passing")
 
-        with pytest.raises(DeviceFaultError):
-            async with background(failing()), rig.driving() as task:
-                rig.gate.say(DriveAction.RUN, 6_000)
-                await task
+        async with background(failing()):
+            session = asyncio.create_task(rig.session())
+            rig.gate.say(DriveAction.RUN, 6_000)
+            with pytest.raises(DeviceFaultError):
+                await session
         assert controls(rig).count(Control.FAULT_RESET) == 3
 
     on_bench(test)
