@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from monstertruckd.cli.options import ConfigOption
 from monstertruckd.cli.output import JsonOption
-from monstertruckd.cli.robot import ConfigOption
 
 DEMO_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from monstertruckd.cli.live import ENDPOINT
+from monstertruckd.cli.options import ENDPOINT
 
 app = typer.Typer(help="Look inside, repair and export logs (MCAP).", no_args_is_help=True)
 

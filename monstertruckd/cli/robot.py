@@ -6,11 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
+from monstertruckd.cli.options import ConfigOption
 from monstertruckd.cli.output import JsonOption, print_json, print_table
-
-ConfigOption = Annotated[
-    Path, typer.Option("--config", "-c", help="Configuration of this robot or experiment (YAML).", show_default=False)
-]
 
 
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:

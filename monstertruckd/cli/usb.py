@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import run_wall
-from monstertruckd.cli.live import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption
 
 
 def usb(
