@@ -9,6 +9,7 @@ import platform
 import secrets
 from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
 from monstertruckd.health import ClockService, HealthBoard, MeterService
+from monstertruckd.notify import notify_from, status_line
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
 
@@ -58,6 +60,7 @@ class Daemon:
         tree: origins of the configuration's values, kept with the log.
         seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
+        environment: what systemd says of the socket and the watchdog it wants to be told on.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class Daemon:
         computer: Computer | None = None,
         tree: Tree | None = None,
         seed: int | None = None,
+        environment: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.config = config
         self.clock = clock
@@ -93,6 +97,7 @@ class Daemon:
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.recorder = self._build_recorder()
+        self._notify = notify_from(environment, clock, self.gate.ticks, self._status)
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set, then end everything inside-out, neutral first.
@@ -120,7 +125,11 @@ class Daemon:
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body):
                 self._start(planners, service)
+            if self._notify is not None:
+                self._notify.up()
             await stop.wait()
+            if self._notify is not None:
+                self._notify.stopping()
             self.gate.shut_down()
 
     # The scopes' contents
@@ -138,6 +147,8 @@ class Daemon:
             self._start(bus_scope, self._board)
             if self._cabling.service is not None:
                 self._start(bus_scope, self._cabling.service)
+            if self._notify is not None:
+                self._start(bus_scope, self._notify)
             yield
 
     @asynccontextmanager
@@ -155,6 +166,9 @@ class Daemon:
                 yield
             finally:
                 tap.close()
+
+    def _status(self) -> str:
+        return status_line(self.gate.mode, self._board.rows())
 
     def _recorder_failed(self, reason: Reason, text: str) -> None:
         self._board.report(

@@ -4,6 +4,7 @@ import asyncio
 import faulthandler
 import gc
 import logging
+import os
 import signal
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        daemon = Daemon(config, clock, tree=tree)
+        daemon = Daemon(config, clock, tree=tree, environment=os.environ)
         for topic in TOPICS:
             wire.schema(topic)  # built once, before the control tick would wait for it
         # A full collection over everything loaded so far takes tens of milliseconds: take it out of the heap's view.

@@ -1,21 +1,24 @@
-"""Stop the drive after any death of the daemon: quick stop, then power stage off.
+"""Stop every drive after any death of the daemon: quick stop, then power stage off.
 
-    python3 neutral.py /dev/truck/drive [NODE]
+    python3 neutral.py /dev/truck/drive[=NODE[@BAUD]] ...
 
-NODE must equal ``devices.drive.driver.node`` of the configuration (default 1); the line runs at 38400 baud, as the
-controller is delivered. Needs nothing but Python's standard library and the codec beside it. Exit code 0 once the
-controller has accepted both commands, 1 if it did not within five seconds, for whatever reason.
+One argument for each driven shaft, all stopped at once. NODE and BAUD must equal ``driver.node`` and ``port.baud`` of
+the configuration's drive; left out they are 1 and 38400, as the controller is delivered. Needs nothing but Python's
+standard library and the codec installed with it. Exit code 0 once every controller has accepted both commands, 1 if
+one did not within five seconds, for whatever reason.
 """
 
 import os
 import select
 import sys
 import termios
+import threading
 import time
 import tty
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "drivers"))
+HERE = Path(__file__).resolve()
+sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checkout's, an installation's
 
 from monstertruck_drivers.epos.protocol import Frame, FrameError, decode_body, stop_frames
 
@@ -35,21 +38,39 @@ class NotStoppedError(Exception):
 
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit code."""
-    port, node = arguments[0], int(arguments[1]) if len(arguments) > 1 else 1
+    drives = [drive(argument) for argument in arguments]
+    stopped: list[str] = []
+    threads = [threading.Thread(target=insist, args=(*one, stopped)) for one in drives]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return 0 if drives and len(stopped) == len(drives) else 1
+
+
+def drive(argument: str) -> tuple[str, int, int]:
+    """Port, node and baud rate that an argument names."""
+    port, _, rest = argument.partition("=")
+    node, _, baud = rest.partition("@")
+    return port, int(node or 1), int(baud or 38400)
+
+
+def insist(port: str, node: int, baud: int, stopped: list[str]) -> None:
+    """Try until the controller has stopped or patience ends; adds the port to ``stopped``."""
     give_up = time.monotonic() + PATIENCE
     while time.monotonic() < give_up:
         try:
-            stop(port, node)
+            stop(port, node, baud)
         except (OSError, termios.error, FrameError, NotStoppedError) as error:
             print(f"neutral: {port}: {error}", file=sys.stderr)
             time.sleep(FRAME_TIMEOUT)
         else:
             print(f"neutral: {port}: stopped")
-            return 0
-    return 1
+            stopped.append(port)
+            return
 
 
-def stop(port: str, node: int) -> None:
+def stop(port: str, node: int, baud: int) -> None:
     """Open the port and make both writes.
 
     Raises:
@@ -61,7 +82,7 @@ def stop(port: str, node: int) -> None:
     try:
         tty.setraw(line)
         settings = termios.tcgetattr(line)
-        settings[4] = settings[5] = termios.B38400
+        settings[4] = settings[5] = getattr(termios, f"B{baud}")
         termios.tcsetattr(line, termios.TCSANOW, settings)
         termios.tcflush(line, termios.TCIOFLUSH)
         brake, switch_off = stop_frames(node)

@@ -176,17 +176,8 @@ async def test_the_stop_script_stops_the_truck_after_the_daemon_was_killed(tmp_p
 async def test_the_stop_script_says_so_when_the_controller_refuses(tmp_path: Path):
     async with robot(tmp_path) as truck:
         await truck.start_simulator()
-        script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), str(tmp_path / "dev" / "drive"), "5"]
+        script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), f"{tmp_path / 'dev' / 'drive'}=5@38400"]
         done = await asyncio.to_thread(subprocess.run, script, capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 1
     assert "refused with error 0x0F00FFB9" in done.stderr
     assert "stopped" not in done.stdout
-
-
-def test_the_unit_keeps_state_where_it_may_write():
-    lines = (ROOT / "systemd" / "monstertruckd.service").read_text().splitlines()
-    settings = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
-    assert settings["WorkingDirectory"] == "%S/" + settings["StateDirectory"]
-    assert settings["ProtectSystem"] == "strict"
-    assert settings["ExecStopPost"].split()[1].endswith("systemd/neutral.py")
-    assert " run --config /" in settings["ExecStart"]

@@ -1,0 +1,122 @@
+"""What systemd is told: ready, alive, stopping (protocol of sd_notify(3)). Alive: the control tick advanced."""
+
+import os
+import socket
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final, Protocol
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import Ready
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.state import GateMode
+
+PERIOD: Final = 1.0
+"""Seconds between two looks without a watchdog."""
+POLL: Final = 0.02
+"""Seconds between two looks until the first tick."""
+
+
+class Notify(Protocol):
+    """Takes lines for systemd; true if they arrived."""
+
+    def __call__(self, *lines: str) -> bool:
+        """Send them as one message, or lose them."""
+        ...
+
+
+def notify_socket(address: str) -> Notify:
+    """Sender to a socket by its path, or abstract with a leading @. It never blocks and never raises."""
+    name = "\0" + address[1:] if address.startswith("@") else address
+
+    def send(*lines: str) -> bool:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+            try:
+                return sender.sendto("\n".join(lines).encode(), name) > 0
+            except OSError:
+                return False
+
+    return send
+
+
+def watchdog_seconds(environment: Mapping[str, str], pid: int) -> float | None:
+    """Seconds without a ping after which systemd gives the process up; None = never, or another process is meant."""
+    try:
+        seconds = int(environment["WATCHDOG_USEC"]) / 1e6
+        meant = int(environment.get("WATCHDOG_PID") or pid)
+    except (KeyError, ValueError):
+        return None
+    return seconds if seconds > 0 and meant == pid else None
+
+
+class NotifyService:
+    """Tells systemd READY once the daemon is up and the tick runs, then pings while the tick advances.
+
+    Args:
+        send: where lines go.
+        watchdog: seconds; None = no pings, only the status.
+        clock: time.
+        ticks: control ticks so far.
+        status: state of the robot, one line.
+    """
+
+    name = "notify"
+
+    def __init__(
+        self, send: Notify, watchdog: float | None, clock: Clock, ticks: Callable[[], int], status: Callable[[], str]
+    ) -> None:
+        self._send = send
+        self._ping = ("WATCHDOG=1",) if watchdog is not None else ()
+        self._period = PERIOD if watchdog is None else watchdog / 3
+        self._clock = clock
+        self._ticks = ticks
+        self._status = status
+        self._up = False
+        self._told_ticks = 0
+        self._told_status = ""
+
+    def up(self) -> None:
+        """Everything has been started; from now on the tick alone decides."""
+        self._up = True
+
+    def stopping(self) -> None:
+        """The daemon ends on purpose."""
+        self._send("STOPPING=1", "STATUS=stopping")
+
+    async def run(self, ready: Ready) -> None:
+        """Tell until cancelled."""
+        ready()
+        while not (self._up and self._ticks() and self._tell("READY=1")):
+            await self._clock.sleep(POLL)
+        while True:
+            await self._clock.sleep(self._period)
+            self._tell()
+
+    def _tell(self, *first: str) -> bool:
+        """Send what is news; what did not arrive is news again the next time."""
+        ticks, status = self._ticks(), self._status()
+        lines = [*first]
+        if ticks > self._told_ticks:
+            lines += self._ping
+        if status != self._told_status:
+            lines.append(f"STATUS={status}")
+        if not lines or not self._send(*lines):
+            return False
+        self._told_ticks, self._told_status = ticks, status
+        return True
+
+
+def status_line(mode: GateMode, services: Iterable[ServiceHealth]) -> str:
+    """The robot in one line: the gate's state, and which services do not work."""
+    down = [f"{row.name} ({row.state.value})" for row in services if row.state is not ServiceState.READY]
+    return f"{mode.value}; not ready: {', '.join(down)}" if down else mode.value
+
+
+def notify_from(
+    environment: Mapping[str, str], clock: Clock, ticks: Callable[[], int], status: Callable[[], str]
+) -> NotifyService | None:
+    """The service for the present process; None where no systemd waits for it."""
+    address = environment.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return None
+    watchdog = watchdog_seconds(environment, os.getpid())
+    return NotifyService(notify_socket(address), watchdog, clock, ticks, status)
