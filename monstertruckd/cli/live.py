@@ -3,15 +3,17 @@
 import asyncio
 import math
 import sys
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, TopicArgument
 from monstertruckd.cli.output import JsonOption, print_json, remark, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
 
 SILENCE: Final = 2.0
 """Seconds without a message after which `echo` says what it is waiting for."""
@@ -46,6 +48,7 @@ def echo(
     json_output: JsonOption = False,
 ) -> None:
     """Print a topic's messages as they come, one JSON object per line; on a terminal long lists are cut short."""
+    from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.mailbox import fifo
     from monstertruck_schemas.topics import BY_NAME
 
@@ -75,7 +78,7 @@ def echo(
     until_stopped(main)
 
 
-async def _explain_silence(client: TruckClient, clock: Clock, topic: str) -> None:
+async def _explain_silence(client: "TruckClient", clock: Clock, topic: str) -> None:
     await clock.sleep(SILENCE)
     if await client.alive():
         remark(f"robot {client.robot!r} is there but publishes no {topic} yet; waiting")

@@ -17,7 +17,7 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, GATE, Topic
 from monstertruckd.cli import orders
-from monstertruckd.cli.orders import Answer, give
+from monstertruckd.cli.answer import Answer, give
 
 HEADER = {"stamp": 1, "received": 1, "seq": 0}
 
