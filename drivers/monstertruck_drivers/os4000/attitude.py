@@ -3,7 +3,8 @@
 import math
 from typing import Final
 
-from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.os4000.config import IronConfig, Os4000Config
+from monstertruck_drivers.os4000.iron import level_field
 from monstertruck_drivers.os4000.protocol import Sentence
 from monstertruck_schemas.sensor import Attitude, Vector3
 
@@ -20,8 +21,11 @@ def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: 
     roll right side down (about x, forward), so that only pitch changes its sign. Its acceleration is +1 g along z
     (up) at rest, with x forward and y left (a maker's sample of pitch 2.5 and roll -14 degrees shows it).
 
+    With a calibrated ``iron`` the heading comes from the field instead; ``magnetic_field`` stays as measured.
+
     Raises:
-        ValueError: heading, pitch or roll is absent or out of range; the text says which.
+        ValueError: heading, pitch or roll (or the field, where it is needed) is absent or out of range; the text says
+            which.
     """
     heading, pitch, roll = sentence.heading, sentence.pitch, sentence.roll
     if heading is None or not 0 <= heading < 360:
@@ -35,7 +39,7 @@ def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: 
         received=received,
         seq=seq,
         frame=config.frame,
-        heading=math.radians(heading),
+        heading=math.radians(heading) if config.iron == _NO_IRON else _heading(sentence, config.iron),
         roll=math.radians(roll),
         pitch=-math.radians(pitch),
         temperature=sentence.temperature,
@@ -44,6 +48,17 @@ def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: 
         heading_disturbed=_is_disturbed(sentence, config),
         tilt_valid=_is_tilt(sentence, config),
     )
+
+
+_NO_IRON: Final = IronConfig()
+
+
+def _heading(sentence: Sentence, iron: IronConfig) -> float:
+    if sentence.field is None or sentence.pitch is None or sentence.roll is None:
+        raise ValueError("the field is missing, which the calibrated heading needs")
+    x, y, z = (component * MILLIGAUSS for component in sentence.field)
+    north, left = level_field((x, y, z), -math.radians(sentence.pitch), math.radians(sentence.roll), iron)
+    return math.atan2(left, north) % (2 * math.pi)
 
 
 def _scaled(vector: tuple[float, float, float] | None, factor: float) -> Vector3 | None:

@@ -13,6 +13,27 @@ NEEDED = Fields.HEADING | Fields.PITCH | Fields.ROLL
 """Without these there is no attitude."""
 
 
+class IronConfig(Schema):
+    """The truck's own magnetism, to be taken out of the measured field: ``soft (field - hard)``, device axes.
+
+    As calibrated on level ground: the vertical field is left as it is, and ``soft`` is scaled to determinant 1. With
+    the values below the unit's own heading is believed; with any others it is computed here.
+    """
+
+    hard_x: float = 0.0
+    """Microtesla, in the unit's own scale"""
+    hard_y: float = 0.0
+    soft_xx: Positive = 1.0
+    soft_xy: float = 0.0
+    soft_yy: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _keeps_directions_apart(self) -> Self:
+        if not self.soft_xy**2 < self.soft_xx * self.soft_yy:
+            raise ValueError(f"soft_xy {self.soft_xy}: expected less than the root of soft_xx * soft_yy")
+        return self
+
+
 class Os4000Config(Schema):
     """OceanServer OS4000 compass.
 
@@ -33,6 +54,8 @@ class Os4000Config(Schema):
     """Length of the magnetic field vector where the unit was calibrated, microtesla; None = not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share by which the field may differ before the heading counts as disturbed."""
+    iron: IronConfig = IronConfig()
+    """Magnetic calibration of the unit on this truck"""
     gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """Share of 1 g by which the acceleration may differ before roll and pitch stop being tilt."""
     frame: FrameId = "base"
@@ -42,6 +65,8 @@ class Os4000Config(Schema):
     def _fields_make_an_attitude(self) -> Self:
         if self.fields & NEEDED != NEEDED:
             raise ValueError(f"fields {self.fields} lacks heading (1), pitch (2) or roll (4)")
+        if self.iron != IronConfig() and not self.fields & Fields.FIELD:
+            raise ValueError(f"fields {self.fields} lacks the magnetic field (64), which iron needs")
         return self
 
     @property

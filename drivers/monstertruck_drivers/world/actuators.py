@@ -58,6 +58,8 @@ class Servo:
 
     def __init__(self, config: ServoConfig) -> None:
         self._config = config
+        self._left_stop = min(SERVO_LIMIT, radians(config.left_stop_deg))
+        self._right_stop = -min(SERVO_LIMIT, radians(config.right_stop_deg))
         self._held_us: float | None = None
         self.angle = 0.0
         """Of the arm, rad."""
@@ -76,7 +78,7 @@ class Servo:
         if self._held_us is None:
             return
         target = radians((self._held_us - self._config.centre_us) / self._config.us_per_degree)
-        target = min(max(target, -SERVO_LIMIT), SERVO_LIMIT)
+        target = min(max(target, self._right_stop), self._left_stop)
         self.angle = _towards(self.angle, target, self._config.rate * dt)
 
 

@@ -45,7 +45,7 @@ class Battery:
     @property
     def analog_volts(self) -> float:
         """Behind divider and filter."""
-        return self._filtered / self._config.divider
+        return self._filtered / self._config.divider + self._config.analog_offset
 
     def step(self, dt: float, motor_w: float) -> None:
         """Draw the electronics' and the motor's power for dt seconds."""

@@ -1,4 +1,4 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, and a ramp."""
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, and an open yard."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -126,11 +126,23 @@ def ramp() -> BuiltIn:
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0), Profile(tuple((x, round(z, 4)) for x, z in points)))
 
 
+def yard() -> BuiltIn:
+    """Open level floor, 7 m x 7 m, for calibration drives: a few posts and niches along the walls only."""
+    canvas = _Canvas((-4.0, 4.0), (-4.0, 4.0))
+    canvas.free = canvas.rectangle(-3.5, -3.5, 3.5, 3.5)
+    for niche in ((3.4, -1.0, 3.8, 0.2), (-2.0, 3.4, -0.8, 3.75), (-3.7, 0.5, -3.4, 2.0)):
+        canvas.free |= canvas.rectangle(*niche)
+    for post in ((3.0, 2.6, 0.15), (-2.9, -2.4, 0.2), (0.8, -3.1, 0.12)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
 BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
     "loop": loop,
     "rooms": rooms,
     "corridor_maze": corridor_maze,
     "ramp": ramp,
+    "yard": yard,
 }
 
 

@@ -33,6 +33,9 @@ class ServoConfig(Schema):
     """The servo does not move for a smaller change of its pulse, us."""
     resolution_us: Positive = 1.0
     """Steps in which the servo measures its pulse, us."""
+    left_stop_deg: Annotated[float, Field(gt=0, le=45)] = 45.0
+    """Angle at which something stops the arm on its way to the left."""
+    right_stop_deg: Annotated[float, Field(gt=0, le=45)] = 45.0
 
 
 class MotorConfig(Schema):
@@ -161,6 +164,8 @@ class BatteryConfig(Schema):
     """Pack volts per volt at the analog input."""
     channel: Annotated[int, Field(ge=0, le=5)] = 5
     """Analog input of the servo controller."""
+    analog_offset: float = 0.0
+    """Added at the analog input by the drop along the ground wire, V."""
     filter_time: Positive = 0.1
     """Time constant of the divider's RC low-pass, s."""
     analog_noise: NotNegative = 0.003
@@ -217,6 +222,8 @@ class Iron(Schema):
     soft_x: float = 1.0
     soft_y: float = 1.0
     soft_z: float = 1.0
+    soft_xy: float = 0.0
+    """Share of x that shows in y, and of y in x."""
 
 
 class CompassConfig(Schema):

@@ -210,8 +210,11 @@ class SimulatedCompass:
     def _distorted(self, field: Vector) -> Vector:
         iron = self._config.iron
         return (
-            iron.soft_x * field[0] + iron.hard_x,
-            iron.soft_y * field[1] + iron.hard_y + self._config.motor_field * self._plant.current,
+            iron.soft_x * field[0] + iron.soft_xy * field[1] + iron.hard_x,
+            iron.soft_xy * field[0]
+            + iron.soft_y * field[1]
+            + iron.hard_y
+            + self._config.motor_field * self._plant.current,
             iron.soft_z * field[2] + iron.hard_z,
         )
 

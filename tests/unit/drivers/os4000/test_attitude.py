@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -98,3 +99,33 @@ def test_tilt_needs_one_g(g: float, valid: bool):
 def test_bad_configurations_are_refused(config: dict[str, int], text: str):
     with pytest.raises(ValidationError, match=text):
         Os4000Config(**config)
+
+
+IRON = {"hard_x": 6.0, "hard_y": -3.0, "soft_xx": 1.1, "soft_xy": 0.05, "soft_yy": (1 + 0.05**2) / 1.1}
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 135.0, 250.0, 359.0])
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (8.0, -5.0)])
+def test_calibrated_iron_is_taken_out_of_the_heading(degrees: float, pitch: float, roll: float):
+    truth, nose_down, right_down = math.radians(degrees), -math.radians(pitch), math.radians(roll)
+    x, y, z = 25 * math.cos(truth), 25 * math.sin(truth), -39.0
+    # Into the body: Rx(-roll) Ry(-pitch).
+    x, z = math.cos(nose_down) * x - math.sin(nose_down) * z, math.sin(nose_down) * x + math.cos(nose_down) * z
+    y, z = math.cos(right_down) * y + math.sin(right_down) * z, math.cos(right_down) * z - math.sin(right_down) * y
+    soft = [[IRON["soft_xx"], IRON["soft_xy"]], [IRON["soft_xy"], IRON["soft_yy"]]]
+    x, y = np.linalg.solve(soft, (x, y)) + np.array((IRON["hard_x"], IRON["hard_y"]))
+    felt = Sentence(123.4, pitch, roll, 20.0, field=(x * 10, y * 10, z * 10))
+    assert convert(felt).heading == pytest.approx(math.radians(123.4)), "the unit is believed without a calibration"
+    attitude = convert(felt, iron=IRON)
+    assert math.remainder(attitude.heading - truth, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+    assert attitude.magnetic_field is not None
+    assert attitude.magnetic_field.x == pytest.approx(x), "the field stays as measured"
+
+
+def test_a_calibrated_heading_needs_the_field():
+    with pytest.raises(ValueError, match="field is missing"):
+        convert(Sentence(1.0, 2.0, 3.0), iron=IRON)
+    with pytest.raises(ValidationError, match="lacks the magnetic field"):
+        Os4000Config(fields=15, iron=IRON)
+    with pytest.raises(ValidationError, match="root of soft_xx"):
+        Os4000Config(iron={"soft_xy": 1.2})

@@ -5,7 +5,7 @@ from math import degrees, pi, radians
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import CompassConfig, Iron, LidarConfig, SinusoidTilt
+from monstertruck_drivers.world.config import BatteryConfig, CompassConfig, Iron, LidarConfig, SinusoidTilt
 from monstertruck_drivers.world.obstacles import Box, Disc
 from monstertruck_drivers.world.sensors import FAILED, NO_RETURN, TOO_NEAR
 
@@ -206,6 +206,16 @@ def test_motor_current_and_iron_disturb_the_heading(field):
     reading = iron.world.compass.compass(iron.now)
     assert reading.field == pytest.approx((125, 25, -390))
     assert reading.heading_deg == pytest.approx(degrees(np.arctan2(25, 125)))
+    skewed = field(start=(0.0, 0.0, pi / 2), compass=CompassConfig(iron=Iron(soft_xy=0.1)))
+    assert skewed.world.compass.compass(skewed.now).field == pytest.approx((250, 25, -390))
+
+
+def test_the_ground_wire_offsets_the_battery_input(field):
+    volts = [
+        field(battery=BatteryConfig(analog_offset=offset)).world.servos.analog_volts(5, 8 * 10**9)
+        for offset in (0.0, 0.02)
+    ]
+    assert volts[1] - volts[0] == pytest.approx(0.02)
 
 
 def test_readings_have_the_controllers_sign(field):

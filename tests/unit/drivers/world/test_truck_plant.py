@@ -1,6 +1,6 @@
 """Physics of the truck: distances, radii, lags, clutch, collisions, battery."""
 
-from math import atan, cos, hypot, pi, radians, sin
+from math import atan, cos, degrees, hypot, pi, radians, sin
 
 import numpy as np
 import pytest
@@ -122,6 +122,15 @@ def test_hidden_calibration_bends_the_straight_line(field):
     driver.steer(0.0, 0.0)
     driver.drive(0.2)
     assert driver.wait(3).yaw > 0.015  # the nominal centre is 10 us too low: to the left
+
+
+def test_a_stop_of_the_servo_ends_its_travel_on_one_side(field):
+    off = IDEAL.model_copy(update={"front_servo": ServoConfig(channel=1, left_stop_deg=20.0)})
+    driver = field(truck=off)
+    driver.steer(0.4, 0.0)
+    assert degrees(driver.wait(1).front) == pytest.approx(13.0, abs=0.5)
+    driver.steer(-0.4, 0.0)
+    assert driver.wait(1).front == pytest.approx(-0.4, abs=0.005)
 
 
 def test_tyres_understeer(field):
