@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from monstertruckd.cli.options import ENDPOINT
+from monstertruckd.cli.output import JsonOption, print_json, progress
 
 app = typer.Typer(help="Look inside, repair and export logs (MCAP).", no_args_is_help=True)
 
@@ -51,6 +52,23 @@ def recover_command(
 
     done = recover(log, output or log)
     typer.echo(f"{done.path}: {done.messages} messages kept" + (f"; {done.damage}" if done.damage else ", was sound"))
+
+
+@app.command("report")
+def report_command(
+    log: LogArgument,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="HTML file; default: beside the log.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Write one HTML page about a log: way, states, events, signals, health, losses. It needs no network."""
+    from monstertruckd.logs.report import report
+
+    with progress("report", log.stat().st_size if log.exists() else None) as done:
+        written = report(log, output, done)
+    if json_output:
+        print_json(written.figures())
+    else:
+        typer.echo(str(written.file))
 
 
 @app.command("export")

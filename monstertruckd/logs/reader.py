@@ -75,6 +75,8 @@ class LogReader:
         self.path = path
         self.damage: str | None = None
         """After an iteration to the end: why it ended early; None for a finished, sound log."""
+        self.position = 0
+        """Bytes an iteration has read so far, for progress bars."""
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
@@ -112,17 +114,18 @@ class LogReader:
         """Every MCAP record up to the first error, chunks opened; channels always precede their messages."""
         self.damage = None
         channels: set[int] = set()
-        size = self.path.stat().st_size
+        size = self.size
         with self.path.open("rb") as file:
             stream = StreamReader(file, validate_crcs=True, record_size_limit=size).records
             while True:
-                at = file.tell()
+                self.position = at = file.tell()
                 try:
                     record = next(stream, None)
                 except _DAMAGE as error:
                     self.damage = f"ends or is damaged after byte {at} of {size} ({type(error).__name__})"
                     return
                 if record is None:
+                    self.position = size
                     return
                 if isinstance(record, Channel):
                     channels.add(record.id)
@@ -130,6 +133,11 @@ class LogReader:
                     self.damage = f"message of an unknown channel before byte {at} of {size}"
                     return
                 yield record
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self.path.stat().st_size
 
     def attachments(self) -> dict[str, bytes]:
         """Attached files by name."""
