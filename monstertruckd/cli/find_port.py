@@ -1,7 +1,5 @@
 """Finds the port of a cable by its being unplugged, and puts it into a configuration file."""
 
-import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -12,6 +10,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.tree import Device, Snapshot, parent_of, place, port_of, read_device, read_tree
 from monstertruck_runtime.errors import InputError, NoAnswerError
+from monstertruck_runtime.small_files import replace_file
 from monstertruckd.catalog import BY_ROLE
 
 POLL: Final = 0.2
@@ -119,7 +118,7 @@ def write_port(path: Path, role: str, port: UsbPortConfig) -> None:
     """
     try:
         text = path.read_text(encoding="utf-8")
-        _replace_file(path, _with_port(text, path, role, port))
+        replace_file(path, _with_port(text, path, role, port))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -152,15 +151,3 @@ def _end(node: yaml.Node) -> int:
         return _end(node.value[-1][1])
     end: int = node.end_mark.index
     return end
-
-
-def _replace_file(path: Path, text: str) -> None:
-    handle, scratch = tempfile.mkstemp(dir=path.resolve().parent, prefix=path.name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        Path(scratch).chmod(path.stat().st_mode)
-        Path(scratch).replace(path.resolve())
-    except BaseException:
-        Path(scratch).unlink(missing_ok=True)
-        raise

@@ -35,6 +35,18 @@ class BusyError(TruckError):
     reason = Reason.BUSY
 
 
+class NotPermittedError(TruckError):
+    """The user lacks a right; the text tells how to get it."""
+
+    reason = Reason.NOT_PERMITTED
+
+
+class CommandFailedError(TruckError):
+    """A program of the computer failed; the text is what it said."""
+
+    reason = Reason.COMMAND_FAILED
+
+
 class NoAnswerError(TruckError):
     """A robot did not answer in time."""
 

@@ -1,5 +1,7 @@
-"""Files of /proc and /sys: small, made up by the kernel as they are read, and often not there."""
+"""Small files: such of /proc and /sys, made up by the kernel and often not there, and such that are replaced whole."""
 
+import os
+import tempfile
 from pathlib import Path
 
 
@@ -18,3 +20,28 @@ def number_of(file: Path) -> int | None:
         return None if text is None else int(text)
     except ValueError:
         return None
+
+
+def replace_file(path: Path, text: str, mode: int = 0o644) -> None:
+    """Make the file say ``text``, as a whole or not at all; one that was there keeps its mode.
+
+    Args:
+        path: the file, or a link to it, which stays a link.
+        text: new content.
+        mode: of a new file.
+
+    Raises:
+        OSError: it could not be written; nothing has changed then.
+    """
+    place = path.resolve()
+    handle, scratch = tempfile.mkstemp(dir=place.parent, prefix=place.name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(handle)
+        Path(scratch).chmod(place.stat().st_mode if place.exists() else mode)
+        Path(scratch).replace(place)
+    except BaseException:
+        Path(scratch).unlink(missing_ok=True)
+        raise

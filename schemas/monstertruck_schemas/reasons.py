@@ -35,6 +35,10 @@ class Reason(StrEnum):
     LOG_DAMAGED = "log_damaged", 9, "log is truncated or damaged"
     RECORDING_FAILED = "recording_failed", 10, "log cannot be written"
     NOT_SUPPORTED = "not_supported", 11, "the robot cannot do that"
+    NOT_PERMITTED = "not_permitted", 12, "the user may not do that"
+    NOT_INSTALLED = "not_installed", 13, "something is not installed, or not as it should be"
+    COMMAND_FAILED = "command_failed", 14, "a program of the computer failed"
+    BLACK_BOX_SAVED = "black_box_saved", 0, "the minute before a stop was saved"
 
     # Devices
     DEVICE_LOST = "device_lost", 20, "device unplugged or its port vanished"
@@ -104,3 +108,5 @@ class Reason(StrEnum):
     HOST_BUSY = "host_busy", 115, "the processor has little time left"
     LINK_WEAK = "link_weak", 116, "network link is weak"
     LINK_DOWN = "link_down", 117, "no network link"
+    CLOCK_UNSET = "clock_unset", 118, "the computer does not know the time"
+    LINK_OPEN = "link_open", 119, "anybody on the network may drive the truck"
