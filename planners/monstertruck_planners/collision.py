@@ -6,6 +6,7 @@ distances are metres, negative inside the footprint.
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.state import Grid
 
+if TYPE_CHECKING:
+    from monstertruck_planners.collision_kernels import BodyData, FieldData
+
 Array = NDArray[np.float64]
 
 OCCUPIED = 50
@@ -23,12 +27,13 @@ OCCUPIED = 50
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Rectangle centred on the base frame, grown by ``padding`` on every side.
+    """Rectangle round the point that the poses speak of (the base), grown by ``padding`` on every side.
 
     Args:
         length: along x, m.
         width: along y, m.
         padding: added on each side, m.
+        offset: of the rectangle's centre ahead of the poses' point, m; half a wheelbase for poses of the rear axle.
 
     Raises:
         InputError: length or width not above zero, or padding below it.
@@ -37,6 +42,7 @@ class Footprint:
     length: float = 0.47
     width: float = 0.34
     padding: float = 0.01
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.length > 0 and self.width > 0 and self.padding >= 0):
@@ -58,13 +64,13 @@ class Footprint:
 
     @property
     def circumscribed_radius(self) -> float:
-        """Radius of the circle through the padded corners, m."""
-        return math.hypot(self.half_length, self.half_width)
+        """Radius of the circle round the poses' point that holds the padded rectangle, m."""
+        return math.hypot(self.half_length + abs(self.offset), self.half_width)
 
     @property
     def inscribed_radius(self) -> float:
-        """Radius of the largest circle inside the padded rectangle, m."""
-        return min(self.half_length, self.half_width)
+        """Radius of the largest circle round the poses' point inside the padded rectangle, m."""
+        return max(min(self.half_length - abs(self.offset), self.half_width), 0.0)
 
     def covering_discs(self, count: int = 3) -> tuple[Array, float]:
         """``count`` discs along x that together cover the rectangle.
@@ -73,8 +79,55 @@ class Footprint:
             Their centres on the x axis, shape (count,), m, and their common radius, m.
         """
         half = self.half_length / count
-        centres = np.array([-self.half_length + half * (2 * i + 1) for i in range(count)])
+        centres = np.array([self.offset - self.half_length + half * (2 * i + 1) for i in range(count)])
         return centres, math.hypot(half, self.half_width)
+
+    def body(self) -> "BodyData":
+        """What the compiled tests take."""
+        from monstertruck_planners.collision_kernels import BodyData  # noqa: PLC0415 - workers only
+
+        discs, radius = self.covering_discs()
+        reach = float(np.abs(discs).max())
+        return BodyData(discs, radius, self.half_length, self.half_width, self.offset, self.inscribed_radius, reach)
+
+
+@dataclass(frozen=True, slots=True)
+class DiscFootprint:
+    """Union of equal discs on the x axis.
+
+    Args:
+        centres: x of each, m.
+        radius: m.
+
+    Raises:
+        InputError: no disc, or a radius not above zero.
+    """
+
+    centres: tuple[float, ...]
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not (self.centres and self.radius > 0):
+            raise InputError(
+                f"footprint of {len(self.centres)} discs of {self.radius} m: expected one at least, above 0 m"
+            )
+
+    @property
+    def circumscribed_radius(self) -> float:
+        """Radius of the circle round the poses' point that holds all discs, m."""
+        return max(map(abs, self.centres)) + self.radius
+
+    @property
+    def inscribed_radius(self) -> float:
+        """Radius of the largest circle round the poses' point inside one of the discs, m."""
+        return max(self.radius - min(map(abs, self.centres)), 0.0)
+
+    def body(self) -> "BodyData":
+        """What the compiled tests take."""
+        from monstertruck_planners.collision_kernels import BodyData  # noqa: PLC0415 - workers only
+
+        reach = max(map(abs, self.centres))
+        return BodyData(np.array(self.centres), self.radius, 0.0, 0.0, 0.0, self.inscribed_radius, reach)
 
 
 def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Array:
@@ -96,7 +149,7 @@ def _beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, A
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x = np.column_stack((c, s)) @ points.T - (c * poses[:, 0] + s * poses[:, 1])[:, None]
     y = np.column_stack((-s, c)) @ points.T - (c * poses[:, 1] - s * poses[:, 0])[:, None]
-    return np.abs(x) - footprint.half_length, np.abs(y) - footprint.half_width
+    return np.abs(x - footprint.offset) - footprint.half_length, np.abs(y) - footprint.half_width
 
 
 def _distance(beyond_x: Array, beyond_y: Array) -> Array:
@@ -204,8 +257,8 @@ def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:
 class DistanceField:
     """Distance to the nearest occupied cell of a grid, and footprint-true checks on it.
 
-    Obstacles are the centres of occupied cells, half a cell wide; everything outside the grid is occupied.
-    Built in workers only: the constructor loads scipy.
+    Obstacles are the squares of occupied cells; everything outside the grid is occupied.
+    Built in workers only: the constructor loads scipy, the checks load numba.
 
     Args:
         occupied: shape (rows, columns), bool, row 0 at the lowest y.
@@ -219,7 +272,7 @@ class DistanceField:
     def __init__(
         self, occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
-        from scipy.ndimage import binary_erosion, distance_transform_edt  # noqa: PLC0415 - workers only
+        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - workers only
 
         if occupied.ndim != 2 or occupied.size == 0 or not resolution > 0:
             msg = (
@@ -230,9 +283,9 @@ class DistanceField:
         self.resolution = resolution
         self.origin = origin
         # One ring of occupied cells stands for everything outside.
-        ringed = np.pad(occupied, 1, constant_values=True)
-        self._distance: Array = np.asarray(distance_transform_edt(~ringed)) * resolution
-        self._edge: NDArray[np.bool_] = ringed & ~binary_erosion(ringed, np.ones((3, 3), np.bool_), border_value=1)
+        self._occupied: NDArray[np.bool_] = np.pad(occupied, 1, constant_values=True)
+        distance = np.asarray(distance_transform_edt(~self._occupied, sampling=resolution))
+        self._distance: NDArray[np.float32] = distance.astype(np.float32)
 
     @classmethod
     def from_grid(cls, grid: Grid, *, unknown_blocks: bool = True) -> "DistanceField":
@@ -242,6 +295,15 @@ class DistanceField:
         if unknown_blocks:
             occupied |= cells < 0
         return cls(occupied, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
+
+    def data(self) -> "FieldData":
+        """What the compiled tests take: the grid with its ring."""
+        from monstertruck_planners.collision_kernels import FieldData  # noqa: PLC0415 - workers only
+
+        x, y, yaw = self.origin
+        c, s = math.cos(yaw), math.sin(yaw)
+        res = self.resolution
+        return FieldData(self._distance, self._occupied, res, x - res * (c - s), y - res * (s + c), c, s)
 
     def lookup(self, points: Array) -> Array:
         """Distance to the nearest occupied cell centre, bilinear between cell centres.
@@ -270,40 +332,24 @@ class DistanceField:
         c, s = math.cos(yaw), math.sin(yaw)
         return (dx * c + dy * s) / self.resolution + 0.5, (dy * c - dx * s) / self.resolution + 0.5
 
-    def free(self, footprint: Footprint, poses: Array, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Whether the footprint keeps ``margin`` and half a cell from every occupied cell centre.
+    def inside(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (..., 2) lie on the grid."""
+        column, row = self._cells(points)
+        rows, columns = self._distance.shape
+        return np.asarray((row >= 0.5) & (row <= rows - 1.5) & (column >= 0.5) & (column <= columns - 1.5))
 
-        Covering discs accept, the inscribed circle rejects; what neither decides is checked exactly.
+    def free(self, footprint: Footprint | DiscFootprint, poses: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Whether the footprint, grown by ``margin`` on all sides, overlaps no occupied cell, exactly.
 
         Args:
-            footprint: the rectangle.
+            footprint: the truck.
             poses: shape (m, 3), in the grid's parent frame.
             margin: m.
 
         Returns:
             Shape (m,).
         """
-        keep = margin + self.resolution / 2
-        # Bilinear values stray from the true distance by less than a cell's diagonal.
-        slack = self.resolution * math.sqrt(2)
-        offsets, radius = footprint.covering_discs()
-        heading = np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=-1)
-        discs = poses[:, None, :2] + offsets[None, :, None] * heading[:, None, :]
-        result = np.asarray((self.lookup(discs) >= radius + keep + slack).all(axis=1))
-        hopeless = np.asarray(self.lookup(poses[:, :2]) < footprint.inscribed_radius + keep - slack)
-        for i in np.flatnonzero(~result & ~hopeless):
-            pose = poses[i : i + 1]
-            points = self._edges_near(pose[0], footprint.circumscribed_radius + keep)
-            result[i] = bool(clearance_to_points(footprint, pose, points)[0] >= keep)
-        return result
+        from monstertruck_planners.collision_kernels import free_poses  # noqa: PLC0415 - workers only
 
-    def _edges_near(self, pose: Array, reach: float) -> Array:
-        """Centres of the occupied cells with a free neighbour within ``reach``, shape (n, 2)."""
-        column, row = self._cells(pose[:2])
-        span = reach / self.resolution + 1
-        top, left = max(int(row - span), 0), max(int(column - span), 0)
-        r, c = np.nonzero(self._edge[top : int(row + span) + 2, left : int(column + span) + 2])
-        along, across = (c + left - 0.5) * self.resolution, (r + top - 0.5) * self.resolution
-        x, y, yaw = self.origin
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return np.column_stack((x + along * cos - across * sin, y + along * sin + across * cos))
+        rows = np.ascontiguousarray(poses, dtype=np.float64)
+        return np.asarray(free_poses(self.data(), footprint.body(), margin, rows))

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import (
+    DiscFootprint,
     DistanceField,
     Footprint,
     clearance_to_points,
@@ -16,6 +17,7 @@ from monstertruck_planners.collision import (
     scan_points,
     swept_poses,
 )
+from monstertruck_planners.collision_kernels import row_free
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import LaserScan
@@ -180,7 +182,7 @@ def test_field_values_are_distances_to_cell_centres():
 
 def test_the_outside_of_a_grid_is_occupied():
     empty = DistanceField(np.zeros((40, 40), dtype=bool), 0.05)
-    assert empty.lookup(points((0.525, 1.0)))[0] == pytest.approx(0.55, abs=1e-9)  # the ring's centre lies outside
+    assert empty.lookup(points((0.525, 1.0)))[0] == pytest.approx(0.55, abs=1e-7)  # the ring's centre lies outside
     poses = np.array([[1.0, 1.0, 0.0], [0.1, 1.0, 0.0], [1.85, 1.0, 0.0]])
     assert empty.free(Footprint(), poses).tolist() == [True, False, False]
 
@@ -193,16 +195,65 @@ def test_free_is_footprint_true():
     assert field.free(Footprint(), np.array([beside]), margin=0.02).tolist() == [False]
 
 
-@given(st.floats(0.1, 3.9), st.floats(0.1, 2.9), st.floats(-3.2, 3.2))
-@settings(max_examples=60, deadline=None)
-def test_shortcuts_never_change_the_answer(x, y, yaw):
-    field = room()
-    pose = np.array([[x, y, yaw]])
-    ring = [(-0.025 + 0.05 * i, v) for i in range(82) for v in (-0.025, 3.025)]
-    ring += [(u, -0.025 + 0.05 * i) for i in range(62) for u in (-0.025, 4.025)]
-    truth = clearance_to_points(Footprint(), pose, points((2.025, 1.525), *ring))[0]
-    if abs(truth - 0.025) > 1e-9:
-        assert field.free(Footprint(), pose)[0] == (truth >= 0.025)
+@st.composite
+def grids(draw):
+    cells = np.zeros((30, 40), dtype=bool)  # 2 x 1.5 m
+    for _ in range(draw(st.integers(1, 6))):
+        cells[draw(st.integers(0, 29)), draw(st.integers(0, 39))] = True
+    return cells
+
+
+def gap(first, second):
+    """Widest gap between the shadows of two convex polygons (n, 2); negative where they overlap."""
+    edges = np.concatenate((np.roll(first, -1, 0) - first, np.roll(second, -1, 0) - second))
+    normals = np.column_stack((-edges[:, 1], edges[:, 0])) / np.hypot(edges[:, 0], edges[:, 1])[:, None]
+    a, b = first @ normals.T, second @ normals.T
+    return np.maximum(b.min(0) - a.max(0), a.min(0) - b.max(0)).max()
+
+
+def slow_gap(footprint, pose, cells, margin):
+    """The slow truth: every occupied cell as a polygon, and those round the grid."""
+    ringed = np.pad(cells, 1, constant_values=True)
+    corners = 0.05 * (np.argwhere(ringed)[:, None, ::-1] - 1 + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
+    turn = np.array([[math.cos(pose[2]), math.sin(pose[2])], [-math.sin(pose[2]), math.cos(pose[2])]])
+    if isinstance(footprint, DiscFootprint):
+        centres = np.column_stack((footprint.centres, np.zeros(len(footprint.centres)))) @ turn + pose[:2]
+        nearest = np.clip(centres[:, None], corners[None, :, 0], corners[None, :, 2])
+        return np.hypot(*np.moveaxis(nearest - centres[:, None], -1, 0)).min() - footprint.radius - margin
+    length, width = footprint.half_length + margin, footprint.half_width + margin
+    body = np.array([[length, width], [-length, width], [-length, -width], [length, -width]])
+    body = (body + np.array([footprint.offset, 0])) @ turn + pose[:2]
+    return min(gap(body, square) for square in corners)
+
+
+@pytest.mark.parametrize("footprint", [Footprint(), Footprint(offset=0.16), DiscFootprint((-0.03, 0.11, 0.26), 0.12)])
+@given(cells=grids(), x=st.floats(0.1, 1.9), y=st.floats(0.1, 1.4), yaw=st.floats(-3.2, 3.2), margin=st.floats(0, 0.05))
+@settings(max_examples=40, deadline=None)
+def test_shortcuts_never_change_the_answer(footprint, cells, x, y, yaw, margin):
+    distance = slow_gap(footprint, np.array([x, y, yaw]), cells, margin)
+    if abs(distance) > 1e-9:
+        assert DistanceField(cells, 0.05).free(footprint, np.array([[x, y, yaw]]), margin)[0] == (distance > 0)
+
+
+def test_footprints_of_discs():
+    discs = DiscFootprint((0.0, 0.3), 0.1)
+    assert (discs.circumscribed_radius, discs.inscribed_radius) == (0.4, 0.1)
+    for centres, radius in (((), 0.1), ((0.0,), 0.0)):
+        with pytest.raises(InputError, match="discs"):
+            DiscFootprint(centres, radius)
+
+
+def test_rows_are_checked_all_the_way():
+    cells = np.zeros((60, 80), dtype=bool)
+    cells[30, 40] = True
+    field = DistanceField(cells, 0.05)
+    data, body = field.data(), Footprint().body()
+    assert row_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.0, 0.0, 0.0)
+    assert not row_free(data, body, 0.0, 0.01, 0.5, 1.5, 0.0, 3.0, 0.0, 0.0)
+    assert not row_free(data, body, 0.0, 0.01, 3.5, 1.5, 0.0, -3.0, 0.0, 0.0)
+    assert not row_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.4, 0.0, 0.0)  # leaves the grid
+    assert not row_free(data, body, 0.0, 0.01, 1.0, 1.1, 0.0, 2.0, 0.0, 0.4)
+    assert row_free(data, body, 0.0, 0.01, 1.0, 0.6, 0.0, 1.5, 0.3, 0.0)
 
 
 def test_a_turned_grid_turns_its_obstacles():
