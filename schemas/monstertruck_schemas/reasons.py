@@ -110,3 +110,10 @@ class Reason(StrEnum):
     LINK_DOWN = "link_down", 117, "no network link"
     CLOCK_UNSET = "clock_unset", 118, "the computer does not know the time"
     LINK_OPEN = "link_open", 119, "anybody on the network may drive the truck"
+
+    # Routes
+    START_BLOCKED = "start_blocked", 130, "the truck stands in an obstacle or off the map"
+    GOAL_BLOCKED = "goal_blocked", 131, "the truck would stand in an obstacle at the goal"
+    GOAL_OUTSIDE = "goal_outside", 132, "the goal is off the map"
+    GOAL_UNREACHABLE = "goal_unreachable", 133, "no way leads to the goal"
+    ROUTE_TIMEOUT = "route_timeout", 134, "no route found in the time allowed"
