@@ -112,8 +112,8 @@ class Reason(StrEnum):
     LINK_OPEN = "link_open", 119, "anybody on the network may drive the truck"
 
     # Routes
-    START_BLOCKED = "start_blocked", 130, "the truck stands in an obstacle or off the map"
-    GOAL_BLOCKED = "goal_blocked", 131, "the truck would stand in an obstacle at the goal"
-    GOAL_OUTSIDE = "goal_outside", 132, "the goal is off the map"
-    GOAL_UNREACHABLE = "goal_unreachable", 133, "no way leads to the goal"
-    ROUTE_TIMEOUT = "route_timeout", 134, "no route found in the time allowed"
+    START_BLOCKED = "start_blocked", 30, "the truck stands in an obstacle or off the map"
+    GOAL_BLOCKED = "goal_blocked", 31, "the truck would stand in an obstacle at the goal"
+    GOAL_OUTSIDE = "goal_outside", 32, "the goal is off the map"
+    GOAL_UNREACHABLE = "goal_unreachable", 33, "no way leads to the goal"
+    ROUTE_TIMEOUT = "route_timeout", 34, "no route found in the time allowed"
