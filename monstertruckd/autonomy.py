@@ -18,6 +18,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
 
@@ -116,10 +117,11 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
         )
 
 
-def calibration(config: TruckConfig, chassis: Chassis) -> dict[str, Any]:
-    """Everything that was measured on this very truck, for the log."""
+def calibration(config: TruckConfig, chassis: Chassis, tree: Tree | None = None) -> dict[str, Any]:
+    """Everything that was measured on this very truck, and the file it comes from, for the log."""
     devices = config.devices
     values: dict[str, Any] = {
+        "file": None if tree is None or tree.calibration is None else str(tree.calibration),
         "wheel_radius_m": config.geometry.wheel_radius,
         "drive_ratio": config.geometry.drive_ratio,
         "linkage": None if chassis.linkage is None else dataclasses.asdict(chassis.linkage),

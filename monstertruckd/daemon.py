@@ -20,6 +20,7 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
+from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -32,6 +33,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.cabling import Cabling, Computer
+from monstertruckd.calibrate import rpc as calibration_rpc
 from monstertruckd.config.truck import SHAFTS, TruckConfig
 from monstertruckd.config.validate import resolved
 from monstertruckd.config.yaml_tree import Tree
@@ -96,6 +98,7 @@ class Daemon:
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
+        self.rpc = self._build_rpc()
         self.recorder = self._build_recorder()
         self._notify = notify_from(environment, clock, self.gate.ticks, self._status)
 
@@ -138,7 +141,7 @@ class Daemon:
     async def _outside(self) -> AsyncIterator[None]:
         async with scope("bus") as bus_scope:
             if self._seed is None:
-                bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self._rpc())
+                bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self.rpc)
                 await bridge.open()
                 self._start(bus_scope, bridge, OnBug.EXIT)
             self._start(
@@ -191,7 +194,7 @@ class Daemon:
             if role in roles:
                 self._start(where, self._drivers[role], on_bug, device.restart)
 
-    def _rpc(self) -> Rpc:
+    def _build_rpc(self) -> Rpc:
         rpc = Rpc(self.clock)
 
         async def config(_: dict[str, Any]) -> dict[str, Any]:
@@ -202,6 +205,9 @@ class Daemon:
 
         rpc.register("config", config)
         rpc.register("versions", versions)
+        loaded = self._tree.calibration if self._tree is not None else None
+        offload = in_thread if self._seed is None else inline
+        calibration_rpc.register(rpc, self.config, loaded, self.clock, self._events, offload)
         return rpc
 
     def _refuse_goal(self, request: GoalRequest) -> None:
@@ -265,7 +271,7 @@ class Daemon:
             self._recorder_failed,
             attachments={
                 "config": resolved(self.config),
-                "calibration": calibration(self.config, self._body.chassis),
+                "calibration": calibration(self.config, self._body.chassis, self._tree),
                 "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
                 "versions": VERSIONS,
             },

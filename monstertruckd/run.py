@@ -13,6 +13,7 @@ from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import PortBusyError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
+from monstertruckd.calibrate.apply import store_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.logging_queue import start_logging
@@ -31,6 +32,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     config, tree = load_truck(config_file)
     faulthandler.enable()
     listener = start_logging(verbose=verbose)
+    log.info("calibration: %s", tree.calibration or f"none in {store_of(config).folder}")
 
     async def main(clock: Clock) -> None:
         stop = asyncio.Event()

@@ -1,14 +1,15 @@
-"""Loads a truck's configuration file, simulated or not."""
+"""Loads a truck's configuration file, simulated or not, with the truck's calibration over it."""
 
 from pathlib import Path
 
+from monstertruckd.calibrate.apply import calibrated
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.validate import load_config
 from monstertruckd.config.yaml_tree import Tree, load_tree
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
-    """The configuration at ``path``; with a section ``sim`` the world's settings are checked too.
+    """The configuration at ``path``, calibrated; with a section ``sim`` the world's settings are checked too.
 
     Raises:
         ConfigError: one line per mistake.
@@ -19,4 +20,4 @@ def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
         from monstertruckd.sim.config import SimulatedTruckConfig  # noqa: PLC0415
 
         model = SimulatedTruckConfig
-    return load_config(path, model)
+    return calibrated(*load_config(path, model))

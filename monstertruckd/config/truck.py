@@ -221,6 +221,8 @@ class TruckConfig(Schema):
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
     """Where the e-stop latch is kept"""
+    calibration: Path | None = None
+    """Folder of the calibration files; null = `calibration` in the state directory"""
 
     def chassis(self) -> Chassis:
         """The body's kinematics.

@@ -28,6 +28,8 @@ class Tree:
 
     data: dict[str, Any]
     origins: dict[Key, Origin] = field(default_factory=dict)
+    calibration: Path | None = None
+    """Calibration file whose values lie over those of the configuration, if there is one."""
 
     def origin(self, key: Key) -> Origin | None:
         """Origin of ``key``, or of its nearest parent that has one."""

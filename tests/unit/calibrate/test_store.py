@@ -1,0 +1,122 @@
+"""The folder of calibration files: whole after any crash, the one before kept, undone by a newer one."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruckd.calibrate.record import Estimate, Result
+from monstertruckd.calibrate.store import CalibrationStore
+
+NOON = 1_795_262_400 * SECOND
+
+
+def ratio(value: float) -> Result:
+    estimate = Estimate(
+        name="drive_ratio",
+        value=value,
+        low=value - 1,
+        high=value + 1,
+        samples=4,
+        meaning="test",
+        key="geometry.drive_ratio",
+    )
+    return Result(wizard="drive", measured="taped", estimates=(estimate,))
+
+
+def gain(value: float) -> Result:
+    estimate = Estimate(name="gain", value=value, samples=1, meaning="test")
+    return Result(wizard="battery", measured="metered", estimates=(estimate,))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> CalibrationStore:
+    return CalibrationStore(tmp_path / "state" / "calibration", "truck")
+
+
+def value(store: CalibrationStore, wizard: str = "drive"):
+    current = store.current()
+    assert current is not None
+    result = current.results.get(wizard)  # type: ignore[call-overload]
+    return None if result is None else result.estimates[0].value
+
+
+def test_files_are_dated_numbered_and_all_kept(store: CalibrationStore):
+    assert store.newest() is None
+    assert store.current() is None
+    first = store.save(ratio(640.0), NOON)
+    second = store.save(gain(1.02), NOON + 90 * SECOND)
+    assert [path.name for path in store.files()] == ["0001-2026-11-21T120000Z.json", "0002-2026-11-21T120130Z.json"]
+    assert store.newest() == second
+    assert store.load(first).results.keys() == {"drive"}
+    current = store.current()
+    assert current is not None
+    assert current.results["drive"].date == "2026-11-21T12:00:00Z"
+    assert current.results["battery"].date == "2026-11-21T12:01:30Z"
+    assert current.change == "battery calibrated"
+
+
+def test_numbers_decide_not_dates(store: CalibrationStore):
+    store.save(ratio(640.0), NOON)
+    store.save(ratio(650.0), 0)  # a robot without a clock of its own
+    assert value(store) == 650.0
+
+
+def test_undo_returns_to_the_value_before_and_twice_is_redo(store: CalibrationStore):
+    store.save(ratio(640.0), NOON)
+    store.save(ratio(650.0), NOON)
+    store.save(gain(1.02), NOON)
+    store.undo("drive", NOON)
+    assert (value(store), value(store, "battery")) == (640.0, 1.02), "only what was asked for"
+    store.undo("drive", NOON)
+    assert value(store) == 650.0
+    store.undo("battery", NOON)
+    assert value(store, "battery") is None
+    assert len(store.files()) == 6, "nothing is ever lost"
+
+
+def test_nothing_to_undo(store: CalibrationStore):
+    store.save(ratio(640.0), NOON)
+    with pytest.raises(NotFoundError, match="battery was never calibrated"):
+        store.undo("battery", NOON)
+
+
+@pytest.mark.parametrize("step", ["open", "fsync", "replace"])
+def test_a_failure_while_writing_leaves_the_old_file(
+    step: str, store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
+):
+    store.save(ratio(640.0), NOON)
+    before = {path: path.read_bytes() for path in store.files()}
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os if step == "fsync" else Path, step, full)
+        with pytest.raises(ConfigError, match="No space left on device"):
+            store.save(ratio(650.0), NOON)
+    assert {path: path.read_bytes() for path in store.files()} == before
+    assert value(store) == 640.0
+
+
+def test_a_torn_draft_is_no_calibration(store: CalibrationStore):
+    path = store.save(ratio(640.0), NOON)
+    (store.folder / "0002-2026-11-21T120130Z.new").write_text('{"version": 1, "num')
+    assert store.newest() == path
+    store.save(ratio(650.0), NOON + 90 * SECOND)
+    assert value(store) == 650.0
+
+
+def test_a_damaged_file_is_named_with_the_way_back(store: CalibrationStore):
+    path = store.save(ratio(640.0), NOON)
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(ConfigError, match=rf"{path}: no usable calibration: .*move it away"):
+        store.current()
+
+
+def test_another_trucks_file_is_refused(store: CalibrationStore):
+    store.save(ratio(640.0), NOON)
+    with pytest.raises(ConfigError, match="calibration of 'truck', this is 'lorry'"):
+        CalibrationStore(store.folder, "lorry").current()
