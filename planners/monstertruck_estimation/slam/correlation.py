@@ -1,0 +1,241 @@
+"""Coarse registration by exhaustive correlation with a likelihood grid, made fast by branch and bound.
+
+Every level of the grid holds the maximum over squares of 2^level cells, so that a block of translations is bounded by one
+look-up per point (Hess, Kohler, Rapp, Andor 2016; Olson 2009). The search returns the true maximum in its window.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+RESOLUTION: Final = 0.05
+"""Edge of a cell, m."""
+SMEAR: Final = 0.08
+"""Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search."""
+DOUBT: Final = 0.01
+"""What a squared standard deviation from the guess costs, as share of the score."""
+WORK: Final = 400_000
+"""Blocks looked at before the search ends with what it has."""
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodGrid:
+    """Pyramid of likelihoods, 0..255, of finding a surface in a cell."""
+
+    levels: NDArray[np.uint8]
+    """Shape (levels, rows, columns): level k is the maximum over squares of 2^k cells up and right of the cell."""
+    origin: tuple[float, float]
+    """Corner of the cell (0, 0), m."""
+
+    @classmethod
+    def of(cls, points: Array, levels: int) -> "LikelihoodGrid":
+        """Likelihood of surfaces at ``points``, shape (n, 2), n > 0."""
+        pad = (1 << (levels - 1)) + 4
+        low = np.floor(points.min(axis=0) / RESOLUTION).astype(np.int64) - pad
+        high = np.floor(points.max(axis=0) / RESOLUTION).astype(np.int64) + pad
+        columns, rows = (high - low + 1).tolist()
+        origin = (float(low[0] * RESOLUTION), float(low[1] * RESOLUTION))
+        grid = np.zeros((levels, rows, columns), np.uint8)
+        _stamp(grid[0], points, origin[0], origin[1])
+        for level in range(1, levels):
+            _pool(grid[level - 1], grid[level], 1 << (level - 1))
+        return cls(grid, origin)
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """Best pose of a correlation."""
+
+    pose: Array
+    """Shape (3,), m and rad."""
+    score: float
+    """Mean likelihood of the points there, 0..1."""
+    rival: float
+    """Best score of a clearly different pose in the window; 0 if none came near."""
+
+
+def correlate(
+    grid: LikelihoodGrid,
+    points: Array,
+    guess: Array,
+    window: tuple[float, float],
+    deviation: tuple[float, float],
+    least: float,
+    apart: float = 0.0,
+) -> Peak | None:
+    """Best pose of ``points`` in the grid.
+
+    Args:
+        grid: where the surfaces are.
+        points: shape (n, 2), in the moving frame, m.
+        guess: shape (3,); middle of the window.
+        window: half width of the translation (m) and of the yaw (rad).
+        deviation: standard deviation of the guess (m, rad), which breaks ties (``DOUBT``).
+        least: poses scoring less are no result.
+        apart: a rival is at least this far (m; or that arc at the typical range) from the best; 0: do not look.
+    """
+    if not len(points):
+        return None
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    lever = float(np.clip(np.percentile(ranges, 80), 1.0, 12.0))
+    step = RESOLUTION / lever
+    half = math.ceil(window[1] / step)
+    turns = np.arange(-half, half + 1) * step
+    cells = math.ceil(window[0] / RESOLUTION)
+    offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
+    penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
+    zone = (10**9, 10**9, 10**9, -1.0, -1.0)
+    score, k, ix, iy = _search(grid.levels, offsets, turns, cells, *penalty, least, *zone)
+    if k < 0:
+        return None
+    rival = 0.0
+    if apart > 0:
+        zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
+        rival = max(_search(grid.levels, offsets, turns, cells, *penalty, 0.8 * score, *zone)[0], 0.0)
+    pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
+    return Peak(pose, float(score), float(rival))
+
+
+@njit(cache=True)
+def _stamp(grid, points, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    half = 4
+    for i in range(points.shape[0]):
+        px, py = (points[i, 0] - x0) / RESOLUTION, (points[i, 1] - y0) / RESOLUTION
+        cx, cy = int(px), int(py)
+        for gy in range(cy - half, cy + half + 1):
+            for gx in range(cx - half, cx + half + 1):
+                dx, dy = (gx + 0.5 - px) * RESOLUTION, (gy + 0.5 - py) * RESOLUTION
+                value = np.uint8(255 * math.exp(-0.5 * (dx * dx + dy * dy) / (SMEAR * SMEAR)))
+                grid[gy, gx] = max(grid[gy, gx], value)
+
+
+@njit(cache=True)
+def _pool(source, target, step):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    rows, columns = source.shape
+    for y in range(rows):
+        y2 = min(y + step, rows - 1)
+        for x in range(columns):
+            x2 = min(x + step, columns - 1)
+            target[y, x] = max(max(source[y, x], source[y, x2]), max(source[y2, x], source[y2, x2]))
+
+
+@njit(cache=True)
+def _rotated(points, guess, turns, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Cells of the points at the guess, for every turn: shape (turns, points, 2)."""
+    result = np.empty((turns.size, points.shape[0], 2), np.int32)
+    for k in range(turns.size):
+        c, s = math.cos(guess[2] + turns[k]), math.sin(guess[2] + turns[k])
+        for i in range(points.shape[0]):
+            x = guess[0] + c * points[i, 0] - s * points[i, 1]
+            y = guess[1] + s * points[i, 0] + c * points[i, 1]
+            result[k, i, 0] = int(math.floor((x - x0) / RESOLUTION))
+            result[k, i, 1] = int(math.floor((y - y0) / RESOLUTION))
+    return result
+
+
+@njit(cache=True)
+def _bound(level, offsets, ix, iy):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    rows, columns = level.shape
+    total = 0
+    for i in range(offsets.shape[0]):
+        x, y = offsets[i, 0] + ix, offsets[i, 1] + iy
+        if 0 <= x < columns and 0 <= y < rows:
+            total += level[y, x]
+    return total / (255.0 * offsets.shape[0])
+
+
+@njit(cache=True)
+def _least_square(low, width):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Least square of the whole numbers low .. low + width - 1."""
+    high = low + width - 1
+    if low > 0:
+        return low * low
+    if high < 0:
+        return high * high
+    return 0
+
+
+@njit(cache=True)
+def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
+    levels,  # noqa: ANN001
+    offsets,  # noqa: ANN001
+    turns,  # noqa: ANN001
+    cells,  # noqa: ANN001
+    by_cell,  # noqa: ANN001
+    by_turn,  # noqa: ANN001
+    least,  # noqa: ANN001
+    shut_k,  # noqa: ANN001
+    shut_x,  # noqa: ANN001
+    shut_y,  # noqa: ANN001
+    shut_cells,  # noqa: ANN001
+    shut_turns,  # noqa: ANN001
+):
+    """Depth-first branch and bound; (score, turn index, x cells, y cells), turn index -1 if nothing reached ``least``.
+
+    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
+    """
+    top = levels.shape[0] - 1
+    while top > 0 and (1 << top) > 2 * cells:
+        top -= 1
+    width = 1 << top
+    per_axis = (2 * cells + width) // width
+    count = turns.size * per_axis * per_axis
+    bounds = np.empty(count)
+    blocks = np.empty((count, 3), np.int32)
+    n = 0
+    for k in range(turns.size):
+        for by in range(per_axis):
+            for bx in range(per_axis):
+                ix, iy = -cells + bx * width, -cells + by * width
+                doubt = by_turn * turns[k] ** 2
+                doubt += by_cell * (_least_square(ix, width) + _least_square(iy, width))
+                bounds[n] = _bound(levels[top], offsets[k], ix, iy) - doubt
+                blocks[n, 0], blocks[n, 1], blocks[n, 2] = k, ix, iy
+                n += 1
+    best, best_k, best_x, best_y = least, -1, 0, 0
+    work = 0
+    stack = np.empty((4 * (top + 1) + 4, 4), np.int32)
+    stack_bound = np.empty(4 * (top + 1) + 4)
+    for m in np.argsort(-bounds, kind="mergesort"):
+        if bounds[m] <= best or work > WORK:
+            break
+        stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = blocks[m, 0], blocks[m, 1], blocks[m, 2], top
+        stack_bound[0] = bounds[m]
+        size = 1
+        while size:
+            size -= 1
+            if stack_bound[size] <= best:
+                continue
+            k, x, y, level = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
+            if level == 0:
+                near = math.hypot(x - shut_x, y - shut_y) <= shut_cells and abs(k - shut_k) <= shut_turns
+                if not near and abs(x) <= cells and abs(y) <= cells:
+                    best, best_k, best_x, best_y = stack_bound[size], k, x, y
+                continue
+            half = 1 << (level - 1)
+            first = size
+            for q in range(4):
+                cx, cy = x + (q & 1) * half, y + (q >> 1) * half
+                doubt = by_turn * turns[k] ** 2
+                doubt += by_cell * (_least_square(cx, half) + _least_square(cy, half))
+                bound = _bound(levels[level - 1], offsets[k], cx, cy) - doubt
+                work += 1
+                if bound <= best:
+                    continue
+                # Insert so that the most promising child is on top.
+                at = size
+                while at > first and stack_bound[at - 1] > bound:
+                    stack_bound[at] = stack_bound[at - 1]
+                    for e in range(4):
+                        stack[at, e] = stack[at - 1, e]
+                    at -= 1
+                stack_bound[at] = bound
+                stack[at, 0], stack[at, 1], stack[at, 2], stack[at, 3] = k, cx, cy, level - 1
+                size += 1
+    return best if best_k >= 0 else 0.0, best_k, best_x, best_y

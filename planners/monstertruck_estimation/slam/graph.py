@@ -1,0 +1,212 @@
+"""Pose graph in the plane: sparse Levenberg-Marquardt over relative poses, robust where a relation may be wrong.
+
+Residual of an edge: the pose of ``target`` in the frame of ``origin`` minus its measurement. Loop edges are weighted by
+dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013), the closed form of switchable constraints.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import splu
+
+from monstertruck_estimation.slam.se2 import between, wrap
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SWITCH: Final = 12.0
+"""Squared Mahalanobis residual up to which a loop edge counts in full."""
+LEVER: Final = 4.0
+"""Distance at which an error of the yaw counts as one of the translation, m."""
+SETTLED: Final = 1e-4
+"""Greatest change of a pose, m or rad, at which the optimisation ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Relations between poses, as arrays with one row per edge."""
+
+    origin: Index
+    """Shape (n,)."""
+    target: Index
+    """Shape (n,)."""
+    measured: Array
+    """Shape (n, 3): target in the frame of origin."""
+    information: Array
+    """Shape (n, 3, 3)."""
+    loop: NDArray[np.bool_]
+    """Shape (n,): whether the edge may be wrong."""
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+
+def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
+    """Residuals, shape (n, 3), and squared Mahalanobis norms, shape (n,), of ``edges``."""
+    off = between(poses[edges.origin], poses[edges.target]) - edges.measured
+    off[:, 2] = wrap(off[:, 2])
+    return off, np.einsum("ni,nij,nj->n", off, edges.information, off)
+
+
+def trust(squares: Array, loop: NDArray[np.bool_]) -> Array:
+    """Weight in (0, 1] of every edge by its squared residual: 1 for those that cannot be wrong."""
+    scale = np.minimum(1.0, 2 * SWITCH / (SWITCH + squares))
+    return np.where(loop, scale**2, 1.0)
+
+
+def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 20) -> Array:
+    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; number ``fixed`` stays where it is."""
+    if not len(edges):
+        return poses
+    pattern = _Pattern(edges, len(poses), fixed)
+    damping = 1e-6
+    off, squares = residuals(poses, edges)
+    weights = trust(squares, edges.loop)
+    cost = _cost(squares, edges.loop)
+    for _ in range(iterations):
+        step = pattern.solve(poses, edges, off, weights, damping)
+        moved = poses + step
+        moved[:, 2] = wrap(moved[:, 2])
+        off_now, squares_now = residuals(moved, edges)
+        cost_now = _cost(squares_now, edges.loop)
+        if cost_now > cost * (1 + 1e-9):
+            damping = max(damping * 100, 1e-4)
+            if damping > 1e6:
+                break
+            continue
+        poses, off, squares = moved, off_now, squares_now
+        weights = trust(squares, edges.loop)
+        damping = max(damping / 10, 1e-9)
+        settled = np.abs(step).max() < SETTLED or cost - cost_now < 1e-6 * cost
+        cost = cost_now
+        if settled:
+            break
+    return poses
+
+
+def _cost(squares: Array, loop: NDArray[np.bool_]) -> float:
+    """Sum of the robust costs belonging to ``trust``."""
+    scale = np.minimum(1.0, 2 * SWITCH / (SWITCH + squares))
+    robust = scale**2 * squares + SWITCH * (1 - scale) ** 2
+    return float(np.where(loop, robust, squares).sum())
+
+
+class _Pattern:
+    """The sparse normal equations of one set of edges, assembled anew for every step."""
+
+    def __init__(self, edges: Edges, count: int, fixed: int) -> None:
+        self._size = 3 * count
+        a, b = 3 * edges.origin, 3 * edges.target
+        k = np.arange(3)
+        rows, columns = [], []
+        for left, right in ((a, a), (a, b), (b, a), (b, b)):
+            rows.append(np.broadcast_to((left[:, None] + k)[:, :, None], (len(edges), 3, 3)))
+            columns.append(np.broadcast_to((right[:, None] + k)[:, None, :], (len(edges), 3, 3)))
+        diagonal = np.arange(self._size)
+        self._rows = np.concatenate([r.ravel() for r in rows] + [diagonal])
+        self._columns = np.concatenate([c.ravel() for c in columns] + [diagonal])
+        self._held = slice(3 * fixed, 3 * fixed + 3)
+        self._a, self._b = a, b
+
+    def solve(self, poses: Array, edges: Edges, off: Array, weights: Array, damping: float) -> Array:
+        """One damped Gauss-Newton step, shape (n, 3)."""
+        by_origin, by_target = _jacobians(poses[edges.origin], poses[edges.target])
+        weighted = edges.information * weights[:, None, None]
+        from_origin = np.einsum("nji,njk->nik", by_origin, weighted)
+        from_target = np.einsum("nji,njk->nik", by_target, weighted)
+        blocks = [
+            from_origin @ by_origin,
+            from_origin @ by_target,
+            from_target @ by_origin,
+            from_target @ by_target,
+        ]
+        gradient = np.zeros(self._size)
+        for first, factor in ((self._a, from_origin), (self._b, from_target)):
+            pull = np.einsum("nij,nj->ni", factor, off)
+            for k in range(3):
+                gradient += np.bincount(first + k, weights=pull[:, k], minlength=self._size)
+        ground = np.full(self._size, damping)
+        ground[self._held] = 1e12
+        values = np.concatenate([block.ravel() for block in blocks] + [ground])
+        matrix = csc_matrix((values, (self._rows, self._columns)), shape=(self._size, self._size))
+        factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0})
+        return -np.asarray(factors.solve(gradient)).reshape(-1, 3)
+
+
+def _jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
+    """Derivatives, shape (n, 3, 3), of ``between`` by both poses."""
+    c, s = np.cos(origin[:, 2]), np.sin(origin[:, 2])
+    dx, dy = target[:, 0] - origin[:, 0], target[:, 1] - origin[:, 1]
+    by_origin = np.zeros((len(origin), 3, 3))
+    by_target = np.zeros((len(origin), 3, 3))
+    by_target[:, 0, 0], by_target[:, 0, 1] = c, s
+    by_target[:, 1, 0], by_target[:, 1, 1] = -s, c
+    by_target[:, 2, 2] = 1.0
+    by_origin[:, :2, :2] = -by_target[:, :2, :2]
+    by_origin[:, 0, 2] = -s * dx + c * dy
+    by_origin[:, 1, 2] = -c * dx - s * dy
+    by_origin[:, 2, 2] = -1.0
+    return by_origin, by_target
+
+
+def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array, Array]:
+    """Covariance of every pose in the frame of ``source``, carried along the surest path of the graph.
+
+    An upper bound: what other paths know is left out.
+
+    Args:
+        poses: shape (n, 3).
+        edges: m edges of the graph.
+        spread: shape (m, 2): variance of each edge's translation (each axis, m^2) and of its yaw (rad^2).
+        source: number of the pose that is the frame.
+
+    Returns:
+        Covariances, shape (n, 3, 3), infinite where no path leads; and the paths' summed variance, m^2, shape (n,).
+    """
+    count = len(poses)
+    variance = spread[:, 0] + spread[:, 1] * LEVER**2
+    low, high = np.minimum(edges.origin, edges.target), np.maximum(edges.origin, edges.target)
+    order = np.lexsort((variance, high, low))
+    low, high = low[order], high[order]
+    first = np.ones(len(low), bool)
+    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    kept = order[first]
+    low, high = low[first], high[first]
+    shape = (count, count)
+    graph = csr_matrix((variance[kept], (low, high)), shape=shape)
+    far, before = dijkstra(graph, directed=False, indices=source, return_predecessors=True)
+    numbers = low * count + high
+    parents = before.astype(np.int64)
+    nodes = np.arange(count)
+    pair = np.minimum(parents, nodes) * count + np.maximum(parents, nodes)
+    taken = kept[np.minimum(np.searchsorted(numbers, pair), len(kept) - 1)] if len(kept) else np.zeros(count, np.int64)
+    steps = spread[taken] if len(kept) else np.zeros((count, 2))
+    local = between(poses[source], poses)
+    covariances = _carry(local, np.argsort(far, kind="stable"), parents, steps, source)
+    return covariances, np.asarray(far)
+
+
+@njit(cache=True)
+def _carry(local, order, parents, steps, source):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Covariances compounded from parent to child; ``local`` are the poses in the frame of the source."""
+    result = np.full((local.shape[0], 3, 3), np.inf)
+    result[source] = 0.0
+    for node in order:
+        parent = parents[node]
+        if parent < 0:
+            continue
+        dx, dy = local[node, 0] - local[parent, 0], local[node, 1] - local[parent, 1]
+        turn = np.eye(3)
+        turn[0, 2] = -dy
+        turn[1, 2] = dx
+        carried = turn @ result[parent] @ turn.T
+        carried[0, 0] += steps[node, 0]
+        carried[1, 1] += steps[node, 0]
+        carried[2, 2] += steps[node, 1]
+        result[node] = carried
+    return result

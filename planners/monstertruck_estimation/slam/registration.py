@@ -1,0 +1,279 @@
+"""Iterated fine registration of a scan to a cloud of surface elements (generalised ICP in the plane).
+
+Residual of a pair: the vector d from the moved scan point to its nearest map point, weighted by the inverse of the sum of
+both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional Gaussian prior.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.scans import Scan
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CELL: Final = 0.3
+"""Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
+KERNEL: Final = 3.0
+"""Mahalanobis distance at which a pair's influence is a quarter."""
+CORRELATION: Final = 0.1
+"""Share of independent pairs: neighbouring beams err alike, so the information is scaled by this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Surface elements in one frame, hashed by cells of ``CELL`` metres."""
+
+    points: Array
+    """Shape (n, 2), m."""
+    normals: Array
+    """Shape (n, 2), towards the sensor that saw them."""
+    variances: Array
+    """Shape (n, 2): across and along the surface, m^2."""
+    starts: Index
+    """Shape (2^k + 1,): first entry of ``order`` per bucket."""
+    order: Index
+    """Shape (n,): elements by bucket."""
+
+    @classmethod
+    def of(cls, scan: Scan) -> "Cloud":
+        """The elements of ``scan`` with their hash."""
+        return cls(scan.points, scan.normals, scan.variances, *_hashed(scan.points))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Result of a registration."""
+
+    pose: Array
+    """Shape (3,): the scan's frame in the cloud's, m and rad."""
+    information: Array
+    """Shape (3, 3): what the pairs alone know about ``pose`` (x, y in the cloud's frame, yaw)."""
+    overlap: float
+    """Share of the scan's points that found a fitting partner."""
+    residual: float
+    """Root mean square distance across the surface of those, m."""
+    pairs: int
+    """Their number."""
+
+
+NO_PRIOR: Final = np.zeros((3, 3))
+
+
+def register(
+    scan: Scan,
+    cloud: Cloud,
+    guess: Array,
+    prior: Array = NO_PRIOR,
+    iterations: int = 20,
+    reach: float = CELL,
+    start: Array | None = None,
+) -> Fit:
+    """Fit ``scan`` into ``cloud``.
+
+    Args:
+        scan: points with normals in the moving frame.
+        cloud: where they should come to lie.
+        guess: shape (3,), mean of the prior and, without ``start``, first pose.
+        prior: information, shape (3, 3), of the guess in the cloud's frame.
+        iterations: Gauss-Newton steps at most.
+        reach: greatest distance of a pair, m (at most ``CELL``).
+        start: shape (3,), first pose, where a coarse search found a better one.
+    """
+    pose, information, stats = _register(
+        scan.points,
+        scan.normals,
+        scan.variances,
+        cloud.points,
+        cloud.normals,
+        cloud.variances,
+        cloud.starts,
+        cloud.order,
+        np.ascontiguousarray(guess if start is None else start, dtype=np.float64),
+        np.ascontiguousarray(guess, dtype=np.float64),
+        np.ascontiguousarray(prior),
+        iterations,
+        min(reach, CELL),
+    )
+    pairs = int(stats[0])
+    total = max(len(scan), 1)
+    return Fit(pose, information, pairs / total, math.sqrt(stats[1] / max(pairs, 1)), pairs)
+
+
+@njit(cache=True)
+def _bucket(cx, cy, mask):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    return (cx * 73856093 ^ cy * 19349663) & mask
+
+
+@njit(cache=True)
+def _hashed(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Buckets by counting sort: starts and order."""
+    n = points.shape[0]
+    size = 16
+    while size < 2 * n:
+        size *= 2
+    mask = size - 1
+    bucket = np.empty(n, np.int64)
+    starts = np.zeros(size + 1, np.int64)
+    for i in range(n):
+        cx = np.int64(math.floor(points[i, 0] / CELL))
+        cy = np.int64(math.floor(points[i, 1] / CELL))
+        bucket[i] = _bucket(cx, cy, mask)
+        starts[bucket[i] + 1] += 1
+    for b in range(size):
+        starts[b + 1] += starts[b]
+    fill = starts[:-1].copy()
+    order = np.empty(n, np.int64)
+    for i in range(n):
+        order[fill[bucket[i]]] = i
+        fill[bucket[i]] += 1
+    return starts, order
+
+
+@njit(cache=True)
+def _nearest(x, y, nx, ny, points, normals, starts, order, reach):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Nearest element that faces the same half-plane; -1 if there is none within ``reach``."""
+    mask = starts.size - 2
+    cx = np.int64(math.floor(x / CELL))
+    cy = np.int64(math.floor(y / CELL))
+    best, found = reach * reach, -1
+    for gx in range(cx - 1, cx + 2):
+        for gy in range(cy - 1, cy + 2):
+            b = _bucket(gx, gy, mask)
+            for k in range(starts[b], starts[b + 1]):
+                j = order[k]
+                dx, dy = points[j, 0] - x, points[j, 1] - y
+                d = dx * dx + dy * dy
+                if d < best and normals[j, 0] * nx + normals[j, 1] * ny > 0.3:
+                    best, found = d, j
+    return found
+
+
+@njit(cache=True)
+def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
+    pose,  # noqa: ANN001
+    points,  # noqa: ANN001
+    normals,  # noqa: ANN001
+    variances,  # noqa: ANN001
+    map_points,  # noqa: ANN001
+    map_normals,  # noqa: ANN001
+    map_variances,  # noqa: ANN001
+    starts,  # noqa: ANN001
+    order,  # noqa: ANN001
+    reach,  # noqa: ANN001
+):
+    """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across)."""
+    h = np.zeros((3, 3))
+    g = np.zeros(3)
+    stats = np.zeros(2)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(points.shape[0]):
+        rx = c * points[i, 0] - s * points[i, 1]
+        ry = s * points[i, 0] + c * points[i, 1]
+        nx = c * normals[i, 0] - s * normals[i, 1]
+        ny = s * normals[i, 0] + c * normals[i, 1]
+        x, y = rx + pose[0], ry + pose[1]
+        j = _nearest(x, y, nx, ny, map_points, map_normals, starts, order, reach)
+        if j < 0:
+            continue
+        mx, my = map_normals[j, 0], map_normals[j, 1]
+        across, along = variances[i, 0], variances[i, 1]
+        across_m, along_m = map_variances[j, 0], map_variances[j, 1]
+        cxx = across * nx * nx + along * ny * ny + across_m * mx * mx + along_m * my * my
+        cyy = across * ny * ny + along * nx * nx + across_m * my * my + along_m * mx * mx
+        cxy = (across - along) * nx * ny + (across_m - along_m) * mx * my
+        det = cxx * cyy - cxy * cxy
+        ixx, iyy, ixy = cyy / det, cxx / det, -cxy / det
+        ex, ey = x - map_points[j, 0], y - map_points[j, 1]
+        vx, vy = ixx * ex + ixy * ey, ixy * ex + iyy * ey
+        m = ex * vx + ey * vy
+        w = KERNEL * KERNEL / (KERNEL * KERNEL + m)
+        w = w * w
+        jx, jy = -ry, rx
+        qx, qy = ixx * jx + ixy * jy, ixy * jx + iyy * jy
+        h[0, 0] += w * ixx
+        h[0, 1] += w * ixy
+        h[1, 1] += w * iyy
+        h[0, 2] += w * qx
+        h[1, 2] += w * qy
+        h[2, 2] += w * (jx * qx + jy * qy)
+        g[0] += w * vx
+        g[1] += w * vy
+        g[2] += w * (jx * vx + jy * vy)
+        if m < KERNEL * KERNEL:
+            stats[0] += 1.0
+            stats[1] += (ex * mx + ey * my) ** 2
+    h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
+    return h * CORRELATION, g * CORRELATION, stats
+
+
+@njit(cache=True)
+def solve3(h, g):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
+    """Solution of the symmetric positive system h x = g by Cholesky; zeros if it is singular."""
+    x = np.zeros(3)
+    a = h[0, 0]
+    if a <= 1e-12:
+        return x
+    l00 = math.sqrt(a)
+    l10, l20 = h[1, 0] / l00, h[2, 0] / l00
+    a = h[1, 1] - l10 * l10
+    if a <= 1e-12:
+        return x
+    l11 = math.sqrt(a)
+    l21 = (h[2, 1] - l20 * l10) / l11
+    a = h[2, 2] - l20 * l20 - l21 * l21
+    if a <= 1e-12:
+        return x
+    l22 = math.sqrt(a)
+    y0 = g[0] / l00
+    y1 = (g[1] - l10 * y0) / l11
+    y2 = (g[2] - l20 * y0 - l21 * y1) / l22
+    x[2] = y2 / l22
+    x[1] = (y1 - l21 * x[2]) / l11
+    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
+    return x
+
+
+@njit(cache=True)
+def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
+    points,  # noqa: ANN001
+    normals,  # noqa: ANN001
+    variances,  # noqa: ANN001
+    map_points,  # noqa: ANN001
+    map_normals,  # noqa: ANN001
+    map_variances,  # noqa: ANN001
+    starts,  # noqa: ANN001
+    order,  # noqa: ANN001
+    start,  # noqa: ANN001
+    guess,  # noqa: ANN001
+    prior,  # noqa: ANN001
+    iterations,  # noqa: ANN001
+    reach,  # noqa: ANN001
+):
+    pose = start.copy()
+    h, g, stats = accumulate(
+        pose, points, normals, variances, map_points, map_normals, map_variances, starts, order, reach
+    )
+    for _ in range(iterations):
+        off = pose - guess
+        off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
+        total = h + prior
+        for k in range(3):
+            total[k, k] += 1e-6 + 1e-9 * total[k, k]
+        step = solve3(total, -(g + prior @ off))
+        pose = pose + step
+        h, g, stats = accumulate(
+            pose, points, normals, variances, map_points, map_normals, map_variances, starts, order, reach
+        )
+        if math.hypot(step[0], step[1]) < 1e-4 and abs(step[2]) < 2e-5:
+            break
+    pose[2] = (pose[2] + math.pi) % (2 * math.pi) - math.pi
+    return pose, h, stats

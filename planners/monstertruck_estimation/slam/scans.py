@@ -1,0 +1,209 @@
+"""From ranges to points that know how well they lie on a surface.
+
+Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor) and
+the variances along and across it: a point among neighbours on a line says nothing along that line, a lone point says
+the same in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+RANGE_NOISE: Final = 0.012
+"""Standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
+RELATIVE_NOISE: Final = 0.005
+"""What is added per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
+REACH: Final = 0.2
+"""Neighbours up to this far away along the surface make its normal, m."""
+GRAZING: Final = 0.2
+"""Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad."""
+SLIDE: Final = 5.0
+"""Standard deviation along a line, m: none of what a scan knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanGeometry:
+    """How ranges become points of the base frame."""
+
+    start_angle: float
+    """Angle of the first beam, rad, counter-clockwise from the sensor's x axis."""
+    angle_increment: float
+    """Angle between neighbouring beams, rad."""
+    range_min: float
+    """Shorter ranges are no returns, m."""
+    range_max: float
+    """Ranges at or beyond this are no returns, m."""
+    time_increment: float = 0.0
+    """Seconds between neighbouring beams."""
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Pose of the sensor in base, m and rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """Points of one scan in the base frame at the time of its first beam."""
+
+    points: Array
+    """Shape (n, 2), m."""
+    normals: Array
+    """Shape (n, 2), unit vectors towards the sensor."""
+    variances: Array
+    """Shape (n, 2): across and along the surface, m^2."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def thinned(self, cell: float, most: int) -> "Scan":
+        """About one point per square of ``cell``, and at most ``most``, spread evenly."""
+        kept = spread(self.points, cell)
+        if len(kept) > most:
+            kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
+        return Scan(self.points[kept], self.normals[kept], self.variances[kept])
+
+
+def prepare(
+    ranges: Array, geometry: ScanGeometry, twist: tuple[float, float, float] = (0.0, 0.0, 0.0), longest: float = math.inf
+) -> Scan:
+    """Points with normals; no-returns, NaN and what is out of range are left out.
+
+    Args:
+        ranges: shape (n,), m; anything not finite is a no-return.
+        geometry: angles, limits, times and mount.
+        twist: the base's velocity (vx, vy, wz; m/s, rad/s), by which the scan's motion distortion is undone.
+        longest: ranges beyond this are left out too, m.
+    """
+    values = np.ascontiguousarray(ranges, dtype=np.float64)
+    limit = min(geometry.range_max, np.nextafter(longest, math.inf))
+    xs, ys, yaw = geometry.mount
+    points, normals, variances = _prepare(
+        values,
+        geometry.start_angle,
+        geometry.angle_increment,
+        geometry.range_min,
+        limit,
+        geometry.time_increment,
+        np.array((xs, ys, yaw)),
+        np.array(twist, dtype=np.float64),
+    )
+    return Scan(points, normals, variances)
+
+
+@njit(cache=True)
+def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twist):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Arrays of ``Scan``; see there."""
+    n = 0
+    for r in ranges:
+        if r >= shortest and r < longest:
+            n += 1
+    points = np.empty((n, 2))
+    origins = np.empty((n, 2))
+    beams = np.empty(n, np.int64)
+    reach = np.empty(n)
+    k = 0
+    for i in range(ranges.size):
+        r = ranges[i]
+        if not (r >= shortest and r < longest):
+            continue
+        angle = start + i * increment + mount[2]
+        x = mount[0] + r * math.cos(angle)
+        y = mount[1] + r * math.sin(angle)
+        dt = i * beam_time
+        turn = twist[2] * dt
+        # Along the arc: half of the turn before the way, half after it.
+        wx = (twist[0] * math.cos(turn / 2) - twist[1] * math.sin(turn / 2)) * dt
+        wy = (twist[0] * math.sin(turn / 2) + twist[1] * math.cos(turn / 2)) * dt
+        c, s = math.cos(turn), math.sin(turn)
+        points[k, 0] = wx + c * x - s * y
+        points[k, 1] = wy + s * x + c * y
+        origins[k, 0] = wx + c * mount[0] - s * mount[1]
+        origins[k, 1] = wy + s * mount[0] + c * mount[1]
+        beams[k] = i
+        reach[k] = r
+        k += 1
+    normals = np.empty((n, 2))
+    variances = np.empty((n, 2))
+    for i in range(n):
+        _surface(points, origins, beams, reach, abs(increment), i, normals, variances)
+    return points, normals, variances
+
+
+@njit(cache=True)
+def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Whether the neighbouring points ``a`` and ``b`` plausibly lie on one surface."""
+    gap = abs(beams[b] - beams[a])
+    if gap > 3:
+        return False
+    r = min(reach[a], reach[b])
+    apart = math.hypot(points[a, 0] - points[b, 0], points[a, 1] - points[b, 1])
+    return apart < r * increment * gap / GRAZING + 3.0 * (RANGE_NOISE + RELATIVE_NOISE * r)
+
+
+@njit(cache=True)
+def _surface(points, origins, beams, reach, increment, i, normals, variances):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Normal and variances of point ``i`` from its neighbours in beam order."""
+    n = points.shape[0]
+    noise = RANGE_NOISE + RELATIVE_NOISE * reach[i]
+    spacing = reach[i] * increment
+    window = max(REACH, 2.5 * spacing)
+    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
+    count = 1
+    px, py = points[i, 0], points[i, 1]
+    nearest = 1e9
+    for side in (-1, 1):
+        j = i
+        while True:
+            k = j + side
+            if k < 0 or k >= n or not _joined(points, beams, reach, increment, j, k):
+                break
+            dx, dy = points[k, 0] - px, points[k, 1] - py
+            d = math.hypot(dx, dy)
+            nearest = min(nearest, d)
+            if d > window:
+                break
+            sx += dx
+            sy += dy
+            sxx += dx * dx
+            sxy += dx * dy
+            syy += dy * dy
+            count += 1
+            j = k
+    bx, by = origins[i, 0] - px, origins[i, 1] - py
+    length = math.hypot(bx, by)
+    if length < 1e-9:
+        bx, by, length = 1.0, 0.0, 1.0
+    if count >= 3:
+        mx, my = sx / count, sy / count
+        cxx, cxy, cyy = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
+        middle, half = (cxx + cyy) / 2, math.hypot((cxx - cyy) / 2, cxy)
+        small, large = max(middle - half, 0.0), middle + half
+        if small < (2.0 * noise) ** 2 and small < 0.1 * large:
+            angle = 0.5 * math.atan2(2 * cxy, cxx - cyy)
+            nx, ny = -math.sin(angle), math.cos(angle)
+            if nx * bx + ny * by < 0:
+                nx, ny = -nx, -ny
+            normals[i, 0], normals[i, 1] = nx, ny
+            variances[i, 0], variances[i, 1] = max(noise * noise, small), SLIDE * SLIDE
+            return
+    normals[i, 0], normals[i, 1] = bx / length, by / length
+    around = noise * noise + (min(nearest, window) / 2) ** 2 / 3
+    variances[i, 0], variances[i, 1] = around, around
+
+
+@njit(cache=True)
+def _cells(points, cell):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    keys = np.empty(points.shape[0], np.int64)
+    for i in range(points.shape[0]):
+        keys[i] = np.int64(math.floor(points[i, 0] / cell)) * 1048583 + np.int64(math.floor(points[i, 1] / cell))
+    return keys
+
+
+def spread(points: Array, cell: float) -> NDArray[np.intp]:
+    """Indices, rising, of the first point in every square of ``cell`` m."""
+    _, first = np.unique(_cells(points, cell), return_index=True)
+    return np.sort(first)
