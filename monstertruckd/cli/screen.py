@@ -93,10 +93,16 @@ class ScreenState:
                 pass
 
 
-def draw(state: ScreenState, width: int) -> RenderableType:
-    """The whole screen; a terminal narrower than ``WIDE`` columns gets no scan view."""
+def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
+    """The whole screen; a terminal narrower than ``WIDE`` columns gets no scan view.
+
+    Args:
+        state: what is shown.
+        width: columns there are.
+        events: newest events shown.
+    """
     layout = Layout()
-    layout.split_column(Layout(name="top", ratio=1), Layout(_events(state), name="events", size=8))
+    layout.split_column(Layout(name="top", ratio=1), Layout(_events(state, events), name="events", size=events + 2))
     parts = [Layout(_truck(state), size=40), Layout(_services(state), size=34 if width >= WIDE else None)]
     if width >= WIDE:
         scan = Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")
@@ -116,26 +122,33 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "gate", Text(gate.mode.value.upper(), style=MODE_STYLE[gate.mode]))
         _row(table, "driver", f"{gate.holder or '-'}{f' ({gate.role.value})' if gate.role else ''}")
         _row(table, "lease left", "-" if gate.lease_left is None else f"{gate.lease_left * 1000:.0f} ms")
-        _row(table, "limit", f"{gate.speed_limit:.2f} m/s")
-        _row(table, "stops within", f"{gate.stopping_distance * 100:.1f} cm")
         _row(table, "why", Text("\n".join(r.text for r in gate.reasons[:3]) or "-", style="yellow"))
+        _row(table, "limit", f"{gate.speed_limit:.2f} m/s, stops in {gate.stopping_distance * 100:.1f} cm")
     if odometry is not None:
         speed = math.copysign(math.hypot(odometry.twist.vx, odometry.twist.vy), odometry.twist.vx)
-        _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
         _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s")
-    if state.attitude is not None:
-        _row(table, "tilt", f"{math.degrees(state.attitude.roll):+.1f}° {math.degrees(state.attitude.pitch):+.1f}°")
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.1f} V"
         _row(table, "battery", f"{volts} {state.battery.level.value}")
+    if odometry is not None:
+        _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
+    if state.attitude is not None:
+        _row(table, "tilt", f"{math.degrees(state.attitude.roll):+.1f}° {math.degrees(state.attitude.pitch):+.1f}°")
     if state.tracker is not None:
-        done = state.tracker.along / state.tracker.length if state.tracker.length else 0.0
+        done = _done(state.tracker)
         bar = "█" * round(done * 16)
         _row(table, "path", f"{bar:░<16} {done:4.0%}")
         _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
     if state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
     return Panel(table, title=f"mt/{state.robot}", border_style="dim")
+
+
+def _done(tracker: TrackerState) -> float:
+    """Share of the path that is driven; at the end of a lap the tracker measures along the next one."""
+    if tracker.outcome is Reason.GOAL_REACHED:
+        return 1.0
+    return tracker.along / tracker.length if tracker.length else 0.0
 
 
 def _services(state: ScreenState) -> Panel:
@@ -150,15 +163,15 @@ def _services(state: ScreenState) -> Panel:
         )
     parts: list[RenderableType] = [table]
     if state.recorder is not None and state.recorder.recording:
-        parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB", style="red"))
+        parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB unpacked", style="red"))
     elif state.recorder is not None and state.recorder.reason is not Reason.OK:
         parts.append(Text(f"NOT RECORDING: {state.recorder.reason.text}", style="bold red"))
     return Panel(Group(*parts), title="services", border_style="dim")
 
 
-def _events(state: ScreenState) -> Panel:
+def _events(state: ScreenState, count: int) -> Panel:
     lines = Text()
-    for event in list(state.events)[-6:]:
+    for event in list(state.events)[-count:]:
         seconds = (event.stamp - state.started) / 1e9
         lines.append(f"{seconds:8.2f} s  ", style="dim")
         lines.append(f"{event.source}: ", style="bold")

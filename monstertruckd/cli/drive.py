@@ -1,0 +1,38 @@
+"""``monstertruckd drive``: the keyboard as a deadman switch."""
+
+import math
+import sys
+from typing import Annotated
+
+import typer
+
+from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.cli.output import until_stopped
+from monstertruckd.cli.teleop import SPEEDS, SteeringMode, Teleop
+
+
+def drive(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, to begin with.")] = SteeringMode.FRONT,
+    speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Speed to begin with, m/s.")] = SPEEDS[1],
+    angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Full lock of an axle, degrees.")] = 22.5,
+    hold: Annotated[
+        float,
+        typer.Option(min=0.1, max=1.0, help="Seconds a first press stands: just above the keyboard's repeat delay."),
+    ] = 0.6,
+) -> None:
+    """Drive with the keyboard: the truck moves only while a key is held, in this terminal.
+
+    [b]Enter[/b] arms, [b]W A S D[/b] or the arrow keys drive, [b]space[/b] stops, [b]e[/b] is the emergency stop and
+    [b]r[/b] resets it, [b]1[/b] to [b]5[/b] choose front, rear, counter, crab or hybrid steering, [b]z[/b] and [b]c[/b]
+    the drift of the last, [b]x[/b] straightens the wheels, [b]+[/b] and [b]-[/b] change the speed, [b]q[/b] ends.
+    """
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.cli.drive_session import DriveSession
+
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise InputError("drive reads keys as they are held: it needs a terminal")
+    level = min(range(len(SPEEDS)), key=lambda index: abs(SPEEDS[index] - speed))
+    teleop = Teleop(math.radians(angle), first_hold=hold, level=level, mode=mode)
+    until_stopped(lambda clock: DriveSession(teleop, clock, sys.stdin, sys.stdout).run(robot, endpoint))
