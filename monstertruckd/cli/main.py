@@ -3,7 +3,7 @@
 import typer
 
 from monstertruckd import __version__
-from monstertruckd.cli import demo, devices, drill, kinematics, live, logs, orders, robot, usb
+from monstertruckd.cli import demo, devices, drill, drive, kinematics, live, logs, orders, robot, usb
 from monstertruckd.cli.output import CommandGroup
 
 app = typer.Typer(
@@ -37,6 +37,7 @@ app.command("check-config")(robot.check_config)
 app.command("topics")(robot.topics)
 app.command("status")(live.status)
 app.command("echo")(live.echo)
+app.command("drive")(drive.drive)
 app.command("arm")(orders.arm)
 app.command("disarm")(orders.disarm)
 app.command("estop")(orders.estop)
