@@ -12,17 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
-from monstertruck_schemas.topics import BY_NAME
+from monstertruck_runtime.errors import InputError
 from monstertruckd.logs.reader import LogReader
+from monstertruckd.logs.selection import ALL, Progress, Selection
+from monstertruckd.logs.wall_time import real_offset
 
-_TIME = "log_time"
+_LOG_TIME, _REAL_TIME = "log_time", "real_time"
 
 
-def export_csv(path: str | Path, directory: str | Path) -> dict[str, Path]:
+def export_csv(
+    path: str | Path, directory: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> dict[str, Path]:
     """Write ``<group>_<name>.csv`` for every topic that has messages.
 
-    Nested records get dotted columns; arrays and lists stand in one cell as JSON; absent values are empty.
+    Nested records get dotted columns; arrays and lists stand in one cell as JSON; absent values are empty. Pictures
+    become files of a folder beside the table, which names them. ``log_time`` is daemon time, ns; ``real_time`` the
+    calendar's (UTC).
 
     Returns:
         The files by topic.
@@ -35,20 +40,25 @@ def export_csv(path: str | Path, directory: str | Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     with ExitStack() as stack:
         writers: dict[str, Any] = {}
-        for topic, row in _rows(path):
+        for topic, row in _rows(path, directory, selection, progress):
             if topic not in writers:
                 files[topic] = directory / f"{_stem(topic)}.csv"
                 writers[topic] = csv.writer(stack.enter_context(files[topic].open("w", newline="")))
                 writers[topic].writerow(row)
+            row[_REAL_TIME] = f"{np.datetime64(row[_REAL_TIME], 'ns')}Z"
             writers[topic].writerow(_cell(value) for value in row.values())
     return files
 
 
-def export_npz(path: str | Path, directory: str | Path) -> dict[str, Path]:
+def export_npz(
+    path: str | Path, directory: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> dict[str, Path]:
     """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
 
     Absent numbers are NaN. Arrays of equal length are stacked to shape (messages, length); others are laid end
     to end, with their lengths in ``<column>.lengths``. Text, lists and mappings are strings (lists as JSON).
+    Pictures become files of a folder beside the table, which names them. ``log_time`` is daemon time, ``real_time``
+    UNIX time, both in ns.
 
     Returns:
         The files by topic.
@@ -59,7 +69,7 @@ def export_npz(path: str | Path, directory: str | Path) -> dict[str, Path]:
     """
     directory = _folder(directory)
     tables: dict[str, dict[str, list[Any]]] = {}
-    for topic, row in _rows(path):
+    for topic, row in _rows(path, directory, selection, progress):
         table = tables.setdefault(topic, {name: [] for name in row})
         for name, value in row.items():
             table[name].append(value)
@@ -87,19 +97,25 @@ def _stem(topic: str) -> str:
     return topic.replace("/", "_")
 
 
-def _rows(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(topic, column to value) of every message of a known topic."""
-    for number, message in enumerate(LogReader(Path(path)), start=1):
-        if message.topic not in BY_NAME:
-            continue
-        try:
-            decoded = message.decode()
-        except NotFoundError:
-            continue
-        except TruckError as error:
-            text = f"{path}: message {number}: {error}"
-            raise InputError(text) from None
-        yield message.topic, {_TIME: message.log_time, **_flat(decoded, type(decoded), "")}
+def _rows(
+    path: str | Path, directory: Path, selection: Selection, progress: Progress | None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(topic, column to value) of every selected message; pictures are saved on the way."""
+    reader = LogReader(Path(path))
+    offset = real_offset(reader)
+    for entry, message in selection.of(reader, progress):
+        row = _flat(message, type(message), "")
+        for name, value in row.items():
+            if isinstance(value, bytes):
+                row[name] = _save(value, directory, f"{_stem(entry.topic)}/{entry.log_time}.{row.get('format', 'bin')}")
+        yield entry.topic, {_LOG_TIME: entry.log_time, _REAL_TIME: entry.log_time + offset, **row}
+
+
+def _save(data: bytes, directory: Path, name: str) -> str:
+    file = directory / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(data)
+    return name
 
 
 def _flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:

@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
 
-from monstertruck_runtime import wire
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
+from monstertruckd.logs.channels import Channels
 from monstertruckd.recorder.config import Compression
 
 _NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
@@ -66,14 +66,13 @@ class LogFile:
         self.open_since: int | None = None
         """Log time of the oldest message that is not in the file yet."""
         self._output = _Output(path)
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
         try:
             self._writer = Writer(
                 self._output,  # type: ignore[arg-type]  # write, tell and flush are all it needs
                 chunk_size=chunk_size,
                 compression=_COMPRESSION[compression],
             )
+            self._channels = Channels(self._writer)
             self._writer.start(library=f"monstertruckd {__version__}")
             self._writer.add_metadata("run", dict(metadata))
             for name, value in attachments.items():
@@ -90,10 +89,13 @@ class LogFile:
 
     def add(self, entry: Entry) -> None:
         """Put a message into the open chunk."""
-        channel = self._channels.get(entry.topic.name) or self._register(entry.topic)
         before = self.size
         self._writer.add_message(
-            channel, entry.log_time, entry.payload, max(0, entry.stamp), entry.sequence & 0xFFFFFFFF
+            self._channels.of(entry.topic),
+            entry.log_time,
+            entry.payload,
+            max(0, entry.stamp),
+            entry.sequence & 0xFFFFFFFF,
         )
         if self.size != before:
             self.open_since = None
@@ -120,16 +122,6 @@ class LogFile:
     def abandon(self) -> None:
         """Close as it is; the file is repaired at the next start."""
         self._output.close()
-
-    def _register(self, topic: Topic[Any]) -> int:
-        schema = wire.schema(topic)
-        if schema.name not in self._schemas:
-            self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-        channel = self._writer.register_channel(
-            topic.name, schema.message_encoding, self._schemas[schema.name], {"encoding": wire.encoding(topic)}
-        )
-        self._channels[topic.name] = channel
-        return channel
 
 
 class _Output:
