@@ -1,0 +1,133 @@
+"""Driving by keyboard: a terminal, a truck, and what silence does."""
+
+import asyncio
+import contextlib
+import os
+import pty
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+from tests.daemon.wall_kit import ROOT, Robot, end, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+
+
+@dataclass
+class Terminal:
+    """A user before a terminal in which `drive` runs."""
+
+    user: int
+    process: asyncio.subprocess.Process
+    shown: bytes = b""
+
+    def read(self) -> None:
+        try:
+            self.shown += os.read(self.user, 65536)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self.user)
+        with contextlib.suppress(OSError):
+            os.close(self.user)
+
+    async def hold(self, key: bytes, until: Callable[[], bool]) -> None:
+        """Let a key repeat until something is so."""
+        async with asyncio.timeout(20):
+            while not until():
+                os.write(self.user, key)
+                await asyncio.sleep(0.04)
+
+
+@asynccontextmanager
+async def driving(made: Robot) -> AsyncIterator[Terminal]:
+    user, program = pty.openpty()
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *("-m", "monstertruckd", "drive", "--endpoint", made.endpoint, "--mode", "counter"),
+        cwd=ROOT,
+        stdin=program,
+        stdout=program,
+        stderr=program,
+        start_new_session=True,
+        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"},
+    )
+    os.close(program)
+    terminal = Terminal(user, process)
+    asyncio.get_running_loop().add_reader(user, terminal.read)
+    try:
+        async with asyncio.timeout(30):
+            while b"disarmed: Enter arms" not in terminal.shown:
+                await asyncio.sleep(0.05)
+        yield terminal
+    finally:
+        terminal.close()
+        await end(process)
+
+
+async def becomes(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path: Path):
+    async with robot(tmp_path) as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        async with made.client() as client:
+            gate = client.subscribe(topics.GATE, latest())
+            odometry = client.subscribe(topics.ODOMETRY, latest())
+            async with driving(made) as terminal:
+                await _drive_off(terminal, gate, odometry)
+                await _stopped_and_disarmed(gate, odometry)
+
+                await _drive_off(terminal, gate, odometry)
+                terminal.process.send_signal(signal.SIGSTOP)
+                await becomes(lambda: _mode(gate) is not GateMode.DRIVING)
+                os.write(terminal.user, b"w" * 50)
+                await _stopped_and_disarmed(gate, odometry)
+                terminal.process.send_signal(signal.SIGCONT)
+
+                await _drive_off(terminal, gate, odometry)
+                os.write(terminal.user, b"e")
+                await becomes(lambda: _mode(gate) is GateMode.ESTOPPED)
+                await becomes(lambda: abs(_speed(odometry)) < 0.005)
+                await terminal.hold(b"r", lambda: _mode(gate) is GateMode.DISARMED)
+
+                await _drive_off(terminal, gate, odometry)
+                terminal.close()
+                await _stopped_and_disarmed(gate, odometry)
+                assert await end(terminal.process, 0) == 0, "a terminal that is gone is an ordinary end"
+
+
+async def _drive_off(terminal: Terminal, gate: Mailbox[GateState], odometry: Mailbox[Odometry]) -> None:
+    await terminal.hold(b"\r", lambda: _mode(gate) is GateMode.DRIVING)
+    assert gate.latest is not None
+    assert gate.latest.role is Role.KEYBOARD, "the tracker does not drive off when the keyboard arms"
+    await terminal.hold(b"w", lambda: _speed(odometry) > 0.08)
+
+
+async def _stopped_and_disarmed(gate: Mailbox[GateState], odometry: Mailbox[Odometry]) -> None:
+    await becomes(lambda: abs(_speed(odometry)) < 0.005)
+    await becomes(lambda: _mode(gate) is GateMode.DISARMED)
+    assert gate.latest is not None
+    assert gate.latest.holder is None
+
+
+def _mode(gate: Mailbox[GateState]) -> GateMode | None:
+    return None if gate.latest is None else gate.latest.mode
+
+
+def _speed(odometry: Mailbox[Odometry]) -> float:
+    return 0.0 if odometry.latest is None else odometry.latest.twist.vx
