@@ -3,7 +3,7 @@
 import typer
 
 from monstertruckd import __version__
-from monstertruckd.cli import demo, devices, drill, drive, kinematics, live, logs, orders, robot, usb
+from monstertruckd.cli import demo, devices, drill, drive, kinematics, live, logs, orders, robot, service, usb
 from monstertruckd.cli.output import CommandGroup
 
 app = typer.Typer(
@@ -47,6 +47,8 @@ app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)
 app.command("usb")(usb.usb)
 app.command("find-port")(usb.find_port)
+app.command("install-service")(service.install_service)
+app.command("uninstall-service")(service.uninstall_service)
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 

@@ -1,0 +1,103 @@
+"""The unit of the service, from the configuration and from where the program is."""
+
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.truck import AnyPort, TruckConfig
+from monstertruckd.install.shipped import filled, shipped
+
+HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
+"""Hidden from the service but for the program itself."""
+HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the service must not be run from
+LINKS: Final = Path("/dev/truck")
+"""Folder of the links that the udev rules make."""
+_PLAIN: Final = re.compile(r"/[A-Za-z0-9/._+=,:~-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What the service runs."""
+
+    python: Path
+    """Interpreter, of the environment the packages are in."""
+    neutral: Path
+    """Stop script."""
+    reads: tuple[Path, ...]
+    """Folders with the interpreter and all packages."""
+
+    @classmethod
+    def present(cls) -> Self:
+        """The one that is running now."""
+        neutral = shipped("neutral.py")
+        base = Path(sys.base_prefix)  # may be a link in front of the true folder; both names are used
+        reads = dict.fromkeys((Path(sys.prefix), base, base.resolve(), neutral.parents[1]))
+        return cls(Path(sys.executable), neutral, tuple(reads))
+
+
+def unit_text(config: TruckConfig, config_file: Path, user: str, program: Program) -> str:
+    """The unit.
+
+    Args:
+        config: whose drives are stopped after a death.
+        config_file: what the service is started with.
+        user: it runs as.
+        program: what is run.
+
+    Raises:
+        InputError: systemd or its sandbox could not use one of the paths.
+    """
+    at_home = _at_home(program)
+    return filled(
+        "monstertruckd.service",
+        {
+            "python": _plain(program.python),
+            "config": _plain(config_file),
+            "stop": _stop(config, program),
+            "user": user,
+            "home": "tmpfs" if at_home else "yes",
+            "bind": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in at_home),
+            "switch": "" if config.usb.power.method is None else "ReadWritePaths=-/sys/devices",
+        },
+    )
+
+
+def node_of(role: str, port: AnyPort) -> Path:
+    """Where the device of ``role`` is in /dev once the udev rules are in place."""
+    return LINKS / role if isinstance(port, UsbPortConfig) else port.path
+
+
+def _stop(config: TruckConfig, program: Program) -> str:
+    drives = [
+        f"{_plain(node_of(role, device.port))}={device.driver.node}@{device.port.baud}"
+        for role, device in config.devices.shafts().items()
+    ]
+    # Without site: the script must run even when the environment's packages do not load.
+    return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""
+
+
+def _at_home(program: Program) -> list[Path]:
+    """What the service must still see of the folders that are hidden from it.
+
+    Raises:
+        InputError: the program is where no service may be run from.
+    """
+    for place in program.reads:
+        if any(place.is_relative_to(folder) for folder in HIDDEN):
+            raise InputError(f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd")
+    return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
+
+
+def _plain(path: Path) -> str:
+    """``path`` for a unit file.
+
+    Raises:
+        InputError: it would need quoting.
+    """
+    if not _PLAIN.fullmatch(str(path)):
+        raise InputError(f"{path}: expected an absolute path of letters, digits and / . _ + = , : ~ - for systemd")
+    return str(path)
