@@ -4,7 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -14,6 +14,8 @@ from monstertruckd.cli.output import JsonOption, print_json, remark
 
 if TYPE_CHECKING:
     from monstertruckd.install.apply import Report
+
+T = TypeVar("T")
 
 RootOption = Annotated[
     Path, typer.Option("--root", help="System to write into instead of this one; then no program of it is run.")
@@ -41,19 +43,19 @@ def install_service(
 
     Needs root, and no network. The service starts with the computer from then on.
     """
-    from monstertruckd.install.apply import install, run_command
+    from monstertruckd.install.apply import install, run_command, runs_here
     from monstertruckd.install.plan import RESTART, plan
     from monstertruckd.install.unit import Program
 
     planned = plan(config, user, Program.present(), root)
     report = _as_root(lambda: install(planned, root, dry=dry_run))
-    if start and root == Path("/"):
+    if start:
         report.commands.append(RESTART)
         if not dry_run:
             _as_root(lambda: run_command(RESTART))
     _print(report, planned.notes, dry=dry_run, json_output=json_output)
-    if not (start or dry_run or json_output) and report.changed and root == Path("/"):
-        remark(f"start it now with: sudo {shlex.join(RESTART)}; look at it with: monstertruckd doctor")
+    if not (start or dry_run) and report.changed and runs_here(root):
+        remark(f"to use it now: sudo {shlex.join(RESTART)}")
 
 
 def uninstall_service(
@@ -66,7 +68,8 @@ def uninstall_service(
     _print(report, (), dry=dry_run, json_output=json_output)
 
 
-def _as_root(action: "Callable[[], Report | None]") -> "Report":
+def _as_root(action: Callable[[], T]) -> T:
+    """Do it, or tell the command that may."""
     try:
         return action()
     except NotPermittedError as error:

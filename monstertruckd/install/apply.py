@@ -30,6 +30,8 @@ from monstertruckd.install.plan import (
 
 UNFINISHED: Final = FOLDER / ".unfinished"
 """There while an installation is under way: if it breaks off, the next one tells the programs all the same."""
+BOOTED: Final = Path("/run/systemd/system")
+"""There while systemd runs, see sd_booted(3)."""
 FILES: Final = (ENABLED, UNIT, RULES, MODULES, TMPFILES, SYSUSERS)
 """What is taken out; configuration, logs, state and the user stay."""
 
@@ -77,8 +79,13 @@ def run_command(arguments: Sequence[str]) -> None:
         raise CommandFailedError(f"{' '.join(arguments)}: {said}")
 
 
+def runs_here(root: Path) -> bool:
+    """Whether the system below ``root`` is the one that runs, by systemd: not an image, a chroot or a container."""
+    return root == Path("/") and below(root, BOOTED).is_dir()
+
+
 def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command) -> Report:
-    """Write what differs, then tell the running system; a system below ``root`` is only written.
+    """Write what differs, then tell the running system; one that does not run is only written.
 
     Raises:
         NotPermittedError: not allowed to write there.
@@ -86,12 +93,13 @@ def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command
     """
     report = Report({file.path: _change(root, file) for file in plan.files})
     unfinished = below(root, UNFINISHED)
-    if root == Path("/") and (unfinished.exists() or report.changed):
+    here = runs_here(root)
+    if here and (unfinished.exists() or report.changed):
         report.commands += AFTER_INSTALL
     if dry or not report.changed:
         return report
     with _permission():
-        if root == Path("/"):
+        if here:
             unfinished.parent.mkdir(parents=True, exist_ok=True)
             replace_file(unfinished, "")
         for file in plan.files:
@@ -111,7 +119,7 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Repor
         NotFoundError, CommandFailedError: see ``run_command``.
     """
     report = Report({path: Change.REMOVED for path in FILES if os.path.lexists(below(root, path))})
-    here = root == Path("/") and report.changed
+    here = runs_here(root) and report.changed
     before = BEFORE_REMOVAL if here and UNIT in report.changes else ()
     after = AFTER_REMOVAL if here else ()
     report.commands = [*before, *after]

@@ -94,6 +94,7 @@ class Here:
         self.ran: list[tuple[str, ...]] = []
         self.fails: str | None = None
         monkeypatch.setattr(apply, "below", lambda _, path: folder / path.relative_to("/"))
+        (folder / "run/systemd/system").mkdir(parents=True)
 
     def __call__(self, arguments: Sequence[str]) -> None:
         self.ran.append(tuple(arguments))
@@ -113,6 +114,14 @@ def test_the_running_system_is_told_once(tmp_path: Path, monkeypatch: pytest.Mon
     here.ran.clear()
     assert uninstall(Path("/"), run=here).changed
     assert here.ran == [*BEFORE_REMOVAL, *AFTER_REMOVAL]
+
+
+def test_a_system_that_does_not_run_is_only_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    here = Here(tmp_path, monkeypatch)
+    (tmp_path / "run/systemd/system").rmdir()
+    assert here.install().commands == []
+    assert uninstall(Path("/"), run=here).changed
+    assert here.ran == []
 
 
 def test_an_installation_that_broke_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
