@@ -97,6 +97,7 @@ class Daemon:
         self._body = Body.of(config)
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
+        self.bus.listen(topics.EVENT, self.gate.observe_event)
         self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.rpc = self._build_rpc()
         self.recorder = self._build_recorder()
@@ -245,7 +246,9 @@ class Daemon:
                 battery=bus.subscribe(topics.BATTERY, latest()),
                 health=bus.subscribe(topics.HEALTH, latest()),
             ),
-            GateOutputs(drives, steering, bus.publisher(topics.GATE, Writer.GATE)),
+            GateOutputs(
+                drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)
+            ),
             self._events,
             latch,
         )

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from monstertruck_planners.collision import scan_points
-from monstertruck_schemas.event import Event, Severity
+from monstertruck_runtime.stops import story
+from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -60,37 +62,45 @@ class ScreenState:
     health: HealthTable | None = None
     loop: LoopHealth | None = None
     recorder: RecorderHealth | None = None
+    stop: Stop | None = None
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=8))
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=2000))
 
+    @property
+    def why_stopped(self) -> list[str]:
+        """The newest stop in a few lines, while it still holds the truck; nothing otherwise."""
+        if self.stop is None or self.gate is None or self.gate.speed_limit > 0:
+            return []
+        return story(self.stop, self.gate.stamp)
+
     def take(self, message: object) -> None:
         """Remember ``message`` if the screen shows its kind."""
+        if (name := _NEWEST.get(type(message))) is not None:
+            setattr(self, name, message)
         match message:
-            case GateState():
-                self.gate = message
             case Odometry():
-                self.odometry = message
                 spot = (message.pose.x, message.pose.y)
                 if not self.trail or math.dist(spot, self.trail[-1]) > 0.03:
                     self.trail.append(spot)
-            case LaserScan():
-                self.scan = message
-            case Attitude():
-                self.attitude = message
-            case Battery():
-                self.battery = message
-            case TrackerState():
-                self.tracker = message
-            case HealthTable():
-                self.health = message
-            case LoopHealth():
-                self.loop = message
-            case RecorderHealth():
-                self.recorder = message
             case Event():
                 self.events.append(message)
             case _:
                 pass
+
+
+_NEWEST: Final[dict[type, str]] = {
+    GateState: "gate",
+    Odometry: "odometry",
+    LaserScan: "scan",
+    Attitude: "attitude",
+    Battery: "battery",
+    TrackerState: "tracker",
+    HealthTable: "health",
+    LoopHealth: "loop",
+    RecorderHealth: "recorder",
+    Stop: "stop",
+}
+"""Where the newest message of each kind is kept."""
 
 
 def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
@@ -102,7 +112,11 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
         events: newest events shown.
     """
     layout = Layout()
-    layout.split_column(Layout(name="top", ratio=1), Layout(_events(state, events), name="events", size=events + 2))
+    rows = [Layout(name="top", ratio=1), Layout(_events(state, events), name="events", size=events + 2)]
+    if lines := state.why_stopped:
+        stop = Panel(Text("\n".join(lines), style="yellow", no_wrap=True), title="stopped", border_style="yellow")
+        rows.insert(1, Layout(stop, name="stop", size=len(lines) + 2))
+    layout.split_column(*rows)
     parts = [Layout(_truck(state), size=40), Layout(_services(state), size=34 if width >= WIDE else None)]
     if width >= WIDE:
         scan = Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")

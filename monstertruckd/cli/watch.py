@@ -26,6 +26,7 @@ SHOWN: tuple[Topic[Any], ...] = (
     topics.HEALTH,
     topics.LOOP,
     topics.RECORDER,
+    topics.STOP,
 )
 PERIOD = 0.1
 
@@ -99,6 +100,7 @@ def plain(state: ScreenState) -> list[str]:
     if state.gate is not None:
         reasons = ", ".join(reason.value for reason in state.gate.reasons) or "-"
         lines.append(f"gate      {state.gate.mode.value}, driver {state.gate.holder or '-'}, why {reasons}")
+    lines += [f"stop      {line}" for line in state.why_stopped]
     if state.odometry is not None:
         pose = state.odometry.pose
         lines.append(f"pose      x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.yaw:.3f} rad in {state.odometry.frame}")

@@ -1,12 +1,14 @@
 """Limits of the safety gate. Lengths m, angles rad, times s, speeds m/s."""
 
 import math
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
+from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.steering_check import SteeringCheckConfig
 
 Positive = Annotated[float, Field(gt=0)]
@@ -20,6 +22,11 @@ class SensorLimit(Schema):
     """Seconds after the daemon received the newest good sample at which it no longer counts."""
     critical: bool = True
     """Silence stops the truck; otherwise the sensor's own limits merely lapse with it."""
+
+
+def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
+    """The topic table's limit, unless the configuration names another one."""
+    return SensorLimit(stale_after=topic.fresh_for(), critical=critical)
 
 
 class Leases(Schema):
@@ -106,14 +113,14 @@ class GateConfig(Schema):
     disarm_after: Positive = 1.5
     """Seconds without a driver whose wishes can be carried out, after which the truck disarms."""
 
-    scan: SensorLimit = SensorLimit(stale_after=0.25)
+    scan: SensorLimit = _limit(topics.SCAN)
     scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.35
     """A scan whose plane was tilted more than this is no good sample: within the gate's reach of half a metre it looks
     0.2 m over or under what it should see, rad."""
-    drive: SensorLimit = SensorLimit(stale_after=0.2)
-    steering: SensorLimit = SensorLimit(stale_after=0.25)
-    attitude: SensorLimit = SensorLimit(stale_after=0.25)
-    battery: SensorLimit = SensorLimit(stale_after=2.0, critical=False)
+    drive: SensorLimit = _limit(topics.DRIVE)
+    steering: SensorLimit = _limit(topics.STEERING)
+    attitude: SensorLimit = _limit(topics.COMPASS)
+    battery: SensorLimit = _limit(topics.BATTERY, critical=False)
     max_latency: Positive = 0.4
     """Greatest distance between a sample's stamp and its arrival, s; beyond it the sample is not a good one."""
     tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = ("recorder", "camera", "link", "host", "usb")

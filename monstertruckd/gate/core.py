@@ -2,8 +2,9 @@
 
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so that it ends even if nothing
-is ever sent again. ``sources`` holds the rules of who drives, ``watch`` what stops or slows the truck, ``obstacles``
-the swept footprint, ``motion`` clipping and rates.
+is ever sent again. ``sources`` holds the rules of who drives, ``states`` the transitions, ``watch`` what stops or slows
+the truck, ``pursuit`` the way from a request to the commanded motion, ``evidence``, ``outages`` and ``stops`` the
+reasons told.
 
 Whatever stops the truck ends with standstill confirmed by the drive. Short trouble (a late scan, a lapsed lease) then
 lets the same source go on; trouble longer than ``disarm_after`` and what a human should look at disarms.
@@ -18,8 +19,9 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
+from monstertruck_runtime.stops import sentence
 from monstertruck_schemas.cmd import DriveAction
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
@@ -27,11 +29,16 @@ from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserS
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.events import EventLog
+from monstertruckd.gate.evidence import Evidence, order_cause
 from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.outages import Outages
 from monstertruckd.gate.output import GateOutput
-from monstertruckd.gate.sources import OPERATORS, Key, Source, Sources
+from monstertruckd.gate.pursuit import Pursuit
+from monstertruckd.gate.sources import OPERATORS, Sources
+from monstertruckd.gate.states import States
 from monstertruckd.gate.steering_check import SteeringCheck
+from monstertruckd.gate.stops import StopBook
 from monstertruckd.gate.watch import Judgement, Watch
 
 URGENT: Final = frozenset(
@@ -41,8 +48,6 @@ URGENT: Final = frozenset(
 
 DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
 """After these somebody has to arm again, however short they were."""
-
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 
 
 class Gate:
@@ -80,36 +85,30 @@ class Gate:
         self._chassis = chassis
         self._sources = Sources(nonce, config)
         self._watch = Watch(config, chassis)
+        self._outages = Outages()
         self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, lidar)
         self._motion = Motion(config, chassis)
+        self._pursuit = Pursuit(config, self._motion, self._obstacles, self._watch)
         # Other bodies are turned by their wheel speeds, or not at all, and have no lone servo supply to lose.
         self._steering_check = (
             SteeringCheck(config.turning, chassis.bicycle)
             if config.turning is not None and isinstance(chassis, TruckChassis)
             else None
         )
-        self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
-        """Axle angles and their servo angles at the last tick."""
-        self._measured = (0.0, 0.0)
-        """Axle angles by the newest steering feedback."""
+        self._evidence = Evidence(config, self._watch, self._pursuit, self._steering_check)
         self._events = EventLog(config.event_interval)
-        self._mode = GateMode.ESTOPPED if latched else GateMode.DISARMED
-        self._holder: Source | None = None
-        self._stop_reasons: tuple[Reason, ...] = ()
-        self._known: frozenset[Reason] = frozenset()
-        self._since = 0
-        self._driven = 0
+        self._stops = StopBook(self._outages)
+        self._states = States(self._events, latched=latched)
+        self._known: dict[Reason, int] = {}
+        """What stops or slows the truck, and since when, ns."""
         self._ticked: int | None = None
         self._stalled_until = 0
-        self._disarm_at_rest = False
-        self._blocked_ahead = False
-        self._emergency = False
         self._shut_down = False
 
     @property
     def mode(self) -> GateMode:
         """State now."""
-        return self._mode
+        return self._states.mode
 
     @property
     def nonce(self) -> str:
@@ -129,8 +128,8 @@ class Gate:
         if self._steering_check is not None:
             now = attitude.received
             trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._watch.steering_fresh(now)
-            heading = attitude.heading if trusted and self._mode in ACTIVE else None
-            self._steering_check.observe(attitude.stamp, heading, self._watch.speed(now), *self._measured)
+            heading = attitude.heading if trusted and self._states.active else None
+            self._steering_check.observe(attitude.stamp, heading, self._watch.speed(now), *self._watch.axles)
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
@@ -139,8 +138,6 @@ class Gate:
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the newest steering feedback."""
         self._watch.observe_steering(feedback)
-        if self._watch.steering is feedback:
-            self._measured = self._chassis.axles(feedback.front, feedback.rear)
 
     def observe_battery(self, battery: Battery) -> None:
         """Take the newest battery reading."""
@@ -149,6 +146,11 @@ class Gate:
     def observe_health(self, table: HealthTable) -> None:
         """Take the newest health table."""
         self._watch.observe_health(table)
+        self._outages.observe_health(table)
+
+    def observe_event(self, event: Event) -> None:
+        """Take what happened elsewhere in the daemon: it may be what is behind a stop."""
+        self._outages.observe_event(event)
 
     # Requests
 
@@ -170,11 +172,11 @@ class Gate:
         if (why := self._chassis.refusal(request.front, request.rear)) is not None:
             return self._refuse(now, Reason.IMPOSSIBLE_MOTION, request, why)
         source = self._sources.add(request, now, inside=inside)
-        if self._mode is GateMode.ESTOPPED:
+        if self.mode is GateMode.ESTOPPED:
             return self._refuse(now, Reason.ESTOPPED, request)
-        if self._mode is GateMode.DISARMED:
+        if self.mode is GateMode.DISARMED:
             return self._refuse(now, Reason.DISARMED, request)
-        reason = self._sources.standing(source, now, self._holder_key())
+        reason = self._sources.standing(source, now, self._states.holder_key)
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._watch.judge(now), now)), Reason.OK)
@@ -205,8 +207,10 @@ class Gate:
         return reason
 
     def _estop(self, request: ControlRequest, now: int) -> Reason:
-        if self._mode is not GateMode.ESTOPPED:
-            self._mode, self._since, self._holder = GateMode.ESTOPPED, now, None
+        if self.mode is not GateMode.ESTOPPED:
+            why = order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
+            self._trip(now, GateMode.ESTOPPED, [why])
+            self._states.latch(now)
             values = {"role": request.role.value}
             self._events.tell(
                 now, Reason.ESTOP_REQUESTED, Severity.ERROR, "", values, source=request.source, always=True
@@ -217,40 +221,39 @@ class Gate:
         if request.role is not Role.TRACKER:
             self._sources.claim(request.role)
         self._sources.hold()
-        if self._mode is GateMode.DRIVING:
-            self._stop(now, (Reason.STOPPED,))
-            self._tell_transition(now, Reason.STOPPED, f"stop ordered by {request.source}")
+        if self.mode is GateMode.DRIVING:
+            text = f"stop ordered by {request.source}"
+            self._stop(now, [order_cause(Reason.STOPPED, text, request, now)], ordered=True)
+            self._tell_transition(now, Reason.STOPPED, text)
         return Reason.OK
 
     def _disarm_by(self, request: ControlRequest, now: int) -> Reason:
         text = f"disarmed by {request.source}"
-        if self._mode is GateMode.ARMED:
+        if self.mode is GateMode.ARMED:
             self._disarm(now, text)
-        elif self._mode in ACTIVE:
-            self._disarm_at_rest = True
-            if self._mode is GateMode.DRIVING:
-                self._stop(now, (Reason.DISARMED,))
+        elif self._states.active:
+            self._states.disarm_at_rest = True
+            if self.mode is GateMode.DRIVING:
+                self._stop(now, [order_cause(Reason.DISARMED, text, request, now)], ordered=True)
                 self._tell_transition(now, Reason.DISARMED, text)
         return Reason.OK
 
     def _arm(self, request: ControlRequest, now: int) -> Reason:
-        if self._mode is GateMode.ESTOPPED:
-            return self._refuse(now, Reason.ESTOPPED, request)
+        if self.mode is GateMode.ESTOPPED:
+            return self._refuse(now, Reason.ESTOPPED, request, self._stops.words(now))
         blocks = self._blocks(self._watch.judge(now), now)
         if blocks:
-            return self._refuse(now, blocks[0], request)
-        moving = self._mode is GateMode.STOPPING or not self._watch.at_rest(now)
+            causes = self._outages.explain(self._evidence.causes(blocks, now, self._known))
+            return self._refuse(now, blocks[0], request, sentence(causes, now))
+        moving = self.mode is GateMode.STOPPING or not self._watch.at_rest(now)
         if moving or self._sources.pushing(now, OPERATORS):
             return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
         self._sources.admit()
-        self._driven = now
-        if self._mode is GateMode.DISARMED:
-            self._mode, self._since, self._disarm_at_rest = GateMode.ARMED, now, False
-            self._events.tell(now, Reason.ARMED, Severity.INFO, source=request.source, always=True)
+        self._states.arm(now, request.source)
         return Reason.OK
 
     def _reset(self, request: ControlRequest, now: int) -> Reason:
-        if self._mode is not GateMode.ESTOPPED:
+        if self.mode is not GateMode.ESTOPPED:
             return Reason.OK
         if not self._watch.at_rest(now) or self._sources.pushing(now):
             return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
@@ -266,27 +269,31 @@ class Gate:
         self._ticked = now
         if elapsed > self._config.tick_stall * SECOND:
             self._stalled_until = now + round(self._config.stall_dwell * SECOND)
+            self._evidence.pause = elapsed / SECOND
         dt = min(elapsed, 2 * period) / SECOND
 
         judgement = self._watch.judge(now)
         blocks = self._blocks(judgement, now)
-        self._report(now, blocks, judgement.values, always=self._mode is GateMode.DRIVING)
+        self._report(now, blocks, judgement.values, always=self.mode is GateMode.DRIVING)
         self._advance(now, blocks)
         limits = dict(judgement.limits)
-        if self._mode is GateMode.DRIVING and self._holder is not None:
-            self._follow(now, dt, self._holder.request, limits)
+        if self._states.holder is not None:
+            self._pursuit.follow(now, dt, self._states.holder.request, limits)
+            if self._pursuit.blocked and Reason.OBSTACLE_STOP not in self._known and not self._watch.at_rest(now):
+                self._trip(now, self.mode, self._evidence.causes([Reason.OBSTACLE_STOP], now, {}))
         else:
-            self._motion.halt()
-            self._emergency = self._blocked_ahead = False
+            self._pursuit.halt()
         self._report(now, tuple(limits), judgement.values, always=False)
-        self._known = frozenset((*blocks, *limits))
+        self._known = {reason: self._known.get(reason, now) for reason in (*blocks, *limits)}
         return self._output(now, blocks, limits)
 
     def neutral(self, now: int) -> GateOutput:
         """Last output before the daemon ends: quick stop. From here on the gate never drives again."""
         self._shut_down = True
-        self._motion.halt()
-        if self._mode in ACTIVE:
+        self._pursuit.halt()
+        if self._states.active:
+            if self.mode is GateMode.DRIVING or not self._watch.at_rest(now):
+                self._trip(now, GateMode.DISARMED, self._evidence.causes([Reason.SHUTDOWN], now, {}))
             self._disarm(now, Reason.SHUTDOWN.text)
         return self._output(now, (Reason.SHUTDOWN,), {})
 
@@ -300,137 +307,93 @@ class Gate:
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
         """At most one transition per tick."""
-        if self._mode not in ACTIVE:
+        states = self._states
+        if not states.active:
             return
-        self._disarm_at_rest |= not DISARMING.isdisjoint(blocks)
-        driver = None if blocks else self._sources.driver(now, self._holder_key())
-        if self._mode is GateMode.DRIVING:
-            if driver is None:
-                if not blocks:
-                    self._tell_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {self._holder_name()}")
-                self._stop(now, blocks or (Reason.LEASE_EXPIRED,))
-            else:
-                self._take(now, driver)
-        elif self._mode is GateMode.STOPPING and self._watch.at_rest(now, self._since):
-            self._mode, self._since, self._stop_reasons = GateMode.ARMED, now, ()
-            self._events.tell(now, Reason.STOPPED, Severity.INFO, always=True)
-        elif self._mode is GateMode.ARMED and self._disarm_at_rest:
+        states.disarm_at_rest |= not DISARMING.isdisjoint(blocks)
+        driver = None if blocks else self._sources.driver(now, states.holder_key)
+        if states.mode is GateMode.STOPPING and self._watch.at_rest(now, states.since):
+            states.rest(now)
+        elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
-        elif self._mode is GateMode.ARMED and driver is not None:
-            self._mode, self._since = GateMode.DRIVING, now
-            self._take(now, driver)
-        elif now - self._driven > self._config.disarm_after * SECOND:
+        elif states.mode is not GateMode.STOPPING and driver is not None:
+            if driver.key != states.holder_key:
+                self._sources.claim(driver.request.role)
+            states.drive(now, driver)
+        elif states.holder is not None:
+            if not blocks:
+                self._tell_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {states.holder_name}")
+            lapsed = [self._evidence.lease(states.holder, now)]
+            self._stop(now, self._evidence.causes(blocks, now, self._known) or lapsed)
+        elif now - states.driven > self._config.disarm_after * SECOND:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
-    def _take(self, now: int, driver: Source) -> None:
-        if self._holder_key() != driver.key:
-            role = driver.request.role
-            self._sources.claim(role)
-            values = {"role": role.value}
-            self._events.tell(now, Reason.DRIVING, Severity.INFO, "", values, source=driver.request.source, always=True)
-        self._holder, self._driven = driver, now
+    def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
+        self._trip(now, GateMode.STOPPING, causes, ordered=ordered)
+        self._states.stop(now, (cause.reason for cause in causes))
 
-    def _stop(self, now: int, reasons: tuple[Reason, ...]) -> None:
-        self._mode, self._since, self._stop_reasons, self._holder = GateMode.STOPPING, now, reasons, None
+    def _trip(self, now: int, mode: GateMode, causes: list[Cause], *, ordered: bool = False) -> None:
+        """Note that the truck is stopped, before anything of the state changes."""
+        holder = self._states.holder
+        reasons = tuple(cause.reason for cause in causes)
+        self._stops.add(
+            now,
+            mode,
+            causes,
+            ordered=ordered,
+            quick=mode is GateMode.ESTOPPED or self._pursuit.emergency or not URGENT.isdisjoint(reasons),
+            driver=None if holder is None else holder.request,
+            speed=self._watch.speed(now),
+            stopping_distance=self._pursuit.stopping_distance(now),
+        )
 
     def _tell_transition(self, now: int, reason: Reason, text: str) -> None:
         self._events.tell(now, reason, Severity.WARNING, text, always=True)
 
     def _disarm(self, now: int, text: str) -> None:
-        self._mode, self._since, self._stop_reasons, self._holder = GateMode.DISARMED, now, (), None
-        self._disarm_at_rest = False
         if self._steering_check is not None:
             self._steering_check.reset()  # only driving shows whether it works again
-        self._events.tell(now, Reason.DISARMED, Severity.INFO, text, always=True)
-
-    def _follow(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:
-        """Move the commanded motion towards the request, adding what limits it to ``limits``."""
-        motion = self._motion
-        front, rear, clipped = motion.clipped_angles(request)
-        motion.steer(front, rear, dt)
-        direction = math.copysign(1.0, motion.speed or request.speed)
-        cap = motion.cap(direction)
-        if clipped or abs(request.speed) > cap * (1 + 1e-6):
-            limits[Reason.CLIPPED] = cap
-        if motion.speed != 0 or request.speed != 0:
-            self._heed_obstacles(now, direction, max(abs(request.speed), abs(motion.speed)), limits)
-        allowed = min(*limits.values(), cap) if limits else cap
-        if allowed == 0:
-            motion.halt()
-        else:
-            motion.accelerate(min(max(request.speed, -allowed), allowed), dt)
-
-    def _heed_obstacles(self, now: int, direction: float, wanted: float, limits: dict[Reason, float]) -> None:
-        if not self._watch.scan_fresh(now):
-            return
-        arcs = [(self._motion.front, self._motion.rear)]
-        if self._watch.steering_fresh(now):
-            arcs.append(self._measured)
-        free = self._obstacles.free_distance(direction, tuple(arcs))
-        allowed = self._obstacles.allowed_speed(free, now)
-        crawl = self._config.obstacle.crawl
-        self._blocked_ahead = allowed < (2 * crawl if self._blocked_ahead else crawl)
-        if self._blocked_ahead:
-            limits[Reason.OBSTACLE_STOP] = 0.0
-        elif allowed < wanted:
-            limits[Reason.OBSTACLE_SLOW] = allowed
-        speed = self._watch.speed(now) or 0.0
-        moving_there = speed * direction > self._config.standstill
-        near = self._blocked_ahead and self._obstacles.too_near(free, speed, now)
-        self._emergency = moving_there and (self._emergency or near)
+        self._states.disarm(now, text)
 
     def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:
         """Tell about reasons that were not there at the last tick."""
-        if self._mode not in ACTIVE:
+        if not self._states.active:
             return
         for reason in reasons:
             if reason not in self._known:
                 text = f"{reason.text}: {', '.join(self._watch.failed)}" if reason is Reason.SERVICE_FAILED else ""
                 self._events.tell(now, reason, Severity.WARNING, text, values, always=always)
 
-    def _holder_key(self) -> Key | None:
-        return None if self._holder is None else self._holder.key
-
-    def _holder_name(self) -> str | None:
-        return None if self._holder is None else self._holder.request.source
-
     def _action(self, now: int, reasons: tuple[Reason, ...]) -> DriveAction:
-        if self._mode is GateMode.ESTOPPED or self._emergency or not URGENT.isdisjoint(reasons):
+        if self.mode is GateMode.ESTOPPED or self._pursuit.emergency or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
-        if self._mode is GateMode.DISARMED:
+        if self.mode is GateMode.DISARMED:
             # A motor that still turns (a drive that outlived its daemon) must not be left to coast.
             return DriveAction.DISABLE if self._watch.at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 
     def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:
-        state = {
-            GateMode.ESTOPPED: (Reason.ESTOPPED,),
-            GateMode.DISARMED: (Reason.DISARMED,),
-        }.get(self._mode, self._stop_reasons)
         slow = sorted(limits, key=limits.__getitem__)
-        reasons = tuple(dict.fromkeys((*state, *blocks, *slow)))
-        moving_allowed = self._mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
-        motion, holder = self._motion, self._holder
-        speeds = motion.shaft_speeds
-        travelling = max(abs(self._watch.speed(now) or 0.0), *map(abs, speeds))
-        if self._servos[0] != (motion.front, motion.rear):
-            self._servos = (motion.front, motion.rear), self._chassis.servos(motion.front, motion.rear)
-        front_servo, rear_servo = self._servos[1]
+        reasons = tuple(dict.fromkeys((*self._states.reasons, *blocks, *slow)))
+        moving_allowed = self.mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
+        motion, holder = self._motion, self._states.holder
+        front_servo, rear_servo = motion.servos
         return GateOutput(
             action=self._action(now, reasons),
-            speeds=speeds,
-            motor_velocities=tuple(map(self._chassis.drivetrain.motor_rate, speeds)),
+            speeds=motion.shaft_speeds,
+            motor_velocities=motion.motor_velocities,
             front=motion.front,
             rear=motion.rear,
             front_servo=front_servo,
             rear_servo=rear_servo,
-            mode=self._mode,
-            holder=self._holder_name(),
+            mode=self.mode,
+            holder=self._states.holder_name,
             role=None if holder is None else holder.request.role,
             lease_left=None if holder is None else (holder.deadline - now) / SECOND,
             last_seq=None if holder is None else holder.request.seq,
             speed_limit=min(limits.values(), default=self._config.speed) if moving_allowed else 0.0,
             reasons=reasons,
-            stopping_distance=travelling * self._config.reaction + travelling**2 / (2 * self._config.deceleration),
+            stopping_distance=self._pursuit.stopping_distance(now),
             events=self._events.drain(),
+            trips=self._stops.drain(now),
         )

@@ -25,6 +25,19 @@ class Motion:
         self.speed = 0.0
         self.front = 0.0
         self.rear = 0.0
+        self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
+
+    @property
+    def servos(self) -> tuple[float, float]:
+        """Servo angles front and rear that give the axle angles, rad."""
+        if self._servos[0] != (self.front, self.rear):
+            self._servos = (self.front, self.rear), self._chassis.servos(self.front, self.rear)
+        return self._servos[1]
+
+    @property
+    def motor_velocities(self) -> tuple[float, ...]:
+        """Motor rate of every driven shaft, as ``DriveCommand`` carries it."""
+        return tuple(map(self._chassis.drivetrain.motor_rate, self.shaft_speeds))
 
     @property
     def shaft_speeds(self) -> tuple[float, ...]:

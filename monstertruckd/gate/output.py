@@ -7,11 +7,12 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.events import GateEvent
+from monstertruckd.gate.stops import Trip
 
 
 @dataclass(frozen=True, slots=True)
 class GateOutput:
-    """Commands and state of one tick: the fields of DriveCommand, SteeringCommand and GateState, and the events."""
+    """Commands and state of one tick: the fields of DriveCommand, SteeringCommand and GateState; events and stops."""
 
     action: DriveAction
     speeds: tuple[float, ...]
@@ -30,3 +31,4 @@ class GateOutput:
     reasons: tuple[Reason, ...]
     stopping_distance: float
     events: tuple[GateEvent, ...]
+    trips: tuple[Trip, ...]

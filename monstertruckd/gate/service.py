@@ -9,8 +9,9 @@ from typing import Any, Final
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.stops import sentence
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest
@@ -20,6 +21,7 @@ from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import Latch
 from monstertruckd.gate.meter import Lateness, TickMeter
 from monstertruckd.gate.output import GateOutput
+from monstertruckd.gate.stops import Trip
 
 STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` goes out on every change and at least this often, ns."""
@@ -52,6 +54,7 @@ class GateOutputs:
     drives: tuple[Publisher[DriveCommand], ...]
     steering: Publisher[SteeringCommand]
     state: Publisher[GateState]
+    stops: Publisher[Stop]
 
 
 class GateService:
@@ -65,6 +68,7 @@ class GateService:
         outputs: publishers.
         events: where events go.
         latch: keeps the emergency stop over restarts.
+        black_box: told of every stop as it happens; names the file that will hold the minute before, if any.
     """
 
     name = "gate"
@@ -78,6 +82,7 @@ class GateService:
         outputs: GateOutputs,
         events: EventSink,
         latch: Latch,
+        black_box: Callable[[Trip], str | None] = lambda _: None,
     ) -> None:
         self._gate = gate
         self._rate = rate
@@ -85,6 +90,9 @@ class GateService:
         self._inputs = inputs
         self._outputs = outputs
         self._events = events
+        self._black_box = black_box
+        self._kept: tuple[int, str | None] = (0, None)
+        """Number of the newest stop, and its black box."""
         self._latch = latch
         self._latched = latch.engaged()
         self._latch_differs = asyncio.Event()
@@ -116,6 +124,10 @@ class GateService:
     def control(self, order: ControlRequest) -> Reason:
         """Carry out an order at once, before any queue could lose it; see ``Gate.control``."""
         return self._gate.control(order, self._clock.now())
+
+    def observe_event(self, event: Event) -> None:
+        """Take any service's event at once: it may be what is behind a stop."""
+        self._gate.observe_event(event)
 
     def shut_down(self) -> None:
         """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
@@ -179,12 +191,35 @@ class GateService:
         )
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
+        for trip in output.trips:
+            self._outputs.stops.put(self._stop(trip, now))
         news = (output.mode, output.holder, output.reasons)
         if news != self._told or now - self._told_at >= STATE_PERIOD:
             self._told, self._told_at = news, now
             self._outputs.state.put(self._state(output, now))
         if (output.mode is GateMode.ESTOPPED) != self._latched:
             self._latch_differs.set()
+
+    def _stop(self, trip: Trip, now: int) -> Stop:
+        if trip.number != self._kept[0]:
+            self._kept = trip.number, self._black_box(trip)
+        return Stop(
+            stamp=trip.at,
+            received=now,
+            seq=self._outputs.stops.next_seq(),
+            number=trip.number,
+            reason=trip.reason,
+            mode=trip.mode,
+            ordered=trip.ordered,
+            quick=trip.quick,
+            holder=trip.holder,
+            role=trip.role,
+            speed=trip.speed,
+            stopping_distance=trip.stopping_distance,
+            causes=trip.causes,
+            black_box=self._kept[1],
+            text=f"stopped: {sentence(trip.causes, trip.at)}",
+        )
 
     def _state(self, output: GateOutput, now: int) -> GateState:
         return GateState(

@@ -49,6 +49,8 @@ class Source:
     request: DriveRequest
     deadline: int
     """End of its lease, ns."""
+    arrived: int
+    """When the request came, ns."""
     inside: bool = False
     """It is one of the robot's own planners."""
     held: bool = False
@@ -150,7 +152,7 @@ class Sources:
         lease = min(request.lease, self._config.leases.of(request.role))
         key = (inside, request.source)
         before = self._drive.get(key)
-        source = Source(request, now + round(lease * SECOND), inside)
+        source = Source(request, now + round(lease * SECOND), now, inside)
         source.held = before is not None and before.held and now <= before.deadline and not source.neutral
         self._drive = {other: it for other, it in self._drive.items() if now <= it.deadline}
         self._drive[key] = source

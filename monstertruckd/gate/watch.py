@@ -8,6 +8,7 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import (
@@ -32,6 +33,15 @@ SENSOR_SERVICES: Final = {
 }
 """Services whose reported loss ends the worth of their samples at once."""
 
+STALE_SENSORS: Final = {
+    Reason.SCAN_STALE: "lidar",
+    Reason.ATTITUDE_STALE: "compass",
+    Reason.DRIVE_STALE: "drive",
+    Reason.STEERING_STALE: "steering",
+    Reason.BATTERY_STALE: "battery",
+}
+"""Who is silent, by the reason its silence gives."""
+
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
@@ -47,6 +57,18 @@ class Judgement:
     """Measurements behind the verdict, for the event."""
 
 
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """A sensor without a good sample. Seconds."""
+
+    since: int | None
+    """When its newest sample stopped counting, ns; None = there never was one."""
+    age: float | None
+    limit: float
+    refused: Measurement | None
+    """Why its newest sample since was no good one."""
+
+
 class Watch:
     """Newest good sample of every sensor, judged at each tick.
 
@@ -59,40 +81,50 @@ class Watch:
         self._config = config
         self._chassis = chassis
         self.scan: LaserScan | None = None
-        self._drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
+        self.drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
         self.steering: SteeringFeedback | None = None
-        self._attitude: Attitude | None = None
-        self._battery: Battery | None = None
+        self.attitude: Attitude | None = None
+        self.battery: Battery | None = None
         self._failed: tuple[str, ...] = ()
         self._lost: dict[Reason, int] = {}
+        self._refused: dict[Reason, Measurement] = {}
         self._tilt = _Tilt(config.tilt)
+        self.axles = (0.0, 0.0)
+        """Axle angles by the newest steering feedback, rad."""
 
     def observe_scan(self, scan: LaserScan) -> bool:
         """Take a scan; False if it is not a good sample, by its age or by the tilt of its plane."""
-        if self._good(scan) and (scan.tilt is None or scan.tilt <= self._config.scan_tilt):
+        good = self._good(scan, Reason.SCAN_STALE)
+        if good and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
+            good = False
+            self._refused[Reason.SCAN_STALE] = Measurement(
+                name="tilt of its plane", value=scan.tilt, unit="rad", limit=self._config.scan_tilt
+            )
+        if good:
             self.scan = scan
-        return self.scan is scan
+        return good
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take feedback of a driven shaft."""
-        if self._good(feedback):
-            self._drives[shaft] = feedback
+        if self._good(feedback, Reason.DRIVE_STALE):
+            self.drives[shaft] = feedback
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take steering feedback; what the servo controller does not vouch for is no good sample."""
-        if self._good(feedback) and feedback.trusted:
+        if self._good(feedback, Reason.STEERING_STALE) and feedback.trusted:
             self.steering = feedback
+            self.axles = self._chassis.axles(feedback.front, feedback.rear)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take an attitude; without a valid tilt it is no good sample."""
-        if self._good(attitude) and attitude.tilt_valid:
-            self._attitude = attitude
+        if self._good(attitude, Reason.ATTITUDE_STALE) and attitude.tilt_valid:
+            self.attitude = attitude
             self._tilt.update(math.acos(math.cos(attitude.roll) * math.cos(attitude.pitch)))
 
     def observe_battery(self, battery: Battery) -> None:
         """Take a battery reading; without a judged voltage it is no good sample."""
-        if self._good(battery) and battery.level in MEASURED:
-            self._battery = battery
+        if self._good(battery, Reason.BATTERY_STALE) and battery.level in MEASURED:
+            self.battery = battery
 
     def observe_health(self, table: HealthTable) -> None:
         """Take the services' health: samples from before a service was lost no longer count."""
@@ -105,8 +137,13 @@ class Watch:
             if row.state is ServiceState.FAILED and row.name not in self._config.tolerated_failures
         )
 
-    def _good(self, message: Message) -> bool:
-        return abs(message.received - message.stamp) <= self._config.max_latency * SECOND
+    def _good(self, message: Message, stale: Reason) -> bool:
+        latency = abs(message.received - message.stamp) / SECOND
+        if latency <= self._config.max_latency:
+            self._refused.pop(stale, None)
+            return True
+        self._refused[stale] = Measurement(name="latency", value=latency, unit="s", limit=self._config.max_latency)
+        return False
 
     def _fresh(self, message: Message | None, limit: SensorLimit, now: int, stale: Reason) -> bool:
         if message is None or message.received <= self._lost.get(stale, -1):
@@ -130,8 +167,8 @@ class Watch:
 
     def _fresh_drives(self, now: int) -> tuple[DriveFeedback, ...]:
         """Feedback of all shafts; none of it unless all of it counts."""
-        drives = tuple(drive for drive in self._drives if drive is not None)
-        fresh = all(self._fresh(drive, self._config.drive, now, Reason.DRIVE_STALE) for drive in self._drives)
+        drives = tuple(drive for drive in self.drives if drive is not None)
+        fresh = all(self._fresh(drive, self._config.drive, now, Reason.DRIVE_STALE) for drive in self.drives)
         return drives if fresh else ()
 
     def at_rest(self, now: int, since: int = 0) -> bool:
@@ -151,7 +188,7 @@ class Watch:
         blocks: list[Reason] = []
         limits: dict[Reason, float] = {}
         values: dict[str, Value] = {}
-        for drive in self._drives:
+        for drive in self.drives:
             if drive is not None and drive.mode is DriveMode.FAULT:
                 values["drive_fault_code"] = drive.fault_code
         if "drive_fault_code" in values:
@@ -160,15 +197,15 @@ class Watch:
             blocks.append(Reason.SERVICE_FAILED)
         steered = self._chassis.linkage is not None
         for message, limit, reason in (
-            *((drive, config.drive, Reason.DRIVE_STALE) for drive in self._drives),
+            *((drive, config.drive, Reason.DRIVE_STALE) for drive in self.drives),
             *(((self.steering, config.steering, Reason.STEERING_STALE),) if steered else ()),
             (self.scan, config.scan, Reason.SCAN_STALE),
-            (self._attitude, config.attitude, Reason.ATTITUDE_STALE),
-            (self._battery, config.battery, Reason.BATTERY_STALE),
+            (self.attitude, config.attitude, Reason.ATTITUDE_STALE),
+            (self.battery, config.battery, Reason.BATTERY_STALE),
         ):
             if limit.critical and not self._fresh(message, limit, now, reason):
                 blocks.append(reason)
-        if self._fresh(self._attitude, config.attitude, now, Reason.ATTITUDE_STALE):
+        if self._fresh(self.attitude, config.attitude, now, Reason.ATTITUDE_STALE):
             values["tilt"] = self._tilt.angle
             if self._tilt.stop:
                 blocks.append(Reason.TILT_STOP)
@@ -180,7 +217,7 @@ class Watch:
     def _judge_battery(
         self, now: int, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
     ) -> None:
-        battery = self._battery
+        battery = self.battery
         if battery is None:
             return
         values["battery_voltage"] = battery.voltage
@@ -193,6 +230,32 @@ class Watch:
             battery, self._config.battery, now, Reason.BATTERY_STALE
         ):
             limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
+
+    def silence(self, stale: Reason, now: int) -> Silence:
+        """What is known of a sensor whose silence gives the reason ``stale``; of several shafts of the worst one."""
+        samples: tuple[Message | None, ...]
+        samples, limit = {
+            Reason.SCAN_STALE: ((self.scan,), self._config.scan),
+            Reason.ATTITUDE_STALE: ((self.attitude,), self._config.attitude),
+            Reason.DRIVE_STALE: (tuple(self.drives), self._config.drive),
+            Reason.STEERING_STALE: ((self.steering,), self._config.steering),
+            Reason.BATTERY_STALE: ((self.battery,), self._config.battery),
+        }[stale]
+        received = [sample.received for sample in samples if sample is not None]
+        lost = self._lost.get(stale)
+        refused = self._refused.get(stale)
+        if len(received) < len(samples):
+            return Silence(lost, None, limit.stale_after, refused)
+        oldest = min(received)
+        since = min(now, oldest + round(limit.stale_after * SECOND))
+        if lost is not None and lost >= oldest:
+            since = min(since, lost)
+        return Silence(since, (now - oldest) / SECOND, limit.stale_after, refused)
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the truck's z axis and the vertical, rad, by the newest good attitude."""
+        return self._tilt.angle
 
     @property
     def failed(self) -> tuple[str, ...]:

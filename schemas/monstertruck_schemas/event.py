@@ -1,9 +1,14 @@
 """Messages of the ``event`` group: things that happened once."""
 
 from enum import StrEnum
+from typing import Annotated
 
-from monstertruck_schemas.base import Message
+from pydantic import Field
+
+from monstertruck_schemas.base import Message, Nanoseconds, Schema
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import GateMode
 
 
 class Severity(StrEnum):
@@ -24,3 +29,63 @@ class Event(Message):
     text: str = ""
     values: dict[str, float | int | str | bool | None] = {}
     """Measurements behind the decision."""
+
+
+class Measurement(Schema):
+    """One figure behind a stop."""
+
+    name: str
+    value: float | None = None
+    """None = never measured, or beyond what can be measured."""
+    unit: str = ""
+    """SI unit; empty for plain numbers."""
+    limit: float | None = None
+    """Where it begins to count, in the same unit."""
+    age: float | None = None
+    """Seconds from the measurement to the stop."""
+
+
+class Cause(Schema):
+    """One link of the chain that led to a stop."""
+
+    reason: Reason
+    source: str
+    """Device, service, program or person it happened to or came from."""
+    since: Nanoseconds
+    """When it began."""
+    text: str
+    measurements: tuple[Measurement, ...] = ()
+    because: Annotated[int, Field(ge=0)] | None = None
+    """Index of the cause behind this one; None = nothing deeper is known."""
+
+
+class Stop(Message):
+    """Why the gate stopped the truck: what tripped, since when, by which measurements, and what was behind it.
+
+    ``stamp`` is the moment of the stop. A cause behind it that becomes known a little later (a lost hub is judged once
+    all its devices are gone) is added by a second message of the same ``number``.
+    """
+
+    number: Annotated[int, Field(ge=1)]
+    """Counts the stops since the daemon started."""
+    reason: Reason
+    """That of the first cause."""
+    mode: GateMode
+    """State of the gate after it."""
+    ordered: bool = False
+    """Somebody ordered an ordinary end of driving."""
+    quick: bool = False
+    """By the drive's quick stop instead of its ordinary ramp."""
+    holder: str | None = None
+    """Source that was driving."""
+    role: Role | None = None
+    speed: float | None = None
+    """Measured speed when it began, m/s; None = not known."""
+    stopping_distance: float = 0.0
+    """Metres the truck was still expected to travel."""
+    causes: Annotated[tuple[Cause, ...], Field(min_length=1)]
+    """First what tripped the gate, worst first, then what was behind it."""
+    black_box: str | None = None
+    """Name of the file that will hold the minute before; None = none is written."""
+    text: str
+    """All of it in one line."""

@@ -1,5 +1,6 @@
 """The topic table: one row per key. Bus, recorder, health, access rules and docs are derived from it."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,7 +8,7 @@ from typing import Final, Generic, TypeVar
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
-from monstertruck_schemas.event import Event
+from monstertruck_schemas.event import Event, Stop
 from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth
 from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
@@ -50,7 +51,7 @@ class Topic(Generic[M]):
     rate: float | None = None
     """Nominal rate in Hz; None = on change."""
     stale_after: float | None = None
-    """Seconds after which the newest message no longer counts."""
+    """Seconds after which the newest message no longer counts; gate, tracker and levelling take it from here."""
     logged: bool = True
     retained: bool = False
     """Late joiners get the newest message at once."""
@@ -71,16 +72,20 @@ class Topic(Generic[M]):
         """Zenoh key expression of this topic on ``robot``."""
         return f"{KEY_ROOT}/{robot}/{self.name}"
 
+    def fresh_for(self) -> float:
+        """Seconds for which a message counts; +inf for topics without a limit."""
+        return math.inf if self.stale_after is None else self.stale_after
+
 
 W = Writer
 
-SCAN: Final = Topic("sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, 0.35, foxglove="foxglove.LaserScan")
-COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, 0.3)
-DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.25)
-DRIVE_2: Final = Topic("sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, 0.25)
-DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, 0.25)
-DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, 0.25)
-STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.3)
+SCAN: Final = Topic("sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, 0.25, foxglove="foxglove.LaserScan")
+COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, 0.25)
+DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.2)
+DRIVE_2: Final = Topic("sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, 0.2)
+DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, 0.2)
+DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, 0.2)
+STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.25)
 BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
 CAMERA: Final = Topic(
     "sensor/camera",
@@ -99,10 +104,10 @@ ODOMETRY: Final = Topic(
     W.ESTIMATION,
     "Dead-reckoned pose in odom",
     50,
-    0.1,
+    0.2,
     foxglove="foxglove.PoseInFrame",
 )
-POSE: Final = Topic("state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, 0.1, foxglove="foxglove.PoseInFrame")
+POSE: Final = Topic("state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, 0.2, foxglove="foxglove.PoseInFrame")
 TRANSFORMS: Final = Topic(
     "state/transforms",
     Transforms,
@@ -144,6 +149,7 @@ HOST: Final = Topic("health/host", HostHealth, W.DRIVER, "Load, temperature, mem
 USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
+STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the truck was stopped, with the chain of causes", retained=True)
 
 REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, 0.3)
 REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")

@@ -244,7 +244,9 @@ class HubCoordinator:
         if hit:
             ports = ", ".join(self._describe(name) for name in hit)
             text = f"over-current at {ports}: not started for {self._config.over_current_hold:g} s, check the cables"
-            self._events(Reason.OVER_CURRENT, Severity.ERROR, NAME, text, ports=",".join(hit))
+            self._events(
+                Reason.OVER_CURRENT, Severity.ERROR, NAME, text, ports=",".join(hit), roles=self._roles_at(hit)
+            )
 
     # Telling
 
@@ -258,6 +260,7 @@ class HubCoordinator:
             f"hub {hub} {what}: {self._names(devices) or 'no devices'}",
             hub=hub,
             devices=len(devices),
+            roles=self._roles_at(devices),
         )
 
     def _tell_returned(self, outage: _Outage, back: list[str], now: int) -> None:
@@ -291,6 +294,9 @@ class HubCoordinator:
 
     def _names(self, devices: Iterable[str]) -> str:
         return ", ".join(self._roles.get(name, name) for name in devices)
+
+    def _roles_at(self, devices: Iterable[str]) -> str:
+        return ",".join(self._roles[name] for name in devices if name in self._roles)
 
     def _is_hub(self, name: str) -> bool:
         device = self._slots[name].device

@@ -29,6 +29,7 @@ from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
+from monstertruck_schemas.topics import COMPASS
 
 Positive = Annotated[float, Field(gt=0)]
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
@@ -51,7 +52,7 @@ class StabiliserConfig(Schema):
     """Share of the past that one reading leaves in the filter; more is calmer and later."""
     coast: Positive = 0.2
     """Seconds over which tilt may be predicted beyond its newest reading."""
-    stale_after: Positive = 0.3
+    stale_after: Positive = COMPASS.fresh_for()
     """Seconds without valid tilt after which the joints return to 0."""
 
 

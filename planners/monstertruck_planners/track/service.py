@@ -20,15 +20,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
+from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 """Modes of the gate in which the tracker asks for motion."""
-
-POSE_STALE: Final = 0.2
-"""Seconds after which a pose no longer counts: the tracker falls silent, and its lease runs out."""
-
-SCAN_STALE: Final = 0.35
-"""Seconds after which a scan no longer slows the truck."""
 
 LOOKS: Final = 8
 """Poses ahead whose clearance counts."""
@@ -106,8 +101,8 @@ class TrackerService:
 
     def _step(self, now: int) -> None:
         pose, path, gate = self._pose.latest, self._path.latest, self._gate.latest
-        if pose is None or path is None or gate is None or now - pose.received > POSE_STALE * SECOND:
-            return
+        if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
+            return  # silent: its lease runs out
         self._choose_line(path, pose, armed=gate.mode in ACTIVE)
         if self._line is None:
             return
@@ -148,7 +143,7 @@ class TrackerService:
     def _clearance(self, pose: Odometry, now: int) -> float:
         """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
         scan = None if self._scan is None else self._scan.latest
-        if scan is None or self._line is None or now - scan.received > SCAN_STALE * SECOND:
+        if scan is None or self._line is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return math.inf
         ahead = self._line.ahead(self._progress, self._config.lookahead, LOOKS)
         c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)

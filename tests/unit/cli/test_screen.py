@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 
 from monstertruck_schemas.base import Pose2D, Twist2D
-from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -110,3 +110,21 @@ def test_plain_words_for_pipes():
     state = ScreenState("truck", 0)
     state.take(Battery(**HEADER, voltage=24.82368826, raw_voltage=24.8, cells=6, level=BatteryLevel.NORMAL))
     assert plain(state) == ["battery   24.82 V, normal"]
+
+
+def test_a_stopped_truck_says_why():
+    state = full()
+    assert state.gate is not None
+    lidar = Cause(reason=Reason.DEVICE_LOST, source="lidar", since=9 * 10**8, text="lidar: unplugged")
+    scan = Cause(reason=Reason.SCAN_STALE, source="lidar", since=9 * 10**8, text="no fresh lidar scan", because=1)
+    stop = Stop(**HEADER, number=1, reason=scan.reason, mode=GateMode.STOPPING, causes=(scan, lidar), text="")
+    state.take(stop)
+    assert state.why_stopped == [], "it drives"
+    still = {"stamp": 4 * 10**9, "mode": GateMode.DISARMED, "speed_limit": 0.0}
+    state.take(state.gate.model_copy(update=still))
+    console = Console(width=140, height=40, record=True)
+    console.print(draw(state, 140), height=40)
+    text = console.export_text()
+    for words in ("stop 3.0 s ago", "no fresh lidar scan (for 100 ms)", "because lidar: unplugged (for 100 ms)"):
+        assert words in text
+        assert any(line.startswith("stop ") and words in line for line in plain(state))

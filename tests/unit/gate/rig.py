@@ -88,8 +88,8 @@ def battery(now, level=BatteryLevel.NORMAL, voltage=23.0):
     return Battery(**header(now), voltage=voltage, raw_voltage=23.0, cells=6, level=level)
 
 
-def health(now, state=ServiceState.READY, name="planner"):
-    return HealthTable(**header(now), services=(ServiceHealth(name=name, state=state, since=now),))
+def health(now, state=ServiceState.READY, name="planner", **more):
+    return HealthTable(**header(now), services=(ServiceHealth(name=name, state=state, since=now, **more),))
 
 
 class Rig:
@@ -107,6 +107,7 @@ class Rig:
         self.fault = False
         self.out = None
         self.events = []
+        self.trips = []
         self.travelled = 0.0
         self.driver = None
         self._seq = 0
@@ -148,6 +149,7 @@ class Rig:
                 self.drive(**self.driver)
             self.out = self.gate.tick(self.now)
             self.events += self.out.events
+            self.trips += self.out.trips
             self._obey()
         return self.out
 

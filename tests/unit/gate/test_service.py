@@ -7,6 +7,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode
@@ -55,7 +56,7 @@ class Bench:
         self.latch = latch or MemoryLatch()
         self.requests, self.wishes = Inbox(), Inbox()
         self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
-        self.out = GateOutputs((Outbox(),), Outbox(), Outbox())
+        self.out = GateOutputs((Outbox(),), Outbox(), Outbox(), Outbox())
         self.events = []
         self.readies = 0
         inputs = GateInputs(
@@ -69,10 +70,15 @@ class Bench:
             self.health,
         )
         gate = make_gate(self.latch.engaged())
-        self.service = GateService(gate, 50, clock, inputs, self.out, self.note, self.latch)
+        self.boxes = []
+        self.service = GateService(gate, 50, clock, inputs, self.out, self.note, self.latch, black_box=self.keep)
 
     def note(self, reason, severity, source, text="", **values):
         self.events.append((reason, source, text, values))
+
+    def keep(self, trip):
+        self.boxes.append(trip.reason)
+        return f"box-{trip.number}"
 
     def ready(self):
         self.readies += 1
@@ -369,3 +375,34 @@ def test_meter_forgets_percentiles_but_not_the_maximum():
         meter.record(lateness)
     found = meter.lateness()
     assert (found.ticks, found.p50, found.max) == (5, 2.5, 9.0)
+
+
+def test_a_stop_is_published_with_its_black_box_and_again_when_more_is_known():
+    async def scenario(bench):
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.05)
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.1)
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.05)
+        stop = bench.out.stops.last
+        assert (stop.number, stop.reason, stop.mode, stop.holder) == (1, "estop_requested", "estopped", "gamepad")
+        assert stop.text == "stopped: emergency stop by ann"
+        assert stop.black_box == "box-1"
+
+    async def lease(bench):
+        bench.order(Order.ARM)
+        await bench.clock.sleep(0.05)
+        bench.wish(bench.requests, Role.GAMEPAD)
+        await bench.clock.sleep(0.4)
+        down = {"reason": Reason.LINK_DOWN, "severity": "warning", "source": "link", "text": "wlan0: link is down"}
+        bench.service.observe_event(Event.model_validate({**header(bench.clock.now()), **down}, strict=False))
+        await bench.clock.sleep(0.05)
+        first, second = bench.out.stops.messages
+        assert (first.number, second.number, second.seq) == (1, 1, 1)
+        assert (first.stamp, first.black_box) == (second.stamp, second.black_box)
+        assert second.text.endswith("because wlan0: link is down")
+
+    on_bench(scenario)
+    bench = on_bench(lease)
+    assert bench.boxes == [Reason.LEASE_EXPIRED], "asked for once"

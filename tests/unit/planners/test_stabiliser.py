@@ -97,7 +97,10 @@ def test_prediction_ends_and_readings_get_stale():
     for i in range(40):
         tilt.observe(attitude(1 + 0.05 * i, pitch=0.05 * i))
     newest = 1 + 0.05 * 39
-    predicted = [tilt.tilt(round((newest + age) * SECOND)) for age in (0.1, CONFIG.coast, 0.29, 0.31)]
+    predicted = [
+        tilt.tilt(round((newest + age) * SECOND))
+        for age in (0.1, CONFIG.coast, CONFIG.stale_after - 0.01, CONFIG.stale_after + 0.01)
+    ]
     assert predicted[0].pitch == pytest.approx(0.05 * 39 + 0.1 + CONFIG.lead, abs=1e-6)
     assert predicted[1] == predicted[2]
     assert predicted[3] is None

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.event import Cause, Measurement
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
@@ -28,6 +29,23 @@ joints = st.builds(
     load=st.none() | number,
     voltage=st.none() | number,
     temperature=st.none() | number,
+)
+
+causes = st.builds(
+    Cause,
+    since=ns,
+    measurements=st.lists(
+        st.builds(
+            Measurement,
+            name=st.text(),
+            value=st.none() | number,
+            unit=st.text(max_size=3),
+            limit=st.none() | number,
+            age=st.none() | number,
+        ),
+        max_size=2,
+    ).map(tuple),
+    because=st.none() | st.integers(0, 9),
 )
 
 
@@ -131,4 +149,6 @@ def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
         special["values"] = st.dictionaries(
             st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
         )
+    if topic is t.STOP:
+        special |= {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)}
     return st.builds(topic.model, **special)

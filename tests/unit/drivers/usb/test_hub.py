@@ -67,7 +67,7 @@ def test_a_hub_with_four_devices_vanishes_and_returns(tmp_path: Path, deaf: bool
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
     [(severity, source, text, values)] = bench.events.of(Reason.HUB_LOST)
     assert (severity, source) == (Severity.WARNING, "usb")
-    assert values == {"hub": "1-1", "devices": 4}
+    assert values == {"hub": "1-1", "devices": 4, "roles": "lidar,steering,drive,stabiliser"}
     assert all(role in text for role in FIRST)
     [(severity, _, text, values)] = bench.events.of(Reason.HUB_RETURNED)
     assert severity is Severity.INFO
@@ -197,7 +197,7 @@ def test_a_hub_with_one_device_is_a_hub(tmp_path: Path):
         await bench.clock.sleep(1)
         assert bench.service.waiting == {"compass"}
 
-    assert play(tmp_path, scene).events.of(Reason.HUB_LOST)[0][3] == {"hub": "1-2", "devices": 1}
+    assert play(tmp_path, scene).events.of(Reason.HUB_LOST)[0][3] == {"hub": "1-2", "devices": 1, "roles": "compass"}
 
 
 def test_three_of_four_cables_are_no_hub(tmp_path: Path):
@@ -221,7 +221,11 @@ def test_both_hubs_at_once_are_one_event_of_what_they_hang_on(tmp_path: Path):
 
     bench = play(tmp_path, scene)
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
-    assert bench.events.of(Reason.HUB_LOST)[0][3] == {"hub": "usb1", "devices": 6}
+    assert bench.events.of(Reason.HUB_LOST)[0][3] == {
+        "hub": "usb1",
+        "devices": 6,
+        "roles": "lidar,steering,drive,stabiliser,compass",
+    }
 
 
 def test_a_hub_behind_a_lost_hub_is_part_of_it(tmp_path: Path):
@@ -363,7 +367,7 @@ def test_over_current_is_told_and_the_port_left_alone(tmp_path: Path):
     [(severity, _, text, values)] = bench.events.of(Reason.OVER_CURRENT)
     assert severity is Severity.ERROR
     assert "hub 1-1 port 1 (lidar)" in text
-    assert values == {"ports": "1-1.1"}
+    assert values == {"ports": "1-1.1", "roles": "lidar"}
 
 
 def test_over_current_before_the_start_is_history(tmp_path: Path):

@@ -1,0 +1,82 @@
+"""Why the truck was stopped, in words: for the gate, the command line and stations alike."""
+
+from collections.abc import Iterator, Sequence
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.event import Cause, Measurement, Stop
+
+
+def sentence(causes: Sequence[Cause], now: int) -> str:
+    """All causes in one line, each followed by what was behind it.
+
+    Args:
+        causes: as in ``Stop``.
+        now: instant the durations count to, ns.
+    """
+    return "; ".join(", because ".join(clause(cause, now) for cause in chain(causes, head)) for head in heads(causes))
+
+
+def story(stop: Stop, now: int) -> list[str]:
+    """The stop in a few lines: what and when, then the causes, each indented below what it led to.
+
+    Args:
+        stop: the newest message of its number.
+        now: the robot's time, ns, e.g. the stamp of its newest gate state.
+    """
+    how = "quick stop" if stop.quick else "stop"
+    speed = "" if stop.speed is None else f" at {abs(stop.speed):.2f} m/s"
+    driver = "" if stop.holder is None else f", driver {stop.holder}"
+    lines = [f"{how}{speed} {span((now - stop.stamp) / SECOND)} ago{driver}"]
+    for head in heads(stop.causes):
+        for depth, cause in enumerate(chain(stop.causes, head)):
+            lines.append("  " * depth + ("because " if depth else "") + clause(cause, stop.stamp))
+    if stop.black_box is not None:
+        lines.append(f"black box {stop.black_box}")
+    return lines
+
+
+def heads(causes: Sequence[Cause]) -> list[Cause]:
+    """The causes that tripped the gate themselves: those that are behind no other one."""
+    deeper = {cause.because for cause in causes}
+    return [cause for index, cause in enumerate(causes) if index not in deeper]
+
+
+def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
+    """``head`` and what was behind it, link by link; indices that lead nowhere or back end it."""
+    left = len(causes)
+    cause = head
+    while True:
+        yield cause
+        left -= 1
+        if cause.because is None or not cause.because < len(causes) or left <= 0:
+            return
+        cause = causes[cause.because]
+
+
+def clause(cause: Cause, now: int) -> str:
+    """One cause: ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
+    lasted = (now - cause.since) / SECOND
+    notes = [f"for {span(lasted)}"] if lasted >= 1e-3 else []
+    notes += [figure(measurement) for measurement in cause.measurements]
+    return cause.text + (f" ({', '.join(notes)})" if notes else "")
+
+
+def figure(measurement: Measurement) -> str:
+    """One measurement with its limit and, where it is not the age itself, its age."""
+    text = f"{measurement.name} {_quantity(measurement.value, measurement.unit)}"
+    if measurement.limit is not None:
+        text += f", limit {_quantity(measurement.limit, measurement.unit)}"
+    return text if measurement.age is None else f"{text}, {span(measurement.age)} old"
+
+
+def span(seconds: float) -> str:
+    """A duration: ms below a second, then s, then minutes."""
+    if seconds < 1.0:
+        return f"{seconds * 1e3:.0f} ms"
+    return f"{seconds:.1f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+def _quantity(value: float | None, unit: str) -> str:
+    if value is None:
+        return "unknown"
+    return span(value) if unit == "s" else f"{value:.3g} {unit}".rstrip()
