@@ -1,15 +1,36 @@
 """Commands on logs: look inside, repair, export, play back."""
 
 import json
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.cli.options import ENDPOINT
+from monstertruckd.cli.options import ENDPOINT, complete_topic
 from monstertruckd.cli.output import JsonOption, print_json, progress
 
+if TYPE_CHECKING:
+    from monstertruckd.logs.selection import Progress, Selection
+
 app = typer.Typer(help="Look inside, repair and export logs (MCAP).", no_args_is_help=True)
+
+TopicsOption = Annotated[
+    list[str] | None, typer.Option("--topic", "-t", help="Only these topics.", autocompletion=complete_topic)
+]
+
+
+class ExportFormat(StrEnum):
+    """What a log can be written as."""
+
+    CSV = "csv"
+    NPZ = "npz"
+    ROS2 = "ros2"
+    MCAP = "mcap"
+
 
 LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.", show_default=False)]
 
@@ -74,18 +95,57 @@ def report_command(
 @app.command("export")
 def export_command(
     log: LogArgument,
-    directory: Annotated[Path, typer.Argument(help="Folder for one file per topic.", show_default=False)],
-    form: Annotated[str, typer.Option("--format", "-f", help="csv or npz.")] = "csv",
+    output: Annotated[
+        Path, typer.Argument(help="Folder of the tables; new folder of the bag; new MCAP file.", show_default=False)
+    ],
+    form: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.CSV,
+    topics: TopicsOption = None,
+    start: Annotated[float, typer.Option("--start", "-s", min=0.0, help="Seconds after the log's begin.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")] = None,
+    json_output: JsonOption = False,
 ) -> None:
-    """Write every topic of a log as CSV or as NumPy arrays."""
-    from monstertruck_runtime.errors import InputError
-    from monstertruckd.logs import export_csv, export_npz
+    """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
+    from monstertruckd.logs.selection import Selection
 
-    exporters = {"csv": export_csv, "npz": export_npz}
-    if form not in exporters:
-        raise InputError(f"--format {form}: expected one of {', '.join(exporters)}")
-    for topic, file in exporters[form](log, directory).items():
+    selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
+    with needs_extra("logs"):
+        export = _exporter(form)
+    with progress("export", log.stat().st_size if log.exists() else None) as done:
+        files = export(log, output, selection, done)
+    if json_output:
+        print_json(files)
+        return
+    for topic, file in files.items():
         typer.echo(f"{topic:20} {file}")
+
+
+def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress], dict[str, Path]]":
+    match form:
+        case ExportFormat.CSV:
+            from monstertruckd.logs.export import export_csv as export
+        case ExportFormat.NPZ:
+            from monstertruckd.logs.export import export_npz as export
+        case ExportFormat.ROS2:
+            from monstertruckd.logs.ros2 import export_ros2 as export
+        case ExportFormat.MCAP:
+            from monstertruckd.logs.wall_mcap import export_mcap as export
+    return export
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Say which extra of the distribution brings a library that is missing.
+
+    Raises:
+        NotFoundError: an import inside failed.
+    """
+    from monstertruck_runtime.errors import NotFoundError
+
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        text = f"{error.name} is not installed: it comes with the extra {name!r} (pip install 'monstertruckd[{name}]')"
+        raise NotFoundError(text) from None
 
 
 def replay(
@@ -93,7 +153,7 @@ def replay(
     robot: Annotated[str, typer.Option("--robot", "-r", help="Name to replay under.")] = "truck",
     endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = ENDPOINT,
     speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
-    topics: Annotated[list[str] | None, typer.Option("--topic", "-t", help="Only these topics.")] = None,
+    topics: TopicsOption = None,
 ) -> None:
     """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber."""
     from monstertruckd.replay import replay_log

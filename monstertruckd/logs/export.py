@@ -21,7 +21,7 @@ _LOG_TIME, _REAL_TIME = "log_time", "real_time"
 
 
 def export_csv(
-    path: str | Path, directory: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.csv`` for every topic that has messages.
 
@@ -36,7 +36,7 @@ def export_csv(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or the folder cannot be written.
     """
-    directory = _folder(directory)
+    directory = _folder(output)
     files: dict[str, Path] = {}
     with ExitStack() as stack:
         writers: dict[str, Any] = {}
@@ -51,7 +51,7 @@ def export_csv(
 
 
 def export_npz(
-    path: str | Path, directory: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
 
@@ -67,7 +67,7 @@ def export_npz(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or the folder cannot be written.
     """
-    directory = _folder(directory)
+    directory = _folder(output)
     tables: dict[str, dict[str, list[Any]]] = {}
     for topic, row in _rows(path, directory, selection, progress):
         table = tables.setdefault(topic, {name: [] for name in row})

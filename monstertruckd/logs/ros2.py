@@ -38,7 +38,7 @@ _NEVER: Final = QosTime(9_223_372_036, 854_775_807)
 
 
 def export_ros2(
-    path: str | Path, directory: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write a ROS 2 bag (MCAP storage, CDR).
 
@@ -47,11 +47,11 @@ def export_ros2(
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, a message in it is invalid, or ``directory`` exists or cannot be written.
+        InputError: not a log, a message in it is invalid, or ``output`` exists or cannot be written.
     """
     reader = LogReader(Path(path))
     offset = real_offset(reader)
-    directory = Path(directory)
+    directory = Path(output)
     topics: dict[str, Path] = {}
     try:
         with Writer(directory, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:

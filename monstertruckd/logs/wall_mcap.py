@@ -28,9 +28,9 @@ _INSTANTS: Final = {"stamp", "received", "since", "gate_stamp"}
 
 
 def export_mcap(
-    path: str | Path, file: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
-    """Write the selected messages to ``file`` with log times, stamps and headers in UNIX time.
+    """Write the selected messages to a new file with log times, stamps and headers in UNIX time.
 
     Returns:
         The file by topic.
@@ -42,10 +42,10 @@ def export_mcap(
     reader = LogReader(Path(path))
     offset = real_offset(reader)
     topics: dict[str, Path] = {}
-    file = Path(file)
+    file = Path(output)
     try:
-        with file.open("xb") as output:
-            writer = Writer(output)
+        with file.open("xb") as stream:
+            writer = Writer(stream)
             _begin(writer, reader, offset)
             channels = Channels(writer)
             for entry, message in selection.of(reader, progress):

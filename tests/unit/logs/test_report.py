@@ -11,37 +11,18 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
-from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import ClockOffset, GateMode, GateState, Grid, Odometry
+from monstertruck_schemas.state import GateMode, Grid
 from monstertruckd.logs.report import report
 from monstertruckd.logs.report.collect import collect
 from monstertruckd.logs.report.page import page
 from monstertruckd.recorder.file import Entry, LogFile
+from tests.unit.logs.log_kit import Writer, clock, gate, odometry
 from tests.unit.recorder.conftest import scan
-
-MAY_2026 = 1_777_600_000 * SECOND
-
-
-def odometry(now, seq):
-    return Odometry(
-        stamp=now,
-        received=now,
-        seq=seq,
-        frame="odom",
-        pose=Pose2D(x=0.1 * seq, y=0.0, yaw=0.0),
-        twist=Twist2D(vx=1.0, vy=0.0, wz=0.0),
-        pose_covariance=np.zeros(9),
-        twist_covariance=np.zeros(9),
-        age=0.0,
-    )
-
-
-def gate(now, seq, mode=GateMode.DRIVING):
-    return GateState(stamp=now, received=now, seq=seq, mode=mode, nonce="n", speed_limit=1.0, holder="tracker")
 
 
 def tracker(now, seq):
@@ -68,19 +49,6 @@ def health(now, seq, state):
     return HealthTable(stamp=now, received=now, seq=seq, services=(row,))
 
 
-class Writer:
-    """A log written message by message, counting sequences as the recorder does."""
-
-    def __init__(self, file, **attachments):
-        self.log = LogFile(file, "lz4", 1 << 16, attachments, {"real_offset_ns": "5"}, SECOND)
-        self.sequences = {}
-
-    def put(self, topic, message, skip=0):
-        sequence = self.sequences.get(topic.name, 0) + skip
-        self.sequences[topic.name] = sequence + 1
-        self.log.add(Entry(topic, message.received, message.stamp, sequence, wire.encode(topic, message)))
-
-
 @pytest.fixture
 def log(tmp_path):
     file = tmp_path / "run-000001-000.mcap"
@@ -91,7 +59,7 @@ def log(tmp_path):
         writer.put(t.GATE, gate(now, i, GateMode.DRIVING if 20 <= i < 70 else GateMode.DISARMED))
         writer.put(t.TRACKER, tracker(now, i))
         writer.put(t.SCAN, scan(now, i), skip=3 if i == 50 else 0)
-    writer.put(t.CLOCK, ClockOffset(stamp=now, received=now, seq=0, offset=MAY_2026))
+    writer.put(t.CLOCK, clock(now))
     writer.put(t.EVENT, event(now, Severity.ERROR, "hub <1-1> gone"))
     for seq, state in enumerate((ServiceState.READY, ServiceState.BACKOFF, ServiceState.FAILED)):
         writer.put(t.HEALTH, health(now + seq * SECOND, seq, state))
