@@ -1,0 +1,234 @@
+"""What goes into a route planner and what comes out: map, vehicle, budget, result. Compiled."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceField, Footprint
+from monstertruck_planners.route.config import DriveCosts, Unknown
+from monstertruck_planners.route.motion import MotionPath, Steering, moved
+from monstertruck_planners.route.pricing import Layer
+from monstertruck_planners.route.reeds_shepp import ReedsShepp
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import Grid
+
+Array = NDArray[np.float64]
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class RouteMap:
+    """Ground to plan on.
+
+    Args:
+        field: obstacles.
+        unknown: shape of the field's grid, bool: cells that are dear; None: none.
+        tilt: the same shape, rad, 0 where not known; None: level.
+        roughness: the same shape, m; None: smooth.
+
+    Raises:
+        InputError: a layer of another shape than the field.
+    """
+
+    field: DistanceField
+    unknown: NDArray[np.bool_] | None = None
+    tilt: Array | None = None
+    roughness: Array | None = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(n - 2 for n in self.field.data().occupied.shape)
+        for name in ("unknown", "tilt", "roughness"):
+            layer = getattr(self, name)
+            if layer is not None and layer.shape != shape:
+                raise InputError(f"route map: {name} of shape {layer.shape}: expected that of the grid, {shape}")
+
+    @classmethod
+    def from_grid(
+        cls, grid: Grid, unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None
+    ) -> "RouteMap":
+        """Map of an occupancy grid, unknown cells by policy."""
+        cells = grid.cells.reshape(grid.height, grid.width)
+        return cls.from_cells(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), unknown, tilt, roughness)
+
+    @classmethod
+    def from_cells(
+        cls, cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None,
+    ) -> "RouteMap":  # fmt: skip
+        """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y."""
+        occupied = cells >= OCCUPIED
+        unseen = cells < 0
+        if unknown == "blocked":
+            occupied = occupied | unseen
+        return cls(DistanceField(occupied, resolution, origin), unseen if unknown == "dear" else None, tilt, roughness)
+
+    def layer(self, costs: DriveCosts, keep: float) -> Layer:
+        """Prices of all cells.
+
+        Args:
+            costs: weights.
+            keep: distance to a cell's centre at which the footprint's side touches it, m.
+        """
+        data = self.field.data()
+        price = np.zeros((0, 0), np.float32)
+        for amount, weight in (
+            (self.unknown, costs.unknown_cost),
+            (self.tilt, costs.tilt_cost),
+            (self.roughness, costs.roughness_cost),
+        ):
+            if amount is not None and weight > 0.0:
+                if not price.size:
+                    price = np.zeros(data.distance.shape, np.float32)
+                price[1:-1, 1:-1] += weight * np.abs(amount)
+        if costs.clearance > 0.0 and costs.clearance_cost > 0.0:
+            near = costs.clearance_cost * np.clip(1.0 - (data.distance - keep) / costs.clearance, 0.0, 1.0)
+            price = near.astype(np.float32) + (price if price.size else np.float32(0.0))
+        return Layer(price)
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What is driven.
+
+    Args:
+        footprint: of the reference point: its ``offset`` or disc centres are seen from there.
+        radius: least turning radius of the reference point, m.
+        crab_angle: largest angle of a translation, rad; 0: cannot crab.
+        steering: how arcs and lines are steered.
+        reference: x of the reference point in base, m.
+    """
+
+    footprint: Footprint | DiscFootprint = Footprint()
+    radius: float = 0.378
+    crab_angle: float = 0.0
+    steering: Steering = "counter"
+    reference: float = 0.0
+
+    @classmethod
+    def truck(
+        cls,
+        steering: Literal["2ws", "counter", "4ws"] = "4ws",
+        *,
+        angle: float = 0.4,
+        geometry: FourWheelSteering | None = None,
+        footprint: Footprint | None = None,
+    ) -> "Vehicle":
+        """The truck: front steering about the rear axle, counter steering about the centre, or that and crab."""
+        geometry, footprint = geometry or FourWheelSteering(), footprint or Footprint()
+        if steering == "2ws":
+            radius = geometry.minimum_radius("front", angle)
+            footprint = replace(footprint, offset=footprint.offset + geometry.l_r)
+            return cls(footprint, radius, 0.0, "front", -geometry.l_r)
+        crab = angle if steering == "4ws" else 0.0
+        return cls(footprint, geometry.minimum_radius("counter", angle), crab, "counter", 0.0)
+
+    def reference_pose(self, base: ArrayLike) -> Array:
+        """Pose of the reference point for one of the base."""
+        return moved(np.asarray(base, dtype=np.float64), self.reference)
+
+    def steer(self, costs: DriveCosts | None = None) -> ReedsShepp:
+        """Motions without obstacles, with the costs or by length."""
+        weights = (costs.reverse_cost, costs.cusp_cost, costs.crab_cost) if costs else (1.0, 0.0, 1.0)
+        return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
+
+
+class Budget:
+    """How long a planner may go on: until a time, or for an amount of work.
+
+    Args:
+        seconds: from now on, needs ``now``.
+        now: gives seconds, monotonic.
+        effort: search steps and trials, if there is no clock.
+    """
+
+    def __init__(self, seconds: float, now: Clock | None, effort: int) -> None:
+        self._now = now
+        self._begin = now() if now else 0.0
+        self._seconds = seconds
+        self._effort = effort
+        self.work = 0
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the beginning; 0 without a clock."""
+        return self._now() - self._begin if self._now else 0.0
+
+    def left(self) -> float:
+        """Share of the budget that is left, at most 1."""
+        used = self.elapsed / self._seconds if self._now else self.work / self._effort
+        return max(1.0 - used, 0.0)
+
+
+@dataclass(frozen=True)
+class RouteResult:
+    """A route, or why there is none."""
+
+    reason: Reason
+    path: MotionPath | None = None
+    poses: Array | None = None
+    """Shape (n, 3): a route of grid A*, which is not drivable as it is: x, y, yaw of the reference point."""
+    cost: float = math.inf
+    """Metres, with all prices."""
+    text: str = ""
+    """What exactly was wrong."""
+    statistics: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a route."""
+        return self.reason is Reason.OK
+
+
+class RoutePlanner(Protocol):
+    """Pure: the same arguments, without a clock, give the same result."""
+
+    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+        """Route between two poses of the vehicle's reference point."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Start and goal that may be used."""
+
+    start: Array
+    goal: Array
+
+
+def check_ends(
+    ground: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float, margin: float
+) -> Ends | RouteResult:
+    """Start and goal, the latter within tolerance, or a refusal."""
+    try:
+        a, b = (np.array(p, dtype=np.float64).reshape(3) for p in (start, goal))
+    except (TypeError, ValueError):
+        return RouteResult(Reason.BAD_INPUT, text="start and goal: expected x, y, yaw")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return RouteResult(Reason.NOT_FINITE, text="start and goal: expected finite numbers")
+    field, footprint = ground.field, vehicle.footprint
+    if not field.free(footprint, a[None], margin)[0]:
+        return RouteResult(Reason.START_BLOCKED, text=f"start {_said(a)}: the footprint overlaps an obstacle")
+    if not field.inside(b[:2]):
+        return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_said(b)}: off the map")
+    candidates = np.vstack((b, *(b + d for d in _tolerated(position, yaw))))
+    free = field.free(footprint, candidates, margin)
+    if not free.any():
+        return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_said(b)}: the footprint overlaps an obstacle")
+    return Ends(a, candidates[int(np.argmax(free))])
+
+
+def _tolerated(position: float, yaw: float) -> list[Array]:
+    """Small displacements within the tolerances, the smallest first."""
+    around = [(0.0, 0.0)]
+    around += [(s * position * math.cos(k), s * position * math.sin(k)) for s in (0.5, 0.98) for k in np.arange(8) * math.pi / 4]
+    return [np.array([x, y, t * yaw]) for x, y in around for t in (0.0, 0.5, -0.5, 0.98, -0.98)][1:]
+
+
+def _said(pose: Array) -> str:
+    return f"({pose[0]:g}, {pose[1]:g}, {pose[2]:g})"

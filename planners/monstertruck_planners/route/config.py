@@ -1,0 +1,61 @@
+"""Settings of the route planners: light models, one ``kind`` each."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+AtLeastOne = Annotated[float, Field(ge=1)]
+
+Unknown = Literal["blocked", "dear", "free"]
+
+
+class GoalConfig(Schema):
+    """What all route planners share."""
+
+    budget: Positive = 1.0
+    """Time for a route and its improvement, s; used when the caller gives a clock."""
+    effort: Annotated[int, Field(gt=0)] = 60_000
+    """Search steps and improvement trials allowed without a clock: equal inputs then give equal routes."""
+    position_tolerance: NotNegative = 0.05
+    """If the goal itself is taken, a free pose this near will do, m."""
+    yaw_tolerance: NotNegative = 0.09
+    """The same for the heading, rad."""
+    margin: NotNegative = 0.0
+    """Kept between footprint and obstacles, m."""
+    unknown: Unknown = "blocked"
+    """Cells that nobody has seen: obstacles, dear ground, or free."""
+    unknown_cost: NotNegative = 1.0
+    """Extra cost of a metre on dear unknown ground, m."""
+
+
+class DriveCosts(GoalConfig):
+    """What a metre costs, for planners of drivable motions."""
+
+    reverse_cost: AtLeastOne = 1.02
+    """Of a metre backward, m."""
+    cusp_cost: NotNegative = 0.3
+    """Of a change of direction, m."""
+    crab_cost: AtLeastOne = 1.02
+    """Of a metre beside the heading, m."""
+    clearance: NotNegative = 0.1
+    """Nearer to obstacles than this a metre costs more, m."""
+    clearance_cost: NotNegative = 0.0
+    """Extra cost of a metre in contact, falling to 0 at ``clearance``, m."""
+    tilt_cost: NotNegative = 2.0
+    """Extra cost of a metre for each radian of tilt, m."""
+    roughness_cost: NotNegative = 10.0
+    """Extra cost of a metre for each metre of roughness, m."""
+
+
+class HybridConfig(DriveCosts):
+    """Hybrid-A* with improvement until the budget is used up."""
+
+    kind: Literal["hybrid"] = "hybrid"
+    greed: AtLeastOne = 2.0
+    """Factor on the heuristics: more finds a first route sooner."""
+    improve: bool = True
+    """Shorten the route and look for other ways while there is time."""

@@ -1,0 +1,143 @@
+"""Length of the shortest way to the goal round the obstacles, for a point, on a coarse grid, compiled.
+
+The first of the two heuristics, and the guide of the search: every cell also knows its next one. A coarse cell is open if
+any cell inside it may hold the middle of the footprint; near obstacles a metre counts more, as the footprint is no point.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from monstertruck_planners.collision_kernels import FieldData
+
+UNIT = 100
+"""Cost of a step to the next column or row in the open."""
+
+FAR = 2**30
+BUCKETS = 1024
+"""More than the cost of the dearest step."""
+
+STEPS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
+"""Column and row of each neighbour, counter-clockwise."""
+
+COARSE = 0.1
+"""Cells are joined up to about this size, m."""
+
+
+class ToGo(NamedTuple):
+    """Ways to the goal over the ringed grid of a field."""
+
+    cost: NDArray[np.int32]
+    """In 1/UNIT cells; FAR where no way is known."""
+    step: NDArray[np.int8]
+    """Index of the neighbour that is next, -1 at the goal."""
+    toll: NDArray[np.int16]
+    """Cost of a straight step into the cell, 0 = closed."""
+    cell: float
+    """Size, m."""
+
+
+@njit(cache=True)
+def tolls(field: FieldData, factor: int, closed: float, narrow: float) -> NDArray[np.int16]:
+    """Cost of entering each coarse cell: 0 nearer to obstacles than ``closed``, twice UNIT there, UNIT from ``narrow`` on."""
+    rows, columns = field.distance.shape
+    height, width = (rows + factor - 1) // factor, (columns + factor - 1) // factor
+    result = np.zeros((height, width), np.int16)
+    for row in range(height):
+        for column in range(width):
+            best = np.float32(0.0)
+            for r in range(row * factor, min((row + 1) * factor, rows)):
+                for c in range(column * factor, min((column + 1) * factor, columns)):
+                    best = max(best, field.distance[r, c])
+            if best >= closed:
+                share = min(max((narrow - best) / max(narrow - closed, 1e-6), 0.0), 1.0)
+                result[row, column] = int(UNIT * (1.0 + share))
+    return result
+
+
+@njit(cache=True)
+def spread(
+    toll: NDArray[np.int16], allowed: NDArray[np.bool_], seed_row: int, seed_column: int, stop: int, stretch: float
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Dijkstra with buckets (Dial) from one cell.
+
+    Args:
+        toll: see ``ToGo``.
+        allowed: shape (0, 0) for the whole grid, or where to stay.
+        seed_row: the goal's cell.
+        seed_column: the same.
+        stop: flat index of a cell; -1 for none. The flood ends at ``stretch`` times its cost, and some cells.
+        stretch: see above.
+
+    Returns:
+        Cost and next step of every cell.
+    """
+    rows, columns = toll.shape
+    fenced = allowed.size > 0
+    cost = np.full((rows, columns), FAR, np.int32)
+    step = np.full((rows, columns), -1, np.int8)
+    head = np.full(BUCKETS, -1, np.int32)
+    most = 8 * rows * columns + 1
+    following, cell_of = np.empty(most, np.int32), np.empty(most, np.int32)
+    used, waiting = 1, 1
+    cost[seed_row, seed_column] = 0
+    cell_of[0], following[0], head[0] = seed_row * columns + seed_column, -1, 0
+    level, limit = 0, FAR
+    while waiting > 0 and level <= limit:
+        bucket = level % BUCKETS
+        entry = head[bucket]
+        if entry < 0:
+            level += 1
+            continue
+        head[bucket] = following[entry]
+        waiting -= 1
+        flat = cell_of[entry]
+        row, column = flat // columns, flat % columns
+        if cost[row, column] != level:
+            continue
+        if flat == stop:
+            limit = min(limit, int(stretch * level) + 40 * UNIT)
+        for k in range(8):
+            r, c = row + STEPS[k, 1], column + STEPS[k, 0]
+            if not (0 <= r < rows and 0 <= c < columns) or toll[r, c] == 0 or (fenced and not allowed[r, c]):
+                continue
+            price = int(toll[r, c]) + int(toll[row, column]) if toll[row, column] > 0 else 2 * int(toll[r, c])
+            if k & 1:
+                if toll[row, c] == 0 or toll[r, column] == 0:
+                    continue
+                price = price * 141 // 200
+            else:
+                price //= 2
+            if level + price < cost[r, c]:
+                cost[r, c] = level + price
+                step[r, c] = (k + 4) & 7
+                cell_of[used], following[used] = r * columns + c, head[(level + price) % BUCKETS]
+                head[(level + price) % BUCKETS] = used
+                used += 1
+                waiting += 1
+    return cost, step
+
+
+@njit(cache=True)
+def cell_at(field: FieldData, cell: float, x: float, y: float) -> tuple[int, int]:
+    """(row, column) of the coarse cell at a point; outside the grid too."""
+    dx, dy = x - field.x, y - field.y
+    return (
+        int(np.floor((dy * field.cos - dx * field.sin) / cell)),
+        int(np.floor((dx * field.cos + dy * field.sin) / cell)),
+    )
+
+
+@njit(cache=True)
+def walk(step: NDArray[np.int8], row: int, column: int, length: float) -> tuple[int, int]:
+    """Cell reached after ``length`` cells along the way to the goal, or the goal's."""
+    while length > 0.0:
+        k = step[row, column]
+        if k < 0:
+            break
+        row += STEPS[k, 1]
+        column += STEPS[k, 0]
+        length -= 1.4142135623730951 if k & 1 else 1.0
+    return row, column

@@ -1,0 +1,186 @@
+"""The main route planner: Hybrid-A* for a first route, then shortening and other ways while there is time. Compiled."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monstertruck_planners.route import distance_to_go as togo
+from monstertruck_planners.route import hybrid_search as search
+from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
+from monstertruck_planners.route.config import HybridConfig
+from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.motion_rows import ends as row_ends
+from monstertruck_planners.route.shorten import Draft, measure, shorten
+from monstertruck_planners.route.turning_table import turning_table
+from monstertruck_schemas.reasons import Reason
+
+Array = NDArray[np.float64]
+
+CHUNK = 256
+"""Nodes expanded between two looks at the budget."""
+
+MOST_NODES = 400_000
+HEADINGS = 36
+
+
+@dataclass(frozen=True)
+class Level:
+    """How finely poses are told apart, in turning radii."""
+
+    cell: float
+    move: float
+
+
+LEVELS = (Level(0.35, 0.55), Level(0.15, 0.25))
+"""The second one is for narrow places, when the first finds nothing."""
+
+
+class HybridPlanner:
+    """Routes for one vehicle.
+
+    Args:
+        vehicle: what is driven.
+        config: costs, tolerances, budget.
+    """
+
+    def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None) -> None:
+        self.vehicle = vehicle
+        self.config = config or HybridConfig()
+        self._steer = vehicle.steer(self.config)
+        self._table = turning_table(vehicle.crab_angle)
+        self._body = vehicle.footprint.body()
+
+    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+        """Route of the vehicle's reference point.
+
+        Args:
+            ground: the map.
+            start: pose (x, y, yaw) in the map's frame, m, rad.
+            goal: the same.
+            now: seconds, for the budget; None: the config's ``effort`` limits the work and the result is reproducible.
+        """
+        config = self.config
+        budget = Budget(config.budget, now, config.effort)
+        ends = check_ends(
+            ground, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
+        )
+        if isinstance(ends, RouteResult):
+            return ends
+        return _Run(self, ground, ends, budget).route()
+
+
+class _Run:
+    """One planning request."""
+
+    def __init__(self, planner: HybridPlanner, ground: RouteMap, ends: Ends, budget: Budget) -> None:
+        self.vehicle, self.config, self.budget = planner.vehicle, planner.config, budget
+        self.steer, self.table, self.body = planner._steer, planner._table, planner._body
+        self.start, self.goal = ends.start, ends.goal
+        self.field = ground.field.data()
+        side = self.body.half_width or self.body.radius
+        self.layer = ground.layer(self.config, side + 0.5 * self.field.resolution)
+        self.factor = max(round(togo.COARSE / self.field.resolution), 1)
+        self.cell = self.factor * self.field.resolution
+        self.toll = togo.tolls(self.field, self.factor, self.body.inscribed, side + 0.25 * self.vehicle.radius)
+        self.random = np.random.default_rng(0)
+        self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
+
+    def route(self) -> RouteResult:
+        go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
+        row, column = self._cell(self.start)
+        if go.cost[row, column] >= togo.FAR:
+            return self._none(Reason.GOAL_UNREACHABLE, "no way is wide enough")
+        rows, reason = self._first(go)
+        if rows is None:
+            return self._none(reason, "no drivable way found")
+        self.statistics["first_s"] = self.budget.elapsed
+        self.statistics["first_length"] = float(np.abs(rows[:, 0]).sum())
+        if self.config.improve:
+            rows = self._improve(rows, go)
+        cost = search.rows_cost(self.field, self.layer, self._car(LEVELS[0]), self.start, rows, len(rows), 0.0)
+        path = MotionPath(self.start, rows, self.vehicle.steering, self.vehicle.reference)
+        return RouteResult(Reason.OK, path, cost=cost, statistics=self._told())
+
+    def _none(self, reason: Reason, text: str) -> RouteResult:
+        return RouteResult(reason, text=text, statistics=self._told())
+
+    def _told(self) -> dict[str, float]:
+        return {**self.statistics, "elapsed_s": self.budget.elapsed}
+
+    def _cell(self, pose: Array) -> tuple[int, int]:
+        return togo.cell_at(self.field, self.cell, pose[0], pose[1])  # type: ignore[no-any-return]
+
+    def _ways(self, allowed: NDArray[np.bool_], stretch: float) -> togo.ToGo:
+        row, column = self._cell(self.start)
+        cost, step = togo.spread(self.toll, allowed, *self._cell(self.goal), row * self.toll.shape[1] + column, stretch)
+        return togo.ToGo(cost, step, self.toll, self.cell)
+
+    def _car(self, level: Level) -> search.Car:
+        radius, crab = self.vehicle.radius, self.vehicle.crab_angle
+        length = level.move * radius
+        moves = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
+        if crab > 0.0:
+            moves += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
+        leaps = np.array([16.0, 8.0, 4.0, 2.0]) * radius
+        return search.Car(radius, crab, self.steer.weights, np.array(moves), leaps, 0.01, self.config.margin + 1e-3)
+
+    def _nodes(self, level: Level) -> search.Nodes:
+        cell = level.cell * self.vehicle.radius
+        rows, columns = (int(n * self.field.resolution / cell) + 1 for n in self.field.occupied.shape)
+        n = MOST_NODES
+        return search.Nodes(
+            np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n),
+            np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
+            np.zeros((rows, columns, HEADINGS), np.int32), cell, np.zeros(4, np.int64),
+        )  # fmt: skip
+
+    def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason]:
+        for level in LEVELS:
+            rows, reason = self._search(go, level, self.config.greed, np.inf, keep=0.0)
+            if rows is not None or reason is Reason.ROUTE_TIMEOUT:
+                return rows, reason
+        whole = self._ways(np.zeros((0, 0), np.bool_), stretch=1e4)
+        return self._search(whole, LEVELS[1], self.config.greed, np.inf, keep=0.0)
+
+    def _search(
+        self, go: togo.ToGo, level: Level, greed: float, bound: float, *, keep: float, most: int = MOST_NODES
+    ) -> tuple[Array | None, Reason]:
+        car, nodes = self._car(level), self._nodes(level)
+        field, goal = self.field, self.goal
+        search.add(field, go, self.table, car, goal, nodes, greed, *self.start, 0.0, -1, search.LEAP, 0.0, bound)
+        status = search.RUNNING
+        while status == search.RUNNING and self.budget.left() > keep and nodes.counts[search.EXPANDED] < most:
+            before = int(nodes.counts[search.EXPANDED])
+            status = search.expand(
+                field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, CHUNK
+            )
+            done = int(nodes.counts[search.EXPANDED]) - before
+            self.budget.work += done
+            self.statistics["expanded"] += done
+        if status == search.FOUND:
+            return search.trace(car, goal, nodes), Reason.OK
+        return None, Reason.GOAL_UNREACHABLE if status == search.EXHAUSTED else Reason.ROUTE_TIMEOUT
+
+    def _improve(self, rows: Array, go: togo.ToGo) -> Array:
+        draft = self._draft(rows)
+        while self.budget.left() > 0.02:
+            self._trials(draft, 400)
+        return draft.rows[: draft.count[0]].copy()
+
+    def _draft(self, rows: Array) -> Draft:
+        room = len(rows) + 400
+        draft = Draft(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(rows)]))
+        draft.rows[: len(rows)] = rows
+        draft.poses[0] = self.start
+        measure(draft, 0)
+        return draft
+
+    def _trials(self, draft: Draft, count: int) -> None:
+        reach = 40.0 * self.vehicle.radius
+        kept = shorten(
+            self.field, self.body, self.layer, self._car(LEVELS[0]), draft, reach, self.random.random((count, 6))
+        )
+        self.budget.work += count
+        self.statistics["trials"] += count
+        self.statistics["kept"] += kept
