@@ -4,14 +4,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-import yaml
-
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.tree import Device, Snapshot, parent_of, place, port_of, read_device, read_tree
-from monstertruck_runtime.errors import InputError, NoAnswerError
+from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.catalog import BY_ROLE
+from monstertruckd.config.edit import YamlText
 
 POLL: Final = 0.2
 SETTLE: Final = 0.4
@@ -46,7 +45,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], pa
     except TimeoutError:
         say("still not plugged in there; the port counts all the same")
     node = device.nodes[0]
-    kind = BY_ROLE.get(role)
+    kind = BY_ROLE.get(role.partition("_")[0])
     return UsbPortConfig(
         hub=str(parent_of(device.name)),
         port=port_of(device.name),
@@ -108,46 +107,40 @@ def _flow(port: UsbPortConfig) -> str:
     return f"{{ {', '.join(parts)} }}"
 
 
+def require_place(path: Path, role: str) -> YamlText:
+    """The file ``path``, which must say ``devices.<role>.port``.
+
+    Raises:
+        InputError: it cannot be read, is not YAML, or does not say it.
+    """
+    try:
+        text = YamlText(path.read_text(encoding="utf-8"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise InputError(str(error)) from error
+    if text.node("devices", role, "port") is None:
+        raise InputError(
+            f"{path}: no devices.{role}.port to replace; write it by hand into the file that says devices.{role}"
+        )
+    return text
+
+
 def write_port(path: Path, role: str, port: UsbPortConfig) -> None:
     """Replace ``devices.<role>.port`` in a configuration file; everything else stays as it is, comments too.
 
     A baud rate that stood there is kept. The file is replaced as a whole or not at all.
 
     Raises:
-        InputError: the file cannot be read or written, is not YAML, or says no ``devices.<role>.port``.
+        InputError: see ``require_place``; or the file cannot be written.
     """
+    text = require_place(path, role)
+    key = ("devices", role, "port")
+    baud = text.value(*key, "baud")
+    if baud is not None and baud.isdecimal():
+        port = port.model_copy(update={"baud": int(baud)})
+    text.replace(key, _flow(port))
     try:
-        text = path.read_text(encoding="utf-8")
-        replace_file(path, _with_port(text, path, role, port))
-    except (OSError, UnicodeDecodeError) as error:
+        replace_file(path, text.text)
+    except OSError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _with_port(text: str, path: Path, role: str, port: UsbPortConfig) -> str:
-    try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML: {error}") from error
-    old = _value(_value(_value(node, "devices"), role), "port")
-    if old is None:
-        raise InputError(
-            f"{path}: no devices.{role}.port to replace; write it by hand into the file that says devices.{role}"
-        )
-    baud = _value(old, "baud")
-    if isinstance(baud, yaml.ScalarNode) and baud.value.isdecimal():
-        port = port.model_copy(update={"baud": int(baud.value)})
-    return text[: old.start_mark.index] + _flow(port) + text[_end(old) :]
-
-
-def _value(node: yaml.Node | None, key: str) -> yaml.Node | None:
-    if not isinstance(node, yaml.MappingNode):
-        return None
-    return next((value for name, value in node.value if name.value == key), None)
-
-
-def _end(node: yaml.Node) -> int:
-    """Index behind the node's last character; a block's own mark lies behind the blanks and comments after it."""
-    if isinstance(node, yaml.MappingNode) and not node.flow_style and node.value:
-        return _end(node.value[-1][1])
-    end: int = node.end_mark.index
-    return end

@@ -3,7 +3,7 @@
 import typer
 
 from monstertruckd import __version__
-from monstertruckd.cli import demo, devices, drill, drive, kinematics, live, logs, orders, robot, service, usb
+from monstertruckd.cli import config, demo, devices, drill, drive, kinematics, live, logs, orders, robot, service, usb
 from monstertruckd.cli.output import CommandGroup
 
 app = typer.Typer(
@@ -33,7 +33,7 @@ app.command("demo")(demo.demo)
 app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)
-app.command("check-config")(robot.check_config)
+app.command("check-config", hidden=True)(config.show)  # its name before there were others
 app.command("topics")(robot.topics)
 app.command("status")(live.status)
 app.command("echo")(live.echo)
@@ -49,6 +49,7 @@ app.command("usb")(usb.usb)
 app.command("find-port")(usb.find_port)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
+app.add_typer(config.app, name="config")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 

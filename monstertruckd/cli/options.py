@@ -25,6 +25,13 @@ def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
     return (word for word in words if word[0].startswith(incomplete))
 
 
+def complete_role(incomplete: str) -> list[str]:
+    """Places for devices in a configuration."""
+    from monstertruckd.config.truck import Devices
+
+    return [role for role in Devices.model_fields if role.startswith(incomplete)]
+
+
 def complete_config(incomplete: str) -> list[str]:
     """Configurations of the folder ``configs``; for anything else the shell completes file names itself."""
     files = (*Path("configs").glob("*.yaml"), *Path("configs", "robots").glob("*.yaml"))

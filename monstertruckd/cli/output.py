@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 PIPE_WIDTH: Final = 200
 """Columns of text nobody looks at on a terminal: wide enough to cut nothing."""
 
+WIDE_CELL: Final = 48
+"""Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
 
@@ -98,9 +101,9 @@ def print_table(
     from rich.table import Table
 
     table = Table(box=None, header_style="bold", pad_edge=False, title=title, title_justify="left")
-    for heading in headings:
-        last = heading == headings[-1]
-        table.add_column(heading, justify="right" if heading in right else "left", no_wrap=not last, overflow="fold")
+    for heading, cells in zip(headings, zip(headings, *rows, strict=True), strict=True):
+        whole = max(map(len, cells)) <= WIDE_CELL
+        table.add_column(heading, justify="right" if heading in right else "left", no_wrap=whole, overflow="fold")
     for row in rows:
         table.add_row(*row)
     console().print(table)
@@ -108,7 +111,7 @@ def print_table(
 
 def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[str]) -> list[str]:
     lines = [list(headings), *map(list, rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    widths = [max(len(cell) for cell in column if len(cell) <= WIDE_CELL) for column in zip(*lines, strict=True)]
     to_the_right = [heading in right for heading in headings]
     return [
         "  ".join(

@@ -1,8 +1,6 @@
-"""Commands of the robot itself: run the daemon, check its configuration, print its topic table."""
+"""Commands of the robot itself: run the daemon, print its topic table."""
 
-import json
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -15,35 +13,6 @@ def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose",
     from monstertruckd.run import run_daemon
 
     raise typer.Exit(run_daemon(config, verbose=verbose).exit_code)
-
-
-def check_config(
-    config: Annotated[Path, typer.Argument(help="Configuration to check.")],
-    json_output: JsonOption = False,
-) -> None:
-    """Print the resolved configuration with the origin of every value; exit code 2 if it is refused."""
-    from monstertruckd.config.load import load_truck
-    from monstertruckd.config.validate import resolved
-
-    loaded, tree = load_truck(config)
-    values = resolved(loaded)
-    if json_output:
-        origins = {".".join(map(str, key)): str(origin) for key, origin in tree.origins.items() if key}
-        typer.echo(json.dumps({"config": values, "origins": origins}, indent=2))
-        return
-    for key, value in _leaves(values, ()):
-        origin = tree.origins.get(key)
-        typer.echo(f"{'.'.join(map(str, key)):48} {_short(value):40} {origin or 'default'}")
-
-
-def _leaves(value: Any, key: tuple[str | int, ...]) -> list[tuple[tuple[str | int, ...], Any]]:
-    if isinstance(value, dict) and value:
-        return [leaf for name, inner in value.items() for leaf in _leaves(inner, (*key, name))]
-    return [(key, value)]
-
-
-def _short(value: Any) -> str:
-    return "-" if value is None else json.dumps(value)
 
 
 def topics(json_output: JsonOption = False) -> None:

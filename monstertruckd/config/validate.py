@@ -31,7 +31,9 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
     version = tree.data.get("version")
     if version != VERSION:
         origin = tree.origin(("version",)) or f"{path}:1"
-        raise ConfigError(f"{origin}: version: expected {VERSION}, found {version!r}")
+        older = isinstance(version, int) and 0 <= version < VERSION
+        advice = f"; `monstertruckd config migrate {path}` brings it up to date" if older else ""
+        raise ConfigError(f"{origin}: version: expected {VERSION}, found {version!r}{advice}")
     _locate_files(tree, getattr(model, "FILE_KEYS", ()))
     try:
         text = json.dumps(tree.data)

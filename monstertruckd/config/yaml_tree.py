@@ -1,5 +1,6 @@
 """YAML files as plain data that remember where each value came from, merged along ``include:``."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -79,7 +80,7 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...]) -> Tree:
         raise ConfigError(f"{where}: include: expected a file name or a list of file names")
     merged = Tree({})
     for name in names:
-        target = path.parent / name
+        target = Path(os.path.normpath(path.parent / name))
         if not target.is_file():
             raise ConfigError(f"{where}: include: no such file: {target}")
         _merge(merged, _load(target, (*including, path.resolve())), ())

@@ -1,4 +1,4 @@
-"""`check-config` and `topics` as a user sees them: one clear line per mistake, exit code 2."""
+"""`config` and `topics` as a user sees them: one clear line per mistake, exit code 2."""
 
 import json
 import sys
@@ -8,6 +8,7 @@ import pytest
 
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.cli.main import main
+from monstertruckd.config import migrate
 
 ROOT = Path(__file__).resolve().parents[3]
 SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))
@@ -24,17 +25,59 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def test_every_shipped_configuration_is_accepted(
     config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    assert run(monkeypatch, "check-config", str(config)) == 0
+    assert run(monkeypatch, "config", "show", str(config)) == 0
     out = capsys.readouterr().out
     assert f"{config}:" in out, "every value shows its origin"
     assert " default" in out
 
 
 def test_json_output_has_values_and_origins(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    assert run(monkeypatch, "check-config", "--json", str(ROOT / "configs" / "demo.yaml")) == 0
+    assert run(monkeypatch, "config", "show", "--json", str(ROOT / "configs" / "demo.yaml")) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["config"]["geometry"]["wheelbase"] == 0.32
     assert shown["origins"]["geometry.wheelbase"].endswith("chassis.yaml:6")
+
+
+def test_a_key_chooses_what_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    robot = str(ROOT / "configs" / "robots" / "mecanum.yaml")
+    assert run(monkeypatch, "config", "show", robot, "-k", "geometry.track", "-k", "gate.leases") == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == [
+        "geometry.track",
+        *(f"gate.leases.{role}" for role in ("gamepad", "keyboard", "station", "tracker")),
+    ]
+    assert lines[0].endswith(f"{ROOT}/configs/parts/chassis.yaml:7"), "included files are named the short way"
+    assert run(monkeypatch, "config", "show", robot, "--key", "geometry.track", "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["config"] == {"geometry": {"track": 0.26}}
+    assert list(shown["origins"]) == ["geometry.track"]
+    assert run(monkeypatch, "config", "show", robot, "--key", "geometry.tra") == 4
+    assert "nothing at geometry.tra; sections: version, robot, body, geometry" in capsys.readouterr().err
+
+
+def test_the_first_name_of_config_show_still_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "check-config", str(SHIPPED[0])) == 0
+    assert capsys.readouterr().out.startswith("key ")
+
+
+@pytest.fixture
+def older(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file of a version 0 that called the robot otherwise."""
+    monkeypatch.setitem(migrate.STEPS, 0, lambda text: text.rename(("bot",), "robot"))
+    file = tmp_path / "old.yaml"
+    file.write_text("version: 0\nbot: rover  # mine\n")
+    return file
+
+
+def test_migrate_writes_and_says_so(older: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "config", "migrate", str(older), "--dry-run") == 0
+    assert "-bot: rover  # mine\n+version: 1\n+robot: rover  # mine\n" in capsys.readouterr().out
+    assert run(monkeypatch, "config", "migrate", str(older), "--json") == 0
+    (file,) = json.loads(capsys.readouterr().out)["files"]
+    assert (file["version"], file["previous"]) == (0, f"{older}.v0")
+    assert older.read_text() == "version: 1\nrobot: rover  # mine\n"
+    assert run(monkeypatch, "config", "migrate", str(older)) == 0
+    assert capsys.readouterr().err == f"{older}: up to date, version 1\n"
 
 
 TRUCK = """version: 1
@@ -84,7 +127,7 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(
 ):
     bad = tmp_path / "bad.yaml"
     bad.write_text(text)
-    assert run(monkeypatch, "check-config", str(bad)) == 2
+    assert run(monkeypatch, "config", "show", str(bad)) == 2
     streams = capsys.readouterr()
     assert streams.out == ""
     assert len(streams.err.strip().splitlines()) == 1
@@ -99,7 +142,7 @@ def test_the_gate_may_not_promise_more_braking_than_the_drive_has(
     config.write_text(
         f"include: {ROOT}/configs/truck.yaml\nversion: 1\ngate: {{deceleration: 1.0, quick_deceleration: 5}}\n"
     )
-    assert run(monkeypatch, "check-config", str(config)) == 2
+    assert run(monkeypatch, "config", "show", str(config)) == 2
     assert "gate.quick_deceleration 5.0 m/s^2: the drive is configured to brake with" in capsys.readouterr().err
 
 

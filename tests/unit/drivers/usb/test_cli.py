@@ -246,3 +246,29 @@ def test_find_port_prints_the_line_and_writes_it(tmp_path: Path, monkeypatch: py
     assert result.exit_code == 0, result.output
     assert 'port: { hub: "1-1", port: 1, usb_id: "15d1:0000" }' in result.stdout.splitlines()
     assert 'hub: "1-1"' in file.read_text()
+
+
+@pytest.mark.parametrize("role", ["toaster", "battery"])
+def test_find_port_knows_the_roles_there_are(role: str):
+    result = CliRunner().invoke(app(), ["find-port", role])
+    assert isinstance(result.exception, InputError)
+    assert f"no role '{role}'; known: lidar, drive" in str(result.exception)
+
+
+def test_find_port_asks_nothing_that_it_could_not_write(tmp_path: Path):
+    file = tmp_path / "truck.yaml"
+    file.write_text("version: 1\n")
+    result = CliRunner().invoke(app(), ["find-port", "lidar", "--write", str(file)])
+    assert isinstance(result.exception, InputError)
+    assert "no devices.lidar.port to replace" in str(result.exception)
+
+
+def test_a_machine_without_hubs_says_so(monkeypatch: pytest.MonkeyPatch):
+    async def nothing(*_: Any) -> tuple[UsbNode, ...]:
+        return ()
+
+    monkeypatch.setattr("monstertruckd.cli.usb_tree.local_tree", nothing)
+    result = CliRunner().invoke(app(), ["usb", "--local"])
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert result.stderr == "no USB hub on this machine\n"
+    assert json.loads(CliRunner().invoke(app(), ["usb", "--local", "--json"]).stdout) == []

@@ -1,0 +1,126 @@
+"""Older configuration files become present ones, in steps, with their comments and with a way back."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruckd.config.edit import YamlText
+from monstertruckd.config.migrate import Step, carry_out, plan
+from monstertruckd.config.validate import load_config
+from monstertruckd.config.yaml_tree import load_tree
+from tests.unit.config.test_loading import Root
+
+OLD = """# my robot
+version: 0   # the first
+include: [part.yaml]
+bot: rover   # its name
+gate:
+  lease_ms: 250   # short
+
+# the end
+"""
+PART = """gate: { lease_ms: 300, rate: 50 }
+"""
+NEW = """# my robot
+version: 2   # the first
+include: [part.yaml]
+robot: rover   # its name
+gate:
+  lease: 0.25   # short
+
+# the end
+"""
+
+
+def _to_robot(text: YamlText) -> None:
+    text.rename(("bot",), "robot")
+
+
+def _to_seconds(text: YamlText) -> None:
+    milliseconds = text.value("gate", "lease_ms")
+    if milliseconds is not None:
+        text.replace(("gate", "lease_ms"), f"{int(milliseconds) / 1000:g}")
+        text.rename(("gate", "lease_ms"), "lease")
+
+
+STEPS: Mapping[int, Step] = {0: _to_robot, 1: _to_seconds}
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    (tmp_path / "part.yaml").write_text(PART)
+    file = tmp_path / "old.yaml"
+    file.write_text(OLD)
+    file.chmod(0o640)
+    return file
+
+
+def test_a_chain_of_steps_keeps_comments_and_the_previous_files(old: Path):
+    upgrades = plan(old, STEPS, 2)
+    assert old.read_text() == OLD, "planning writes nothing"
+    assert [upgrade.path.name for upgrade in upgrades] == ["part.yaml", "old.yaml"], "what includes comes last"
+    carry_out(upgrades)
+    assert old.read_text() == NEW
+    assert old.stat().st_mode & 0o777 == 0o640
+    assert (old.parent / "part.yaml").read_text() == "gate: { lease: 0.3, rate: 50 }\n"
+    assert (old.parent / "old.yaml.v0").read_text() == OLD
+    assert (old.parent / "part.yaml.v0").read_text() == PART
+    assert load_tree(old).data == {"version": 2, "robot": "rover", "gate": {"lease": 0.25, "rate": 50}}
+    assert plan(old, STEPS, 2) == [], "nothing is left to do"
+
+
+def test_an_upgrade_that_broke_off_can_be_repeated(old: Path):
+    carry_out(plan(old, STEPS, 2)[:1])
+    carry_out(plan(old, STEPS, 2))
+    assert old.read_text() == NEW
+    assert (old.parent / "part.yaml.v0").read_text() == PART
+
+
+def test_a_previous_file_of_another_content_is_not_lost(old: Path):
+    (old.parent / "old.yaml.v0").write_text("precious")
+    with pytest.raises(InputError, match=r"old\.yaml\.v0: holds another version 0"):
+        carry_out(plan(old, STEPS, 2))
+    assert old.read_text() == OLD
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("version: 3\n", r"a\.yaml:1: version: 3 is newer than this program, which knows up to 2"),
+        ("robot: x\n", r"a\.yaml:1: version: expected a number of 0 to 2, found None"),
+        ("\nversion: one\n", r"a\.yaml:2: version: expected a number of 0 to 2, found 'one'"),
+        ("version: {\n", r"a\.yaml:2: not valid YAML"),
+        ("- version\n", r"a\.yaml:1: expected a mapping"),
+        ("version: 0\ninclude: gone.yaml\n", r"gone\.yaml: cannot be read"),
+        ("version: 0\ninclude: a.yaml\n", r"a\.yaml: includes itself"),
+    ],
+)
+def test_what_cannot_be_upgraded_is_said(text: str, complaint: str, tmp_path: Path):
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=complaint):
+        plan(file, STEPS, 2)
+
+
+def test_a_hole_in_the_chain_is_said(old: Path):
+    with pytest.raises(ConfigError, match="no way from version 1 to 2"):
+        plan(old, {0: _to_robot}, 2)
+
+
+def test_an_old_file_names_the_command_that_mends_it(old: Path):
+    with pytest.raises(ConfigError, match=r"version: expected 1, found 0; `monstertruckd config migrate .*old\.yaml`"):
+        load_config(old, Root)
+
+
+def test_edits_touch_nothing_else():
+    text = YamlText('a:   # one\n  - b: 1\n  - c\n\n# two\nd: "x" # three\n', Path("x.yaml"))
+    assert text.names() == ["a", "d"]
+    assert (text.value("d"), text.value("a"), text.value("d", "e")) == ("x", None, None)
+    assert text.replace(("a",), "[]")
+    assert text.text == 'a:   # one\n  []\n\n# two\nd: "x" # three\n'
+    assert text.replace(("d",), "y")
+    assert not text.rename(("e",), "f")
+    assert not text.replace(("d", "e"), "1")
+    assert text.text == "a:   # one\n  []\n\n# two\nd: y # three\n"
