@@ -1,177 +1,43 @@
-"""Our messages as the well-known ``foxglove.*`` protobuf messages, so that stock viewers draw them.
-
-Fields below 1000 are Foxglove's own and are filled for viewers; fields from 1000 on are ours and carry what
-the well-known message cannot, exactly. Stock readers skip them. A field's number is never reused.
-"""
+"""Our messages as the well-known ``foxglove.*`` protobuf messages, so that stock viewers draw them."""
 
 import math
-import struct
+from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.protobuf import (
-    BOOL,
-    BYTES,
-    DOUBLE,
-    DOUBLES,
-    ENUM,
-    FIXED_INT64,
-    FIXED_UINT32,
-    INT32,
-    INT64,
-    STRING,
-    UINT64,
-    Field,
-    Layout,
-    message,
+from monstertruck_runtime.foxglove_layouts import (
+    COMPRESSED_IMAGE,
+    FRAME_TRANSFORM,
+    FRAME_TRANSFORMS,
+    GRID,
+    LASER_SCAN,
+    OCCUPANCY,
+    POSE,
+    POSE_IN_FRAME,
+    POSES_IN_FRAME,
+    QUATERNION,
+    VECTOR2,
+    VECTOR3,
+    planar_pose,
 )
+from monstertruck_runtime.foxglove_scan import decode_scan, encode_scan
+from monstertruck_runtime.protobuf import Layout
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
 
-FIRST_OWN_FIELD: Final = 1000
-"""Field numbers from here on are ours."""
-
-TIMESTAMP: Final = Layout("google.protobuf.Timestamp", Field(1, "seconds", INT64), Field(2, "nanos", INT32))
-VECTOR2: Final = Layout("foxglove.Vector2", Field(1, "x", DOUBLE), Field(2, "y", DOUBLE))
-VECTOR3: Final = Layout("foxglove.Vector3", Field(1, "x", DOUBLE), Field(2, "y", DOUBLE), Field(3, "z", DOUBLE))
-QUATERNION: Final = Layout(
-    "foxglove.Quaternion", Field(1, "x", DOUBLE), Field(2, "y", DOUBLE), Field(3, "z", DOUBLE), Field(4, "w", DOUBLE)
-)
-POSE: Final = Layout(
-    "foxglove.Pose", Field(1, "position", message(VECTOR3)), Field(2, "orientation", message(QUATERNION))
-)
-PACKED_ELEMENT: Final = Layout(
-    "foxglove.PackedElementField", Field(1, "name", STRING), Field(2, "offset", FIXED_UINT32), Field(3, "type", ENUM)
-)
-FRAME_TRANSFORM: Final = Layout(
-    "foxglove.FrameTransform",
-    Field(1, "timestamp", message(TIMESTAMP)),
-    Field(2, "parent_frame_id", STRING),
-    Field(3, "child_frame_id", STRING),
-    Field(4, "translation", message(VECTOR3)),
-    Field(5, "rotation", message(QUATERNION)),
-)
-
-_HEADER: Final = (Field(1, "timestamp", message(TIMESTAMP)), Field(2, "frame_id", STRING))
-_OWN_HEADER: Final = (Field(1000, "received", FIXED_INT64), Field(1001, "seq", UINT64))
-
-LASER_SCAN: Final = Layout(
-    "foxglove.LaserScan",
-    *_HEADER,
-    Field(3, "pose", message(POSE)),
-    Field(4, "start_angle", DOUBLE),
-    Field(5, "end_angle", DOUBLE),
-    Field(6, "ranges", DOUBLES),
-    Field(7, "intensities", DOUBLES),
-    *_OWN_HEADER,
-    Field(1002, "time_increment", DOUBLE),
-    Field(1003, "scan_time", DOUBLE),
-    Field(1004, "range_min", DOUBLE),
-    Field(1005, "range_max", DOUBLE),
-    Field(1006, "codes", BYTES),
-    Field(1007, "tilt", DOUBLES),  # none or one: stock writers leave out a plain 0
-)
-POSE_IN_FRAME: Final = Layout(
-    "foxglove.PoseInFrame",
-    *_HEADER,
-    Field(3, "pose", message(POSE)),
-    *_OWN_HEADER,
-    Field(1002, "child", STRING),
-    Field(1003, "pose2d", DOUBLES),
-    Field(1004, "twist2d", DOUBLES),
-    Field(1005, "pose_covariance", DOUBLES),
-    Field(1006, "twist_covariance", DOUBLES),
-    Field(1007, "age", DOUBLE),
-    Field(1008, "sources", STRING, repeated=True),
-)
-POSES_IN_FRAME: Final = Layout(
-    "foxglove.PosesInFrame",
-    *_HEADER,
-    Field(3, "poses", message(POSE), repeated=True),
-    *_OWN_HEADER,
-    Field(1002, "poses2d", DOUBLES),
-    Field(1003, "directions", DOUBLES),
-    Field(1004, "closed", BOOL),
-    Field(1005, "name", STRING),
-)
-GRID: Final = Layout(
-    "foxglove.Grid",
-    *_HEADER,
-    Field(3, "pose", message(POSE)),
-    Field(4, "column_count", FIXED_UINT32),
-    Field(5, "cell_size", message(VECTOR2)),
-    Field(6, "row_stride", FIXED_UINT32),
-    Field(7, "cell_stride", FIXED_UINT32),
-    Field(8, "fields", message(PACKED_ELEMENT), repeated=True),
-    Field(9, "data", BYTES),
-    *_OWN_HEADER,
-    Field(1002, "origin2d", DOUBLES),
-)
-COMPRESSED_IMAGE: Final = Layout(
-    "foxglove.CompressedImage",
-    Field(1, "timestamp", message(TIMESTAMP)),
-    Field(2, "data", BYTES),
-    Field(3, "format", STRING),
-    Field(4, "frame_id", STRING),
-    *_OWN_HEADER,
-    Field(1002, "sequence", UINT64),
-)
-FRAME_TRANSFORMS: Final = Layout(
-    "foxglove.FrameTransforms",
-    Field(1, "transforms", message(FRAME_TRANSFORM), repeated=True),
-    *_OWN_HEADER,
-    Field(1002, "stamp", FIXED_INT64),
-    Field(1003, "frame", STRING),
-)
-
-_INT8: Final = 2
-"""``foxglove.PackedElementField.NumericType.INT8``."""
-_OCCUPANCY: Final = PACKED_ELEMENT.encode({"name": "occupancy", "offset": 0, "type": _INT8})
-_PLANAR_POSE: Final = struct.Struct("<3sdBd3sdBd")
-
-
-def planar_pose(x: float, y: float, yaw: float) -> bytes:
-    """Serialized ``foxglove.Pose`` in the plane; what is zero there is left out."""
-    half = yaw / 2
-    return _PLANAR_POSE.pack(b"\x0a\x12\x09", x, 0x11, y, b"\x12\x12\x19", math.sin(half), 0x21, math.cos(half))
-
-
-_IDENTITY: Final = planar_pose(0.0, 0.0, 0.0)
-
 
 def _header(message: Message) -> dict[str, Any]:
-    return {
-        "timestamp": _timestamp(message.stamp),
-        "frame_id": message.frame,
-        "received": message.received,
-        "seq": message.seq,
-    }
+    return {"stamp": message.stamp, "frame": message.frame, "received": message.received, "seq": message.seq}
 
 
 def _own_header(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "stamp": _stamp(values["timestamp"]),
-        "frame": values["frame_id"],
-        "received": values["received"],
-        "seq": values["seq"],
-    }
-
-
-def _timestamp(stamp: int) -> dict[str, int]:
-    seconds, nanos = divmod(stamp, SECOND)
-    return {"seconds": seconds, "nanos": nanos}
-
-
-def _stamp(timestamp: bytes) -> int:
-    values = TIMESTAMP.decode(timestamp)
-    return int(values["seconds"]) * SECOND + int(values["nanos"])
+    return {key: values[key] for key in ("stamp", "frame", "received", "seq")}
 
 
 def _row(pose: bytes) -> tuple[float, float, float]:
@@ -196,53 +62,13 @@ def _doubles3(values: Any) -> tuple[float, float, float]:
     return a, b, c
 
 
-def _scan_values(scan: LaserScan) -> dict[str, Any]:
-    return _header(scan) | {
-        "pose": _IDENTITY,
-        "start_angle": scan.start_angle,
-        "end_angle": scan.end_angle,
-        "ranges": scan.ranges,
-        "time_increment": scan.time_increment,
-        "scan_time": scan.scan_time,
-        "range_min": scan.range_min,
-        "range_max": scan.range_max,
-        "codes": scan.codes.tobytes(),
-        "tilt": np.array([] if scan.tilt is None else [scan.tilt]),
-    }
-
-
-def _scan_model(values: Mapping[str, Any]) -> LaserScan:
-    return LaserScan(
-        **_own_header(values),
-        start_angle=values["start_angle"],
-        end_angle=values["end_angle"],
-        time_increment=values["time_increment"],
-        scan_time=values["scan_time"],
-        range_min=values["range_min"],
-        range_max=values["range_max"],
-        ranges=values["ranges"],
-        codes=np.frombuffer(values["codes"], np.uint8),
-        tilt=float(values["tilt"][0]) if len(values["tilt"]) else None,
-    )
-
-
-def _image_values(image: CompressedImage) -> dict[str, Any]:
-    return _header(image) | {"data": image.data, "format": image.format, "sequence": image.sequence}
-
-
-def _image_model(values: Mapping[str, Any]) -> CompressedImage:
-    return CompressedImage(
-        **_own_header(values), data=values["data"], format=values["format"], sequence=values["sequence"]
-    )
-
-
 def _odometry_values(odometry: Odometry) -> dict[str, Any]:
     pose, twist = odometry.pose, odometry.twist
     return _header(odometry) | {
         "pose": planar_pose(pose.x, pose.y, pose.yaw),
         "child": odometry.child,
-        "pose2d": np.array((pose.x, pose.y, pose.yaw)),
-        "twist2d": np.array((twist.vx, twist.vy, twist.wz)),
+        "pose2d": array("d", (pose.x, pose.y, pose.yaw)),
+        "twist2d": array("d", (twist.vx, twist.vy, twist.wz)),
         "pose_covariance": odometry.pose_covariance,
         "twist_covariance": odometry.twist_covariance,
         "age": odometry.age,
@@ -299,9 +125,9 @@ def _grid_values(grid: Grid) -> dict[str, Any]:
         "cell_size": {"x": grid.resolution, "y": grid.resolution},
         "row_stride": grid.width,
         "cell_stride": 1,
-        "fields": [_OCCUPANCY],
+        "fields": [OCCUPANCY],
         "data": grid.cells.tobytes(),
-        "origin2d": np.array((origin.x, origin.y, origin.yaw)),
+        "origin2d": array("d", (origin.x, origin.y, origin.yaw)),
     }
 
 
@@ -321,45 +147,29 @@ def _grid_model(values: Mapping[str, Any]) -> Grid:
 
 
 def _transforms_values(tree: Transforms) -> dict[str, Any]:
-    return {
+    return _header(tree) | {
         "transforms": [
             {
-                "timestamp": _timestamp(transform.stamp),
-                "parent_frame_id": transform.parent,
-                "child_frame_id": transform.child,
+                "stamp": transform.stamp,
+                "parent": transform.parent,
+                "child": transform.child,
                 "translation": dict(zip("xyz", transform.translation, strict=True)),
                 "rotation": dict(zip("xyzw", transform.rotation, strict=True)),
             }
             for transform in tree.transforms
         ],
-        "stamp": tree.stamp,
-        "received": tree.received,
-        "seq": tree.seq,
-        "frame": tree.frame,
     }
 
 
-def _transforms_model(values: Mapping[str, Any]) -> Transforms:
-    return Transforms(
-        stamp=values["stamp"],
-        received=values["received"],
-        seq=values["seq"],
-        frame=values["frame"],
-        transforms=tuple(_transform(raw) for raw in values["transforms"]),
-    )
+def _transforms_model(values: dict[str, Any]) -> Transforms:
+    return Transforms.model_validate(values | {"transforms": tuple(map(_transform, values["transforms"]))})
 
 
 def _transform(raw: bytes) -> Transform:
     values = FRAME_TRANSFORM.decode(raw)
-    return Transform.model_validate(
-        {
-            "parent": values["parent_frame_id"],
-            "child": values["child_frame_id"],
-            "stamp": _stamp(values["timestamp"]),
-            "translation": tuple(VECTOR3.decode(values["translation"]).values()),
-            "rotation": tuple(QUATERNION.decode(values["rotation"]).values()),
-        }
-    )
+    values["translation"] = tuple(VECTOR3.decode(values["translation"]).values())
+    values["rotation"] = tuple(QUATERNION.decode(values["rotation"]).values())
+    return Transform.model_validate(values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,25 +177,24 @@ class Binding:
     """How one of our models travels as a well-known message."""
 
     layout: Layout
-    values: Callable[[Any], dict[str, Any]]
-    """Model to field values."""
-    model: Callable[[Mapping[str, Any]], Message]
-    """Field values to model; raises ``InputError`` or ``pydantic.ValidationError``."""
+    encode: Callable[[Any], bytes]
+    """Model to bytes; raises ``InputError``."""
+    decode: Callable[[bytes], Message]
+    """Bytes to model; raises ``InputError`` or ``pydantic.ValidationError``."""
 
-    def encode(self, message: Message) -> bytes:
-        """Serialize ``message``."""
-        return self.layout.encode(self.values(message))
 
-    def decode(self, data: bytes) -> Message:
-        """Parse ``data``."""
-        return self.model(self.layout.decode(data))
+def _by_values(
+    layout: Layout, values: Callable[[Any], Mapping[str, Any]], model: Callable[[dict[str, Any]], Message]
+) -> Binding:
+    """Binding by way of the layout's mappings."""
+    return Binding(layout, lambda message: layout.encode(values(message)), lambda data: model(layout.decode(data)))
 
 
 BINDINGS: Final[Mapping[type[Message], Binding]] = {
-    LaserScan: Binding(LASER_SCAN, _scan_values, _scan_model),
-    CompressedImage: Binding(COMPRESSED_IMAGE, _image_values, _image_model),
-    Odometry: Binding(POSE_IN_FRAME, _odometry_values, _odometry_model),
-    Path: Binding(POSES_IN_FRAME, _path_values, _path_model),
-    Grid: Binding(GRID, _grid_values, _grid_model),
-    Transforms: Binding(FRAME_TRANSFORMS, _transforms_values, _transforms_model),
+    LaserScan: Binding(LASER_SCAN, encode_scan, decode_scan),
+    CompressedImage: _by_values(COMPRESSED_IMAGE, vars, CompressedImage.model_validate),
+    Odometry: _by_values(POSE_IN_FRAME, _odometry_values, _odometry_model),
+    Path: _by_values(POSES_IN_FRAME, _path_values, _path_model),
+    Grid: _by_values(GRID, _grid_values, _grid_model),
+    Transforms: _by_values(FRAME_TRANSFORMS, _transforms_values, _transforms_model),
 }

@@ -5,7 +5,7 @@ from importlib import import_module
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 
-from monstertruck_runtime.foxglove import FIRST_OWN_FIELD
+from monstertruck_runtime.foxglove_layouts import FIRST_OWN_FIELD
 from monstertruck_runtime.protobuf import Field, Layout
 
 

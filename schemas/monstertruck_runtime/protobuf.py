@@ -7,7 +7,9 @@ Source: https://protobuf.dev/programming-guides/encoding/. Scalars are always wr
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
+from operator import methodcaller
 from typing import Any, Final
 
 import numpy as np
@@ -22,9 +24,8 @@ FIXED32: Final = 5
 
 _FIXED: Final = {FIXED64: 8, FIXED32: 4}
 _DOUBLE: Final = struct.Struct("<d")
-_INT64: Final = struct.Struct("<q")
-_UINT32: Final = struct.Struct("<I")
 _MASK64: Final = 2**64 - 1
+_SHORT: Final = [bytes((value,)) for value in range(0x80)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class Kind:
     descriptor_type: int
     """``google.protobuf.FieldDescriptorProto.Type``."""
     write: Callable[[Any], bytes]
-    """Value to bytes behind the tag, length prefix included."""
+    """Value to bytes behind the tag, and behind the length where there is one."""
     read: Callable[[Any], Any]
     """Number of a varint, or bytes of anything else, to value."""
     default: Any
@@ -46,6 +47,8 @@ class Kind:
     """Array of scalars in one record; the reader takes them one by one as well."""
     layout: "Layout | None" = None
     """Of an embedded message."""
+    code: str | None = None
+    """Format of ``struct``, where the value has a fixed size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +60,34 @@ class Field:
     kind: Kind
     repeated: bool = False
     """A list of values, each with its own tag; packed kinds are arrays by themselves."""
+    key: str = ""
+    """Its name in mappings; by default ``name``."""
+    constant: bytes | None = None
+    """What always stands behind its tag and is never read, empty = nothing; mappings do not have it."""
     tag: bytes = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "key", self.key or self.name)
         object.__setattr__(self, "tag", varint(self.number << 3 | self.kind.wire_type))
+
+    def writer(self, before: bytes = b"") -> Callable[[Any], bytes]:
+        """Writer of ``before``, the tag and a value; of None, ``before`` alone."""
+        if self.repeated:
+            write_one = replace(self, repeated=False).writer()
+            return lambda values: before + b"".join([write_one(value) for value in values])
+        tag, write = before + self.tag, self.kind.write
+        if self.kind.code is not None:
+            return partial(struct.Struct(f"<{len(tag)}s{self.kind.code}").pack, tag)
+        if self.kind.wire_type == VARINT:
+            return lambda value: tag + write(value)
+
+        def with_length(value: Any) -> bytes:
+            if value is None:
+                return before
+            body = write(value)
+            return b"%b%b%b" % (tag, varint(len(body)), body)
+
+        return with_length
 
     def reader(self) -> Callable[[Any], Any]:
         """Reader of one occurrence, or of the list of all where the field is repeated or joined."""
@@ -68,43 +95,41 @@ class Field:
         if self.repeated:
             return lambda raws: [read(raw) for raw in raws]
         if self.kind.joined:
-            return lambda raws: read(b"".join(raws))
+            return lambda raws: read(raws[0] if len(raws) == 1 else b"".join(raws))
         return read
 
 
 class Layout:
-    """Message type: its full protobuf name and its fields."""
+    """Message type: its full protobuf name and its fields, of which the last one is no constant."""
 
     def __init__(self, name: str, *fields: Field) -> None:
         self.name = name
         self.fields: Sequence[Field] = fields
-        self._defaults = {row.name: () if row.repeated else row.kind.default for row in fields}
+        self._writers: list[tuple[str, Callable[[Any], bytes]]] = []
+        self._defaults: dict[str, Any] = {}
         self._readers: dict[int, tuple[str, Callable[[Any], Any], bool]] = {}
-        """By tag: name, reader, whether it takes the list of all occurrences.
+        """By tag: key, reader, whether it takes the list of all occurrences.
 
         A field of an unexpected wire type has no row here: it counts as unknown, as protobuf demands.
         """
+        constants = b""
         for row in fields:
             tag = row.number << 3
             assert tag | row.kind.wire_type not in self._readers, f"{name}: field number {row.number} used twice"
-            reader = row.name, row.reader(), row.repeated or row.kind.joined
+            if row.constant is not None:
+                constants += row.tag + delimited(row.constant) if row.constant else b""
+                continue
+            self._writers.append((row.key, row.writer(constants)))
+            constants = b""
+            self._defaults[row.key] = () if row.repeated else row.kind.default
+            reader = row.key, row.reader(), row.repeated or row.kind.joined
             self._readers[tag | row.kind.wire_type] = reader
             if row.kind.packed:
                 self._readers[tag | FIXED64] = reader
 
     def encode(self, values: Mapping[str, Any]) -> bytes:
-        """Serialize the fields that ``values`` names; absent names are left out of the message."""
-        parts: list[bytes] = []
-        for row in self.fields:
-            if row.name not in values:
-                continue
-            value = values[row.name]
-            if row.repeated:
-                for item in value:
-                    parts += (row.tag, row.kind.write(item))
-            else:
-                parts += (row.tag, row.kind.write(value))
-        return b"".join(parts)
+        """Serialize the fields that ``values`` has a value for; the others are left out of the message."""
+        return b"".join([write(values[key]) for key, write in self._writers if key in values])
 
     def decode(self, data: bytes) -> dict[str, Any]:
         """Parse a serialized message.
@@ -143,26 +168,28 @@ class Layout:
                     start, at = at, at + length
                     raw = data[start:at]
                 if tag in readers:
-                    name, read, takes_list = readers[tag]
+                    key, read, takes_list = readers[tag]
                     if takes_list:
-                        lists.setdefault(name, (read, []))[1].append(raw)
+                        lists.setdefault(key, (read, []))[1].append(raw)
                     else:
-                        values[name] = read(raw)
+                        values[key] = read(raw)
         except (LookupError, struct.error):
             at = end + 1
         if at > end:
             msg = f"{self.name}: truncated or not protobuf 3"
             raise InputError(msg)
-        for name, (read, raws) in lists.items():
-            values[name] = read(raws)
+        for key, (read, raws) in lists.items():
+            values[key] = read(raws)
         return values
 
 
 def varint(value: int) -> bytes:
     """Base-128 form of ``value``; negative numbers as 64-bit two's complement."""
+    if 0 <= value < 0x80:
+        return _SHORT[value]
+    if 0 <= value < 0x4000:
+        return bytes((value & 0x7F | 0x80, value >> 7))
     value &= _MASK64
-    if value < 0x80:
-        return bytes((value,))
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -177,8 +204,12 @@ def read_varint(data: bytes, at: int) -> tuple[int, int]:
     Raises:
         InputError: truncated, or longer than 64 bits.
     """
-    value = shift = 0
     try:
+        value = data[at]
+        at += 1
+        if value < 0x80:
+            return value, at
+        value, shift = value & 0x7F, 7
         while True:
             byte = data[at]
             at += 1
@@ -218,24 +249,43 @@ def _doubles(raw: bytes) -> NDArray[np.float64]:
     return np.frombuffer(raw)
 
 
+def _first_double(raw: bytes) -> float | None:
+    doubles = _doubles(raw)
+    return float(doubles[0]) if len(doubles) else None
+
+
+def _codes(raw: bytes) -> NDArray[np.uint8]:
+    return np.frombuffer(raw, np.uint8)
+
+
 def _same(value: Any) -> Any:
     return value
 
 
-DOUBLE: Final = Kind(FIXED64, 1, _DOUBLE.pack, lambda raw: _DOUBLE.unpack(raw)[0], 0.0)
-FIXED_UINT32: Final = Kind(FIXED32, 7, _UINT32.pack, lambda raw: _UINT32.unpack(raw)[0], 0)
+_tobytes: Final = methodcaller("tobytes")
+
+
+def _fixed(wire_type: int, descriptor_type: int, code: str, default: float) -> Kind:
+    row = struct.Struct("<" + code)
+    return Kind(wire_type, descriptor_type, row.pack, lambda raw: row.unpack(raw)[0], default, code=code)
+
+
+DOUBLE: Final = _fixed(FIXED64, 1, "d", 0.0)
+FIXED_UINT32: Final = _fixed(FIXED32, 7, "I", 0)
+FIXED_INT64: Final = _fixed(FIXED64, 16, "q", 0)
 INT64: Final = Kind(VARINT, 3, varint, _signed, 0)
 INT32: Final = Kind(VARINT, 5, varint, _signed, 0)
-FIXED_INT64: Final = Kind(FIXED64, 16, _INT64.pack, lambda raw: _INT64.unpack(raw)[0], 0)
 UINT64: Final = Kind(VARINT, 4, varint, _same, 0)
 BOOL: Final = Kind(VARINT, 8, varint, bool, default=False)
 ENUM: Final = Kind(VARINT, 14, varint, _signed, 0)
-STRING: Final = Kind(DELIMITED, 9, lambda value: delimited(value.encode()), _text, "")
-BYTES: Final = Kind(DELIMITED, 12, delimited, _same, b"")
-DOUBLES: Final = Kind(
-    DELIMITED, 1, lambda array: delimited(array.tobytes()), _doubles, np.frombuffer(b""), joined=True, packed=True
-)
-"""Packed ``repeated double`` from and to a float64 array."""
+STRING: Final = Kind(DELIMITED, 9, str.encode, _text, "")
+BYTES: Final = Kind(DELIMITED, 12, _same, _same, b"")
+UINT8_ARRAY: Final = Kind(DELIMITED, 12, _tobytes, _codes, _codes(b""))
+"""``bytes`` from and to a uint8 array."""
+DOUBLES: Final = Kind(DELIMITED, 1, _tobytes, _doubles, np.frombuffer(b""), joined=True, packed=True)
+"""Packed ``repeated double`` from and to a float64 array; ``array.array("d")`` is written as well."""
+OPTIONAL_DOUBLE: Final = Kind(DELIMITED, 1, _DOUBLE.pack, _first_double, None, joined=True, packed=True)
+"""None or one of ``repeated double``: a value that may be absent, as proto3 leaves out a plain 0."""
 
 
 def message(layout: Layout) -> Kind:
@@ -245,6 +295,6 @@ def message(layout: Layout) -> Kind:
     """
 
     def write(value: Mapping[str, Any] | bytes) -> bytes:
-        return delimited(value if isinstance(value, bytes) else layout.encode(value))
+        return value if isinstance(value, bytes) else layout.encode(value)
 
     return Kind(DELIMITED, 11, write, _same, b"", joined=True, layout=layout)

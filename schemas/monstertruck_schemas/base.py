@@ -40,7 +40,11 @@ def _equal(a: object, b: object) -> bool:
 
 
 def _frozen_array(dtype: type[np.generic]) -> BeforeValidator:
+    exact = np.dtype(dtype)
+
     def freeze(value: Any, info: ValidationInfo) -> NDArray[Any]:
+        if type(value) is np.ndarray and value.dtype is exact and value.ndim == 1 and not value.flags.writeable:
+            return value
         # What came in from outside is looked at first: numpy takes its time over strings and nested lists.
         if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
             msg = "expected a list of numbers"

@@ -13,7 +13,7 @@ from mcap.records import Schema as McapSchema
 from mcap_protobuf.decoder import DecoderFactory
 from pydantic import BaseModel
 
-from monstertruck_runtime import foxglove, wire
+from monstertruck_runtime import foxglove, foxglove_layouts, foxglove_scan, wire
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.protobuf import DELIMITED, FIXED32, FIXED64, VARINT, Layout, delimited, varint
 from monstertruck_schemas import topics as t
@@ -96,6 +96,22 @@ def test_stock_protobuf_writes_what_we_read_and_reads_what_we_write(topic, data)
     theirs = stock(topic, ours)
     assert not list(UnknownFieldSet(theirs))
     assert wire.decode(topic, theirs.SerializeToString()) == wire.decode(topic, ours)
+
+
+@modest
+@given(message=messages.scans)
+def test_the_scans_own_codec_writes_what_its_layout_says_and_reads_it_without_the_layout(message):
+    data = wire.encode(t.SCAN, message)
+    assert data == foxglove_layouts.LASER_SCAN.encode(vars(message))
+    assert LaserScan.model_validate(foxglove_layouts.LASER_SCAN.decode(data)) == message
+    if message.stamp >= 0:
+        assert foxglove_scan._decode_own(data) == message
+
+
+@pytest.mark.parametrize("padded", [b"\x12\x85\x00laser", b"\x12\x05laser" * 2])
+def test_a_scan_in_unusual_protobuf_is_read_as_the_standard_says(padded):
+    data = wire.encode(t.SCAN, scan()).replace(b"\x12\x05laser", padded)
+    assert wire.decode(t.SCAN, data) == scan()
 
 
 def test_stock_reader_sees_the_standard_scan():
@@ -215,7 +231,7 @@ def test_invalid_scan_says_why(data, text):
 
 
 def test_odometry_of_the_wrong_shape_is_refused():
-    data = foxglove.POSE_IN_FRAME.encode({"twist2d": np.array([1.0, 2.0])})
+    data = foxglove_layouts.POSE_IN_FRAME.encode({"twist2d": np.array([1.0, 2.0])})
     with pytest.raises(InputError, match="state/odometry: expected 3 numbers, got 2"):
         wire.decode(t.ODOMETRY, data)
 
