@@ -40,8 +40,16 @@ class ToGo(NamedTuple):
 
 
 @njit(cache=True)
-def tolls(field: FieldData, factor: int, closed: float, narrow: float) -> NDArray[np.int16]:
-    """Cost of entering each coarse cell: 0 nearer to obstacles than ``closed``, twice UNIT there, UNIT from ``narrow`` on."""
+def tolls(field: FieldData, factor: int, closed: float, side: float, wide: float) -> NDArray[np.int16]:
+    """Cost of a straight step into each coarse cell.
+
+    Args:
+        field: the fine grid.
+        factor: fine cells per coarse one, each way.
+        closed: nearer to obstacles than this no pose can be free, m: 0.
+        side: nearer than this only the footprint's ends may be, m: four times UNIT.
+        wide: from here on UNIT, half as much more at ``side``, m.
+    """
     rows, columns = field.distance.shape
     height, width = (rows + factor - 1) // factor, (columns + factor - 1) // factor
     result = np.zeros((height, width), np.int16)
@@ -51,9 +59,12 @@ def tolls(field: FieldData, factor: int, closed: float, narrow: float) -> NDArra
             for r in range(row * factor, min((row + 1) * factor, rows)):
                 for c in range(column * factor, min((column + 1) * factor, columns)):
                     best = max(best, field.distance[r, c])
-            if best >= closed:
-                share = min(max((narrow - best) / max(narrow - closed, 1e-6), 0.0), 1.0)
-                result[row, column] = int(UNIT * (1.0 + share))
+            if best >= wide:
+                result[row, column] = UNIT
+            elif best >= side:
+                result[row, column] = int(UNIT * (1.0 + 0.5 * (wide - best) / (wide - side)))
+            elif best >= closed:
+                result[row, column] = 4 * UNIT
     return result
 
 

@@ -1,5 +1,6 @@
 """The main route planner: Hybrid-A* for a first route, then shortening and other ways while there is time. Compiled."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,10 @@ from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, Route
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.motion_rows import ends as row_ends
+from monstertruck_planners.route.redraft import redraft
 from monstertruck_planners.route.shorten import Draft, measure, shorten
 from monstertruck_planners.route.turning_table import turning_table
+from monstertruck_planners.route.ways import brush_way, cheapest_new
 from monstertruck_schemas.reasons import Reason
 
 Array = NDArray[np.float64]
@@ -20,7 +23,20 @@ Array = NDArray[np.float64]
 CHUNK = 256
 """Nodes expanded between two looks at the budget."""
 
+BATCH = 1000
+"""Trials of shortening between two looks."""
+
+PATIENCE = 12
+"""Rounds of improvement without gain after which the route is taken to be the best."""
+
+APART = 2.5
+"""Ways differ if they are this far apart somewhere, turning radii."""
+
+DETOUR = 1.15
+"""Other ways are tried up to this factor on the shortest."""
+
 MOST_NODES = 400_000
+EMPTY = np.empty((0, 3))
 HEADINGS = 36
 
 
@@ -82,7 +98,8 @@ class _Run:
         self.layer = ground.layer(self.config, side + 0.5 * self.field.resolution)
         self.factor = max(round(togo.COARSE / self.field.resolution), 1)
         self.cell = self.factor * self.field.resolution
-        self.toll = togo.tolls(self.field, self.factor, self.body.inscribed, side + 0.25 * self.vehicle.radius)
+        self.toll = togo.tolls(self.field, self.factor, self.body.inscribed, side, side + 0.25 * self.vehicle.radius)
+        self.car = self._car(LEVELS[0])
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
 
@@ -98,9 +115,8 @@ class _Run:
         self.statistics["first_length"] = float(np.abs(rows[:, 0]).sum())
         if self.config.improve:
             rows = self._improve(rows, go)
-        cost = search.rows_cost(self.field, self.layer, self._car(LEVELS[0]), self.start, rows, len(rows), 0.0)
         path = MotionPath(self.start, rows, self.vehicle.steering, self.vehicle.reference)
-        return RouteResult(Reason.OK, path, cost=cost, statistics=self._told())
+        return RouteResult(Reason.OK, path, cost=self._cost(rows), statistics=self._told())
 
     def _none(self, reason: Reason, text: str) -> RouteResult:
         return RouteResult(reason, text=text, statistics=self._told())
@@ -137,20 +153,20 @@ class _Run:
 
     def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason]:
         for level in LEVELS:
-            rows, reason = self._search(go, level, self.config.greed, np.inf, keep=0.0)
+            rows, reason = self._search(go, level, self.config.greed, np.inf)
             if rows is not None or reason is Reason.ROUTE_TIMEOUT:
                 return rows, reason
         whole = self._ways(np.zeros((0, 0), np.bool_), stretch=1e4)
-        return self._search(whole, LEVELS[1], self.config.greed, np.inf, keep=0.0)
+        return self._search(whole, LEVELS[1], self.config.greed, np.inf)
 
     def _search(
-        self, go: togo.ToGo, level: Level, greed: float, bound: float, *, keep: float, most: int = MOST_NODES
+        self, go: togo.ToGo, level: Level, greed: float, bound: float, *, most: int = MOST_NODES
     ) -> tuple[Array | None, Reason]:
         car, nodes = self._car(level), self._nodes(level)
         field, goal = self.field, self.goal
         search.add(field, go, self.table, car, goal, nodes, greed, *self.start, 0.0, -1, search.LEAP, 0.0, bound)
         status = search.RUNNING
-        while status == search.RUNNING and self.budget.left() > keep and nodes.counts[search.EXPANDED] < most:
+        while status == search.RUNNING and self.budget.left() > 0.0 and nodes.counts[search.EXPANDED] < most:
             before = int(nodes.counts[search.EXPANDED])
             status = search.expand(
                 field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, CHUNK
@@ -163,10 +179,68 @@ class _Run:
         return None, Reason.GOAL_UNREACHABLE if status == search.EXHAUSTED else Reason.ROUTE_TIMEOUT
 
     def _improve(self, rows: Array, go: togo.ToGo) -> Array:
-        draft = self._draft(rows)
-        while self.budget.left() > 0.02:
-            self._trials(draft, 400)
+        best, cost = self._polished(rows, np.inf)
+        others = self._other_ways(go)
+        idle = 0
+        while self.budget.left() > 0.0 and idle < PATIENCE:
+            rows = next(others, EMPTY)
+            rows, other = self._polished(rows if len(rows) else best, 1.05 * cost)
+            idle = 0 if other < 0.9995 * cost else idle + 1
+            if other < cost:
+                best, cost = rows, other
+        draft = self._draft(best)
+        self._settle(draft, 1e-4)
         return draft.rows[: draft.count[0]].copy()
+
+    def _polished(self, rows: Array, promising: float) -> tuple[Array, float]:
+        """Shorten, face the better way everywhere, shorten again; given up early unless the cost gets ``promising``."""
+        draft = self._draft(rows)
+        self._settle(draft)
+        cost = self._cost(draft.rows[: draft.count[0]])
+        if cost < promising and self.budget.left() > 0.0:
+            other = self._draft(self._redrafted(draft))
+            if other.count[0]:
+                self._settle(other)
+                if self._cost(other.rows[: other.count[0]]) < cost:
+                    draft = other
+        rows = draft.rows[: draft.count[0]].copy()
+        return rows, self._cost(rows)
+
+    def _settle(self, draft: Draft, gain: float = 1e-3) -> None:
+        """Shorten until a batch of trials gains less than a share of the length."""
+        length = np.inf
+        while self.budget.left() > 0.0 and draft.travelled[draft.count[0]] < (1.0 - gain) * length:
+            length = draft.travelled[draft.count[0]]
+            self._trials(draft, BATCH)
+
+    def _cost(self, rows: Array) -> float:
+        return float(search.rows_cost(self.field, self.layer, self.car, self.start, rows, len(rows), 0.0))
+
+    def _redrafted(self, draft: Draft) -> Array:
+        path = MotionPath(self.start, draft.rows[: draft.count[0]])
+        spacing = max(1.5 * self.vehicle.radius, path.length / 60)
+        samples = path.sample(spacing)
+        return redraft(
+            self.field, self.body, self.layer, self.car, samples.poses, samples.travelled, 16.0 * self.vehicle.radius
+        )  # type: ignore[no-any-return]
+
+    def _other_ways(self, go: togo.ToGo) -> Iterator[Array]:
+        """First drafts along other ways, the shortest ways first."""
+        columns = self.toll.shape[1]
+        whole = np.zeros((0, 0), np.bool_)
+        back, back_step = togo.spread(self.toll, whole, *self._cell(self.start), -1, 1.0)
+        known = np.zeros(self.toll.shape, np.bool_)
+        width = APART * self.vehicle.radius / self.cell
+        brush_way(known, go.step, *self._cell(self.start), width)
+        limit = int(DETOUR * go.cost[self._cell(self.start)])
+        while (cell := cheapest_new(go.cost, back, known, limit)) >= 0:
+            lane = np.zeros(self.toll.shape, np.bool_)
+            for step in (go.step, back_step):
+                brush_way(lane, step, cell // columns, cell % columns, width)
+                brush_way(known, step, cell // columns, cell % columns, width)
+            self.statistics["ways"] += 1
+            rows, _ = self._search(self._ways(lane, 1.3), LEVELS[0], self.config.greed, np.inf, most=CHUNK)
+            yield EMPTY if rows is None else rows
 
     def _draft(self, rows: Array) -> Draft:
         room = len(rows) + 400
@@ -178,9 +252,7 @@ class _Run:
 
     def _trials(self, draft: Draft, count: int) -> None:
         reach = 40.0 * self.vehicle.radius
-        kept = shorten(
-            self.field, self.body, self.layer, self._car(LEVELS[0]), draft, reach, self.random.random((count, 6))
-        )
+        kept = shorten(self.field, self.body, self.layer, self.car, draft, reach, self.random.random((count, 6)))
         self.budget.work += count
         self.statistics["trials"] += count
         self.statistics["kept"] += kept
