@@ -3,7 +3,21 @@
 import typer
 
 from monstertruckd import __version__
-from monstertruckd.cli import config, demo, devices, drill, drive, kinematics, live, logs, orders, robot, service, usb
+from monstertruckd.cli import (
+    config,
+    demo,
+    devices,
+    doctor,
+    drill,
+    drive,
+    kinematics,
+    live,
+    logs,
+    orders,
+    robot,
+    service,
+    usb,
+)
 from monstertruckd.cli.output import CommandGroup
 
 app = typer.Typer(
@@ -47,6 +61,7 @@ app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)
 app.command("usb")(usb.usb)
 app.command("find-port")(usb.find_port)
+app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
 app.add_typer(config.app, name="config")
