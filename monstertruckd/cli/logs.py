@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,6 +22,8 @@ app = typer.Typer(help="Look inside, repair and export logs (MCAP).", no_args_is
 TopicsOption = Annotated[
     list[str] | None, typer.Option("--topic", "-t", help="Only these topics.", autocompletion=complete_topic)
 ]
+StartOption = Annotated[float, typer.Option("--start", min=0.0, help="Seconds after the log's begin.")]
+EndOption = Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")]
 
 
 class ExportFormat(StrEnum):
@@ -84,7 +87,7 @@ def report_command(
     """Write one HTML page about a log: way, states, events, signals, health, losses. It needs no network."""
     from monstertruckd.logs.report import report
 
-    with progress("report", log.stat().st_size if log.exists() else None) as done:
+    with _reading("report", log) as done:
         written = report(log, output, done)
     if json_output:
         print_json(written.figures())
@@ -100,8 +103,8 @@ def export_command(
     ],
     form: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.CSV,
     topics: TopicsOption = None,
-    start: Annotated[float, typer.Option("--start", "-s", min=0.0, help="Seconds after the log's begin.")] = 0.0,
-    end: Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")] = None,
+    start: StartOption = 0.0,
+    end: EndOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
@@ -110,13 +113,45 @@ def export_command(
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
     with needs_extra("logs"):
         export = _exporter(form)
-    with progress("export", log.stat().st_size if log.exists() else None) as done:
+    with _reading("export", log) as done:
         files = export(log, output, selection, done)
     if json_output:
         print_json(files)
         return
     for topic, file in files.items():
         typer.echo(f"{topic:20} {file}")
+
+
+@app.command("view")
+def view_command(
+    log: LogArgument,
+    save: Annotated[Path | None, typer.Option("--save", help="Write this rerun file (.rrd), show nothing.")] = None,
+    topics: TopicsOption = None,
+    start: StartOption = 0.0,
+    end: EndOption = None,
+) -> None:
+    """Show a log in the rerun viewer, laid out, without any network (extra `view`)."""
+    from monstertruckd.logs.selection import Selection
+
+    selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
+    with needs_extra("view"):
+        from monstertruckd.logs.rerun_log import convert
+        from monstertruckd.logs.view import show
+    with TemporaryDirectory(prefix="monstertruckd-") as scratch:
+        recording = save or Path(scratch) / f"{log.stem}.rrd"
+        with _reading("convert", log) as done:
+            convert(log, recording, selection, done)
+        if save is None:
+            show(recording)
+        else:
+            typer.echo(str(save))
+
+
+@contextmanager
+def _reading(what: str, log: Path) -> "Iterator[Progress]":
+    """Progress over the bytes of a log."""
+    with progress(what, log.stat().st_size if log.is_file() else None) as done:
+        yield done
 
 
 def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress], dict[str, Path]]":

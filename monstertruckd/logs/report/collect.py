@@ -26,45 +26,14 @@ from monstertruckd.logs.report.curves import FIGURES, Curve
 from monstertruckd.logs.report.scan_map import ScanMap
 from monstertruckd.logs.report.states import States
 from monstertruckd.logs.report.traffic import Traffic
+from monstertruckd.logs.report.way import Way
+from monstertruckd.logs.selection import Progress
 from monstertruckd.logs.trace import Trace
 
 _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.TRANSFORMS.name: SECOND}
 """Topics that are decoded no more often than this, ns: they come thick and cost most of the time."""
-_WAY: Final = 0.02
-"""Metres between two remembered positions; nearer ones are noise of standing still."""
-_REMEMBERED: Final = 1500
 _EVENTS: Final = 400
 """Events kept of each severity."""
-
-Progress = Callable[[float], None]
-
-
-@dataclass(slots=True)
-class Way:
-    """Where the truck went, thinned out to a bounded number of positions."""
-
-    points: list[tuple[int, float, float]] = field(default_factory=list)
-    """Time, ns; x, y, m."""
-    distance: float = 0.0
-    _last: tuple[float, float] | None = None
-    _spacing: float = _WAY
-
-    def take(self, time: int, x: float, y: float) -> None:
-        """The truck's position."""
-        if self._last is None:
-            self._last = x, y
-            self.points.append((time, x, y))
-            return
-        step = math.dist(self._last, (x, y))
-        if step < _WAY:
-            return
-        self.distance += step
-        self._last = x, y
-        if math.dist(self.points[-1][1:], (x, y)) >= self._spacing:
-            self.points.append((time, x, y))
-            if len(self.points) > _REMEMBERED:
-                self.points = self.points[::2]
-                self._spacing *= 2
 
 
 @dataclass(slots=True)

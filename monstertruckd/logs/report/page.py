@@ -12,10 +12,11 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import ServiceState
-from monstertruckd.logs.report.collect import Progress, Run, collect
+from monstertruckd.logs.report.collect import Run, collect
 from monstertruckd.logs.report.drawing import SEVERITY_TONE, Lines, plots, plotted, scene, timeline
 from monstertruckd.logs.report.spans import Tone
 from monstertruckd.logs.report.svg import clock_text
+from monstertruckd.logs.selection import Progress
 from monstertruckd.logs.wall_time import is_plausible, utc
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
