@@ -37,13 +37,15 @@ class DriveCosts(GoalConfig):
 
     reverse_cost: AtLeastOne = 1.02
     """Of a metre backward, m."""
-    cusp_cost: NotNegative = 0.3
+    cusp_cost: NotNegative = 0.1
     """Of a change of direction, m."""
+    swing_cost: NotNegative = 0.01
+    """Of a change of curvature, m: few long arcs rather than many short ones."""
     crab_cost: AtLeastOne = 1.02
     """Of a metre beside the heading, m."""
     clearance: NotNegative = 0.1
     """Nearer to obstacles than this a metre costs more, m."""
-    clearance_cost: NotNegative = 0.0
+    clearance_cost: NotNegative = 0.2
     """Extra cost of a metre in contact, falling to 0 at ``clearance``, m."""
     tilt_cost: NotNegative = 2.0
     """Extra cost of a metre for each radian of tilt, m."""

@@ -11,9 +11,8 @@ from monstertruck_planners.route import hybrid_search as search
 from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.motion_rows import ends as row_ends
 from monstertruck_planners.route.redraft import redraft
-from monstertruck_planners.route.shorten import Draft, measure, shorten
+from monstertruck_planners.route.shorten import Draft, shorten, tidy
 from monstertruck_planners.route.turning_table import turning_table
 from monstertruck_planners.route.ways import brush_way, cheapest_new
 from monstertruck_schemas.reasons import Reason
@@ -23,11 +22,20 @@ Array = NDArray[np.float64]
 CHUNK = 256
 """Nodes expanded between two looks at the budget."""
 
+CHECK_STEP = 0.01
+"""Between two collision checks close to obstacles, m."""
+
+SKIN = 1e-3
+"""Kept beside the margin, as the footprint may come nearer between two checks, m."""
+
 BATCH = 1000
 """Trials of shortening between two looks."""
 
 PATIENCE = 12
 """Rounds of improvement without gain after which the route is taken to be the best."""
+
+LAST_SHARE = 0.3
+"""Of the budget, for shortening with translations."""
 
 APART = 2.5
 """Ways differ if they are this far apart somewhere, turning radii."""
@@ -139,7 +147,8 @@ class _Run:
         if crab > 0.0:
             moves += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
         leaps = np.array([16.0, 8.0, 4.0, 2.0]) * radius
-        return search.Car(radius, crab, self.steer.weights, np.array(moves), leaps, 0.01, self.config.margin + 1e-3)
+        weights, swing, margin = self.steer.weights, self.config.swing_cost, self.config.margin + SKIN
+        return search.Car(radius, crab, weights, swing, np.array(moves), leaps, CHECK_STEP, margin)
 
     def _nodes(self, level: Level) -> search.Nodes:
         cell = level.cell * self.vehicle.radius
@@ -179,18 +188,28 @@ class _Run:
         return None, Reason.GOAL_UNREACHABLE if status == search.EXHAUSTED else Reason.ROUTE_TIMEOUT
 
     def _improve(self, rows: Array, go: togo.ToGo) -> Array:
+        car = self.car
+        # Motions without translations are found in half the time: those come last.
+        self.car = car._replace(crab=0.0)
+        rows = self._rounds(rows, self._other_ways(go), PATIENCE, LAST_SHARE if car.crab > 0.0 else 0.0)
+        self.car = car
+        if car.crab > 0.0:
+            rows = self._rounds(rows, iter(()), 2, 0.0)
+        best = self._draft(rows)
+        self._settle(best, 1e-4)
+        return best.rows[: best.count[0]].copy()
+
+    def _rounds(self, rows: Array, others: Iterator[Array], patience: int, reserve: float) -> Array:
+        """Polish the best route and other drafts in turn until nothing gains or only the reserve is left."""
         best, cost = self._polished(rows, np.inf)
-        others = self._other_ways(go)
         idle = 0
-        while self.budget.left() > 0.0 and idle < PATIENCE:
+        while self.budget.left() > reserve and idle < patience:
             rows = next(others, EMPTY)
             rows, other = self._polished(rows if len(rows) else best, 1.05 * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
                 best, cost = rows, other
-        draft = self._draft(best)
-        self._settle(draft, 1e-4)
-        return draft.rows[: draft.count[0]].copy()
+        return best
 
     def _polished(self, rows: Array, promising: float) -> tuple[Array, float]:
         """Shorten, face the better way everywhere, shorten again; given up early unless the cost gets ``promising``."""
@@ -207,10 +226,10 @@ class _Run:
         return rows, self._cost(rows)
 
     def _settle(self, draft: Draft, gain: float = 1e-3) -> None:
-        """Shorten until a batch of trials gains less than a share of the length."""
-        length = np.inf
-        while self.budget.left() > 0.0 and draft.travelled[draft.count[0]] < (1.0 - gain) * length:
-            length = draft.travelled[draft.count[0]]
+        """Shorten until a batch of trials gains less than a share of the cost."""
+        last = np.inf
+        while self.budget.left() > 0.0 and (cost := self._cost(draft.rows[: draft.count[0]])) < (1.0 - gain) * last:
+            last = cost
             self._trials(draft, BATCH)
 
     def _cost(self, rows: Array) -> float:
@@ -218,7 +237,7 @@ class _Run:
 
     def _redrafted(self, draft: Draft) -> Array:
         path = MotionPath(self.start, draft.rows[: draft.count[0]])
-        spacing = max(1.5 * self.vehicle.radius, path.length / 60)
+        spacing = max(1.5 * self.vehicle.radius, path.length / 60) * self.random.uniform(0.7, 1.3)
         samples = path.sample(spacing)
         return redraft(
             self.field, self.body, self.layer, self.car, samples.poses, samples.travelled, 16.0 * self.vehicle.radius
@@ -247,7 +266,7 @@ class _Run:
         draft = Draft(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(rows)]))
         draft.rows[: len(rows)] = rows
         draft.poses[0] = self.start
-        measure(draft, 0)
+        tidy(draft)
         return draft
 
     def _trials(self, draft: Draft, count: int) -> None:

@@ -37,6 +37,8 @@ class Car(NamedTuple):
     crab: float
     weights: FloatArray
     """Shape (3,): per metre backward, of a cusp in turning radii, per metre of translation."""
+    swing: float
+    """Of every row, whose beginning turns the wheels, m."""
     moves: FloatArray
     """Shape (p, 3): the short moves, as motion rows."""
     leaps: FloatArray
@@ -92,7 +94,7 @@ def rows_cost(
         weight = 1.0 if length > 0.0 else car.weights[0]
         if rows[i, 2] != 0.0:
             weight *= car.weights[2]
-        total += abs(length) * weight
+        total += abs(length) * weight + car.swing
         if length * sense < 0.0:
             total += car.weights[1] * car.radius
         sense = length

@@ -91,6 +91,16 @@ def _append(out: FloatArray, used: int, length: float, curvature: float, sidesli
 
 
 @njit(cache=True)
+def tidy(draft: Draft) -> None:
+    """Join rows that go on alike, and measure the whole."""
+    used = 0
+    for k in range(draft.count[0]):
+        used = _append(draft.rows, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
+    draft.count[0] = used
+    measure(draft, 0)
+
+
+@njit(cache=True)
 def _splice(draft: Draft, begin: float, i: int, end: float, j: int, middle: FloatArray, many: int, spare: FloatArray) -> None:
     """Replace the stretch from ``begin`` (in row i) to ``end`` (in row j)."""
     used = 0
