@@ -5,7 +5,6 @@ order, so the gate commands neutral while actuators and recorder still listen.
 """
 
 import asyncio
-import platform
 import secrets
 from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager
@@ -20,14 +19,13 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
-from monstertruck_runtime.threads import in_thread, inline
+from monstertruck_runtime.threads import Offload, in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd import __version__
 from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -43,12 +41,13 @@ from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
 from monstertruckd.health import ClockService, HealthBoard, MeterService
 from monstertruckd.notify import notify_from, status_line
+from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
+from monstertruckd.versions import running_versions
 
 ACTUATORS = (*SHAFTS, "steering")
 SENSORS = ("lidar", "compass", "stabiliser", "camera")
-VERSIONS = {"monstertruckd": __version__, "python": platform.python_version(), "machine": platform.machine()}
 
 
 class Daemon:
@@ -81,6 +80,7 @@ class Daemon:
         self.bus = Bus(clock)
         self.digest = LogDigest()
         self._seed = seed
+        self._offload: Offload = in_thread if seed is None else inline
         self._rng = np.random.default_rng(seed)
         self._tree = tree
         self._events = self.bus.event_sink()
@@ -100,7 +100,9 @@ class Daemon:
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.rpc = self._build_rpc()
+        self._attachments = self._describe()
         self.recorder = self._build_recorder()
+        self.black_box = self._build_black_box()
         self._notify = notify_from(environment, clock, self.gate.ticks, self._status)
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -113,6 +115,7 @@ class Daemon:
         async with (
             self._outside(),
             self._recording(),
+            self._remembering(),
             scope("actuators") as actuators,
             scope("gate") as gate,
             scope("sensors") as sensors,
@@ -171,6 +174,22 @@ class Daemon:
             finally:
                 tap.close()
 
+    @asynccontextmanager
+    async def _remembering(self) -> AsyncIterator[None]:
+        """Inside the recording, which then holds the news of a box that is written at the very end."""
+        if self.black_box is None:
+            yield
+            return
+        async with self.black_box as box:
+            tap = self.bus.tap(
+                lambda topic, message, data: box.record(topic, message.stamp, data),
+                (topic for topic in TOPICS if topic.logged),
+            )
+            try:
+                yield
+            finally:
+                tap.close()
+
     def _status(self) -> str:
         return status_line(self.gate.mode, self._board.rows())
 
@@ -202,13 +221,12 @@ class Daemon:
             return resolved(self.config)
 
         async def versions(_: dict[str, Any]) -> dict[str, Any]:
-            return dict(VERSIONS)
+            return dict(running_versions())
 
         rpc.register("config", config)
         rpc.register("versions", versions)
         loaded = self._tree.calibration if self._tree is not None else None
-        offload = in_thread if self._seed is None else inline
-        calibration_rpc.register(rpc, self.config, loaded, self.clock, self._events, offload)
+        calibration_rpc.register(rpc, self.config, loaded, self.clock, self._events, self._offload)
         return rpc
 
     def _refuse_goal(self, request: GoalRequest) -> None:
@@ -251,6 +269,8 @@ class Daemon:
             ),
             self._events,
             latch,
+            black_box=lambda trip: None if self.black_box is None else self.black_box.trip(trip),
+            offload=self._offload,
         )
 
     def _build_latch(self) -> Latch:
@@ -267,17 +287,35 @@ class Daemon:
     def _build_recorder(self) -> Recorder | None:
         if self.config.recorder is None:
             return None
-        origins = self._tree.origins if self._tree is not None else {}
         return Recorder(
             self.config.recorder,
             self.clock,
             self._recorder_failed,
-            attachments={
-                "config": resolved(self.config),
-                "calibration": calibration(self.config, self._body.chassis, self._tree),
-                "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
-                "versions": VERSIONS,
-            },
+            attachments=self._attachments,
             digest=self.digest,
             deterministic=self._seed is not None,
         )
+
+    def _build_black_box(self) -> BlackBox | None:
+        folder = self.config.black_box_folder
+        if self.config.blackbox is None or folder is None:
+            return None
+        return BlackBox(
+            self.config.blackbox,
+            folder,
+            self.clock,
+            self._events,
+            attachments=self._attachments,
+            metadata={"robot": self.config.robot},
+            offload=self._offload,
+        )
+
+    def _describe(self) -> dict[str, Any]:
+        """What every log says about the robot and the run."""
+        origins = self._tree.origins if self._tree is not None else {}
+        return {
+            "config": resolved(self.config),
+            "calibration": calibration(self.config, self._body.chassis, self._tree),
+            "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
+            "versions": dict(running_versions()),
+        }

@@ -27,7 +27,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import BodyConfig, TruckBody
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.recorder.config import RecorderConfig
+from monstertruckd.recorder.config import BlackBoxConfig, RecorderConfig
 
 SHAFTS: Final = ("drive", "drive_2", "drive_3", "drive_4")
 """Roles of the driven shafts' controllers, in the order of the body's shafts."""
@@ -218,6 +218,8 @@ class TruckConfig(Schema):
     path: PathSource | None = None
     map: MapRender | None = None
     recorder: RecorderConfig | None = None
+    blackbox: BlackBoxConfig | None = BlackBoxConfig()
+    """The minute before every trip of the gate; null = not kept"""
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
     """Where the e-stop latch is kept"""
@@ -237,6 +239,13 @@ class TruckConfig(Schema):
             drivetrain=DriveTrain(geometry.drive_ratio, geometry.wheel_radius),
             **self.body.model_dump(),
         )
+
+    @property
+    def black_box_folder(self) -> Path | None:
+        """Where black boxes go; None = nowhere."""
+        if self.blackbox is not None and self.blackbox.directory is not None:
+            return Path(self.blackbox.directory)
+        return None if self.blackbox is None or self.recorder is None else Path(self.recorder.directory) / "blackbox"
 
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""

@@ -10,6 +10,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
 from monstertruck_runtime.stops import sentence
+from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
@@ -69,6 +70,7 @@ class GateService:
         events: where events go.
         latch: keeps the emergency stop over restarts.
         black_box: told of every stop as it happens; names the file that will hold the minute before, if any.
+        offload: where the latch is stored: a disk's sync must not hold up the loop.
     """
 
     name = "gate"
@@ -83,6 +85,7 @@ class GateService:
         events: EventSink,
         latch: Latch,
         black_box: Callable[[Trip], str | None] = lambda _: None,
+        offload: Offload = in_thread,
     ) -> None:
         self._gate = gate
         self._rate = rate
@@ -94,7 +97,9 @@ class GateService:
         self._kept: tuple[int, str | None] = (0, None)
         """Number of the newest stop, and its black box."""
         self._latch = latch
-        self._latched = latch.engaged()
+        self._offload = offload
+        self._latched: bool | None = latch.engaged()
+        """What is on the disk; None while it is being written."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
         self._told: tuple[object, ...] = ()
@@ -134,16 +139,18 @@ class GateService:
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
     async def run(self, ready: Ready) -> None:
-        """Tick until cancelled; the last commands are neutral, whatever ends it."""
+        """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk."""
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._take_requests(), name="gate requests")
                 group.create_task(self._take_wishes(), name="gate wishes")
                 group.create_task(self._keep_latch(), name="gate latch")
-                await self._tick_for_ever(ready)
+                try:
+                    await self._tick_for_ever(ready)
+                finally:
+                    self.shut_down()  # before anybody waits for a disk
         finally:
-            self.shut_down()
-            self._store_latch()
+            await self._store_latch()
 
     async def _tick_for_ever(self, ready: Ready) -> None:
         schedule = Schedule(self._clock, self._rate)
@@ -238,28 +245,27 @@ class GateService:
         )
 
     async def _keep_latch(self) -> None:
-        """Store the latch in a thread: a disk's sync must not delay the stop itself."""
         while True:
             await self._latch_differs.wait()
             self._latch_differs.clear()
-            wanted = self._gate.mode is GateMode.ESTOPPED
-            if wanted == self._latched:
-                continue
-            try:
-                await asyncio.to_thread(self._latch.store, wanted)
-            except OSError as error:
-                self._complain(error)
+            if not await self._store_latch():
                 await self._clock.sleep(LATCH_RETRY)
-            else:
-                self._latched = wanted
+                self._latch_differs.set()
 
-    def _store_latch(self) -> None:
+    async def _store_latch(self) -> bool:
+        """Store the latch if it differs from the gate's state, to the end even if cancelled; False if that failed."""
         wanted = self._gate.mode is GateMode.ESTOPPED
-        if wanted != self._latched:
-            try:
-                self._latch.store(wanted)
-            except OSError as error:
-                self._complain(error)
+        if wanted == self._latched:
+            return True
+        before, self._latched = self._latched, None  # stays so if cancelled: then it is stored once more
+        try:
+            await self._offload(partial(self._latch.store, wanted))
+        except OSError as error:
+            self._latched = before
+            self._complain(error)
+            return False
+        self._latched = wanted
+        return True
 
     def _complain(self, error: OSError) -> None:
         text = f"the emergency stop's latch could not be stored: {error}"

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.reasons import Reason
 
 Seconds = Annotated[float, Field(gt=0)]
 Bytes = Annotated[int, Field(gt=0)]
@@ -39,3 +40,28 @@ class RecorderConfig(Schema):
     """Seconds between two fsync, which is what a power cut can lose."""
     queue_size: Annotated[int, Field(gt=0)] = 8192
     """Messages waiting for the disk before newer ones are dropped and counted."""
+
+
+class BlackBoxConfig(Schema):
+    """The minute before every trip of the gate, kept in memory until then."""
+
+    directory: str | None = None
+    """Folder of the boxes; null = ``blackbox`` in the recorder's folder, and none at all without a recorder."""
+    before: Seconds = 60.0
+    """Seconds before the trip."""
+    after: Seconds = 5.0
+    """Seconds after it; trips meanwhile share the box."""
+    journal: Seconds = 300.0
+    """Seconds of events and log records."""
+    pictures: Seconds = 5.0
+    """Seconds before the trip of which all pictures are kept."""
+    picture_period: Seconds = 0.5
+    """Seconds between two pictures that are kept of the time before."""
+    memory_bytes: Annotated[int, Field(ge=1024 * 1024)] = 24 * 1024 * 1024
+    """Bytes all that may take; beyond, the oldest pictures go first, then the oldest of the rest."""
+    quota_bytes: Bytes = 512 * 1024 * 1024
+    """Size of all boxes in the folder above which the oldest are removed; the newest of each reason stays."""
+    interval: Annotated[float, Field(ge=0)] = 60.0
+    """Least seconds between two boxes of one reason."""
+    unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
+    """Reasons without a box: by default what somebody ordered."""

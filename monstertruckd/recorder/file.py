@@ -1,5 +1,6 @@
 """One log file being written, and the folder of all of them."""
 
+import errno
 import fcntl
 import json
 import os
@@ -11,6 +12,7 @@ from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
 
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
 from monstertruckd.logs.channels import Channels
@@ -35,6 +37,11 @@ class Entry:
     sequence: int
     """Counts the topic's messages; a gap is a message dropped on the way to the log."""
     payload: bytes
+
+
+def disk_reason(error: OSError) -> Reason:
+    """Why a disk refused to take a log."""
+    return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED
 
 
 class LogFile:

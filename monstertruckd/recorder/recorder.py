@@ -1,7 +1,6 @@
 """The recorder: takes encoded messages on the event loop, writes them in a thread of its own."""
 
 import asyncio
-import errno
 import logging
 import queue
 import subprocess
@@ -19,12 +18,10 @@ from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.logs.repair import start_repair
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.digest import LogDigest
-from monstertruckd.recorder.file import Entry
+from monstertruckd.recorder.file import Entry, disk_reason
 from monstertruckd.recorder.writer import LogWriter
 
 log = logging.getLogger(__name__)
-
-_FULL: Final = {errno.ENOSPC, errno.EDQUOT}
 
 _BATCH: Final = 256
 """Messages handed to the thread together; each hand-over makes both threads wait for the interpreter."""
@@ -178,8 +175,7 @@ class Recorder:
                     repair = start_repair(Path(self._config.directory))
                     self._write(writer)
             except OSError as error:
-                reason = Reason.DISK_FULL if error.errno in _FULL else Reason.RECORDING_FAILED
-                self._fail(reason, f"recording stopped: {error}")
+                self._fail(disk_reason(error), f"recording stopped: {error}")
             except Exception as error:
                 log.exception("recorder: bug")
                 self._fail(Reason.INTERNAL, f"recording stopped: {error!r}")

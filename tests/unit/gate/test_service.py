@@ -1,11 +1,12 @@
 import asyncio
+import threading
 from collections import deque
 from contextlib import asynccontextmanager
 
 import numpy as np
 import pytest
 
-from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
@@ -334,6 +335,45 @@ def test_the_latch_is_stored_even_if_the_service_ends_in_the_same_instant():
 
     on_bench(scenario, latch)
     assert latch.engaged()
+
+
+class SlowLatch(MemoryLatch):
+    """A disk that takes its time, in whatever thread."""
+
+    def __init__(self):
+        super().__init__()
+        self.release = threading.Event()
+        self.threads = []
+
+    def store(self, engaged):
+        self.threads.append(threading.current_thread())
+        assert self.release.wait(10)
+        super().store(engaged)
+
+
+def test_a_slow_disk_holds_up_the_end_of_the_service_but_neither_the_loop_nor_the_stop():
+    latch = SlowLatch()
+
+    async def main():
+        bench = Bench(WallClock(), latch)
+        serving = asyncio.create_task(bench.service.run(bench.ready))
+        await asyncio.sleep(0.05)
+        bench.order(Order.ESTOP)
+        while not latch.threads:
+            await asyncio.sleep(0.005)
+        serving.cancel()
+        await asyncio.sleep(0.05)
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+        assert Reason.SHUTDOWN in bench.out.state.last.reasons, "neutral was commanded"
+        assert not serving.done()
+        assert not latch.engaged()
+        latch.release.set()
+        with pytest.raises(asyncio.CancelledError):
+            await serving
+        assert latch.engaged(), "stored before the service ended"
+        assert threading.main_thread() not in latch.threads
+
+    asyncio.run(main())
 
 
 def test_after_quick_changes_of_mind_the_last_one_is_stored():

@@ -1,0 +1,61 @@
+"""What ran: versions of everything a log may have to be explained by."""
+
+import platform
+import shutil
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from monstertruckd import __version__
+
+PACKAGES: Final = ("eclipse-zenoh", "mcap", "numpy", "pydantic")
+ROOT: Final = Path(__file__).resolve().parents[1]
+PATIENCE: Final = 2.0
+"""Seconds git may take."""
+
+
+@cache
+def running_versions() -> Mapping[str, str]:
+    """This package, its libraries, the interpreter, the system, and the state of the checkout it runs from, if any."""
+    found = {
+        "monstertruckd": __version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "kernel": platform.release(),
+        "system": _system(),
+        **{name: text for name in PACKAGES if (text := _version(name)) is not None},
+    }
+    if (state := checkout(ROOT)) is not None:
+        found["git"] = state
+    return MappingProxyType(found)
+
+
+def checkout(root: Path) -> str | None:
+    """Commit of a git checkout, ``-dirty`` behind it if files differ; None if it is none, or git is not there."""
+    git = shutil.which("git")
+    if git is None or not (root / ".git").exists():
+        return None
+    command = [git, "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True)  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return told.stdout.strip()
+
+
+def _system() -> str:
+    try:
+        return platform.freedesktop_os_release().get("PRETTY_NAME", platform.system())
+    except OSError:
+        return platform.system()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,116 @@
+"""Stops of the whole daemon, told with their causes and kept in black boxes, on the virtual clock."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.event import Stop
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.logs import open_log
+from monstertruckd.recorder import black_boxes
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@cache
+def base(name: str) -> SimulatedTruckConfig:
+    return load_config(CONFIGS / f"{name}.yaml", SimulatedTruckConfig)[0]
+
+
+class Drive:
+    """A truck that drives its path, until something happens."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.rig = rig
+        self.clock: VirtualClock = rig.clock
+        self.operator = LocalOperator(rig.bus, rig.clock)
+        self._stops = rig.bus.subscribe(topics.STOP, fifo(64))
+        self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
+        self.stops: list[Stop] = []
+
+    async def begin(self, seconds: float = 1.5) -> None:
+        """Arm as soon as that is possible, then drive for so long."""
+        for _ in range(200):
+            await self.operator.order(Order.ARM)
+            await self.clock.sleep(0.1)
+            state = self._gate.latest
+            if state is not None and state.mode is GateMode.DRIVING:
+                await self.clock.sleep(seconds)
+                return
+        pytest.fail("does not drive")
+
+    def news(self) -> list[Stop]:
+        self.stops += self._stops.drain()
+        return self.stops
+
+
+def test_a_lost_hub_is_told_behind_the_stop_and_the_box_holds_what_led_to_it(tmp_path: Path):
+    config = with_overlay(base("full"), {"recorder": {"directory": str(tmp_path)}, "map": None})
+
+    async def main(clock: VirtualClock) -> list[Stop]:
+        rig = VirtualRig(config, clock)
+        drive = Drive(rig)
+        async with rig.running():
+            await drive.begin()
+            rig.computer.usb.lose_hub("1-2")
+            await clock.sleep(6.0)
+            assert [box.reason for box in black_boxes(tmp_path / "blackbox")] == ["scan_stale"]
+            return drive.news()
+
+    first, better = run_virtual(main)
+    assert [cause.reason for cause in first.causes] == [Reason.SCAN_STALE, Reason.DEVICE_LOST]
+    assert [(cause.reason, cause.because) for cause in better.causes] == [
+        (Reason.SCAN_STALE, 1),
+        (Reason.DEVICE_LOST, 2),
+        (Reason.HUB_LOST, None),
+    ]
+    assert first.number == better.number
+    assert first.black_box == better.black_box == "blackbox-000001-scan_stale.mcap"
+    assert first.holder == "tracker"
+    box = open_log(tmp_path / "blackbox" / "blackbox-000001-scan_stale.mcap")
+    heard = {message.topic for message in box}
+    assert box.damage is None
+    assert {"sensor/scan", "sensor/camera", "sensor/drive", "cmd/drive", "state/gate", "event/stop"} <= heard
+    assert box.attachments().keys() == {"config.json", "calibration.json", "origins.json", "versions.json"}
+    (log,) = tmp_path.glob("*.mcap")
+    saved = [m.decode() for m in open_log(log) if m.topic == "event/event" and b"black_box_saved" in m.payload]
+    assert [event.model_dump()["values"]["file"] for event in saved] == [first.black_box]
+
+
+def shutdown_after_estop(folder: Path) -> tuple[str, bytes]:
+    """Digest of the log and the black box of a run that ends in the instant of its emergency stop."""
+    config = with_overlay(base("demo"), {"recorder": {"directory": str(folder)}, "map": None})
+
+    async def main(clock: VirtualClock) -> str:
+        rig = VirtualRig(config, clock)
+        drive = Drive(rig)
+        async with rig.running():
+            await drive.begin()
+            await drive.operator.order(Order.ESTOP)
+        (stop,) = drive.news()
+        assert (stop.reason, stop.quick) == (Reason.ESTOP_REQUESTED, True)
+        return rig.daemon.digest.hexdigest()
+
+    digest = run_virtual(main)
+    (box,) = black_boxes(folder / "blackbox")
+    assert box.reason == "estop_requested"
+    messages = [message for message in open_log(box.path) if message.topic == "cmd/drive"]
+    assert b"quick_stop" in messages[-1].payload, "the farewell is in it"
+    return digest, b"".join(message.payload for message in open_log(box.path))
+
+
+def test_an_emergency_stop_and_the_end_at_once_leave_a_box_the_same_in_every_run(tmp_path: Path):
+    assert shutdown_after_estop(tmp_path / "a") == shutdown_after_estop(tmp_path / "b")

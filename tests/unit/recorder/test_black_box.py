@@ -1,0 +1,349 @@
+"""The minute before a trip, in a file of its own."""
+
+import asyncio
+import errno
+import json
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
+from monstertruck_runtime.threads import inline
+from monstertruck_schemas import topics as t
+from monstertruck_schemas.event import Cause, Event, Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import CompressedImage
+from monstertruck_schemas.state import ClockOffset, GateMode
+from monstertruckd.gate.stops import Trip
+from monstertruckd.logs import open_log
+from monstertruckd.recorder import BlackBox, BlackBoxConfig, black_boxes
+from monstertruckd.recorder import black_box as module
+from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.ring import OVERHEAD, Ring, Span
+from tests.unit.recorder.conftest import steering
+
+
+def trip(now, reason=Reason.SCAN_STALE, number=1):
+    cause = Cause(reason=reason, source="lidar", since=now, text=reason.text)
+    return Trip(
+        number=number,
+        at=now,
+        mode=GateMode.STOPPING,
+        causes=(cause,),
+        ordered=False,
+        quick=False,
+        holder="ann",
+        role=None,
+        speed=0.1,
+        stopping_distance=0.02,
+    )
+
+
+class Told(list):
+    """Collects events."""
+
+    def __call__(self, reason, severity, source, text="", **values):
+        self.append((reason, text, values))
+
+    @property
+    def reasons(self):
+        return [reason for reason, *_ in self]
+
+
+class Bench:
+    """A black box on the virtual clock, fed with 50 Hz of commands."""
+
+    def __init__(self, clock, folder, offload=inline, **config):
+        self.clock = clock
+        self.folder = folder
+        self.told = Told()
+        self.box = BlackBox(
+            BlackBoxConfig(**config),
+            folder,
+            clock,
+            self.told,
+            attachments={"config": {"robot": "truck"}, "versions": {"python": "3"}},
+            metadata={"robot": "truck"},
+            offload=offload,
+        )
+        self._seq = 0
+
+    def put(self, topic, message):
+        self.box.record(topic, message.stamp, wire.encode(topic, message))
+
+    async def drive(self, seconds):
+        for _ in range(round(seconds * 50)):
+            self._seq += 1
+            self.put(t.CMD_STEERING, steering(self.clock.now(), self._seq))
+            await self.clock.sleep(0.02)
+
+    def event(self, text):
+        now = self.clock.now()
+        self.put(
+            t.EVENT,
+            Event(stamp=now, received=now, seq=0, reason=Reason.OK, severity=Severity.INFO, source="x", text=text),
+        )
+
+    def trip(self, reason=Reason.SCAN_STALE, number=1):
+        return self.box.trip(trip(self.clock.now(), reason, number))
+
+    @property
+    def files(self):
+        return [box.path.name for box in black_boxes(self.folder)]
+
+
+def on_bench(folder, scenario, **config):
+    async def main(clock):
+        bench = Bench(clock, folder, **config)
+        async with bench.box:
+            await scenario(bench)
+        return bench
+
+    return run_virtual(main)
+
+
+def seconds(messages, topic="cmd/steering"):
+    times = [m.log_time for m in messages if m.topic == topic]
+    return times[0] / SECOND, times[-1] / SECOND
+
+
+def test_a_trip_saves_the_minute_before_and_five_seconds_after(tmp_path: Path):
+    async def scenario(bench):
+        bench.put(t.CLOCK, ClockOffset(stamp=1, received=1, seq=0, offset=5))
+        bench.event("long ago")
+        await bench.drive(100)
+        assert bench.trip() == "blackbox-000001-scan_stale.mcap"
+        assert bench.told == [], "it is not there yet"
+        await bench.drive(4.9)
+        assert bench.files == []
+        await bench.drive(0.2)
+        assert bench.files == ["blackbox-000001-scan_stale.mcap"]
+
+    bench = on_bench(tmp_path, scenario)
+    ((reason, text, values),) = bench.told
+    assert reason is Reason.BLACK_BOX_SAVED
+    assert text == "the minute before stop 1 is in blackbox-000001-scan_stale.mcap"
+    assert (values["file"], values["stop"]) == ("blackbox-000001-scan_stale.mcap", 1)
+    reader = open_log(tmp_path / bench.files[0])
+    messages = list(reader)
+    assert reader.damage is None
+    assert len(messages) == values["messages"]
+    first, last = seconds(messages)
+    assert (first, last) == (pytest.approx(41.0, abs=0.1), pytest.approx(106.0, abs=0.1))
+    assert [m.log_time for m in messages] == sorted(m.log_time for m in messages)
+    assert [m.decode().text for m in messages if m.topic == "event/event"] == ["long ago"], "events are kept longer"
+    assert [m.decode().offset for m in messages if m.topic == "state/clock"] == [5], (
+        "what is retained stands at its head"
+    )
+    assert json.loads(reader.attachments()["versions.json"]) == {"python": "3"}
+    run = reader.metadata()["run"]
+    assert (run["robot"], run["reason"], run["stops"], run["lost"]) == ("truck", "scan_stale", "1", "0")
+    assert int(run["stopped_at_ns"]) / SECOND == pytest.approx(101.0, abs=0.1)
+    assert run["text"] == "no fresh lidar scan"
+
+
+def test_two_virtual_runs_write_the_same_bytes(tmp_path: Path):
+    async def scenario(bench):
+        await bench.drive(3)
+        bench.trip()
+        await bench.drive(6)
+
+    told = [on_bench(tmp_path / name, scenario).told for name in ("a", "b")]
+    assert told[0] == told[1]
+    first, second = (next((tmp_path / name).iterdir()).read_bytes() for name in ("a", "b"))
+    assert first == second
+
+
+def test_a_trip_soon_after_another_shares_its_box(tmp_path: Path):
+    async def scenario(bench):
+        await bench.drive(1)
+        name = bench.trip(Reason.LEASE_EXPIRED)
+        await bench.drive(2)
+        assert bench.trip(Reason.ESTOP_REQUESTED, 2) == name
+        await bench.drive(4)
+        assert bench.files == [name]
+        assert open_log(tmp_path / name).metadata()["run"]["stops"] == "1,2"
+
+    on_bench(tmp_path, scenario)
+
+
+def test_repeated_trips_of_one_reason_are_rate_limited_others_are_not(tmp_path: Path):
+    async def scenario(bench):
+        names = []
+        for number in range(5):
+            await bench.drive(7)
+            names.append(bench.trip(Reason.TILT_STOP if number == 3 else Reason.SCAN_STALE, number))
+        assert [name is not None for name in names] == [True, False, False, True, False]
+        await bench.drive(62)
+        assert bench.trip() is not None
+        assert bench.trip(Reason.STOPPED) is None, "an order is no accident"
+
+    bench = on_bench(tmp_path, scenario)
+    assert [name[16:-5] for name in bench.files] == ["scan_stale", "tilt_stop", "scan_stale"]
+
+
+def test_what_is_due_at_the_end_is_written_before_it(tmp_path: Path):
+    async def scenario(bench):
+        await bench.drive(1)
+        bench.trip(Reason.ESTOP_REQUESTED)
+
+    bench = on_bench(tmp_path, scenario)
+    assert bench.told.reasons == [Reason.BLACK_BOX_SAVED]
+    assert len(list(open_log(tmp_path / bench.files[0]))) == 50
+
+
+def test_a_box_is_complete_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "blackbox-000007-tilt_stop.mcap.part").write_bytes(b"of a run that was killed")
+    seen = []
+
+    class Watched(LogFile):
+        def finish(self):
+            seen.append(sorted(path.name for path in tmp_path.iterdir()))
+            super().finish()
+
+    monkeypatch.setattr(module, "LogFile", Watched)
+
+    async def scenario(bench):
+        await bench.drive(0.1)
+        bench.trip()
+
+    on_bench(tmp_path, scenario)
+    assert seen == [["blackbox-000001-scan_stale.mcap.part"]]
+
+
+def test_a_full_disk_costs_the_box_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    class Full(LogFile):
+        def finish(self):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    async def scenario(bench):
+        await bench.drive(0.1)
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "LogFile", Full)
+            bench.trip()
+            await bench.drive(6)
+        assert bench.told == [
+            (Reason.DISK_FULL, "blackbox-000001-scan_stale.mcap is lost: No space left on device", {})
+        ]
+        assert list(tmp_path.iterdir()) == [], "no half of it is left"
+        bench.trip(Reason.TILT_STOP)
+        await bench.drive(6)
+
+    bench = on_bench(tmp_path, scenario)
+    assert bench.files == ["blackbox-000002-tilt_stop.mcap"], "it goes on"
+
+
+def test_a_folder_that_cannot_be_made_is_told_and_tried_again(tmp_path: Path):
+    blocked = tmp_path / "file"
+    blocked.touch()
+
+    async def scenario(bench):
+        assert bench.told.reasons == [Reason.RECORDING_FAILED]
+        blocked.unlink()
+        bench.trip()
+
+    assert on_bench(blocked, scenario).files == ["blackbox-000001-scan_stale.mcap"]
+
+
+def test_a_bug_while_writing_is_told_and_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+    async def scenario(bench):
+        monkeypatch.setattr(module, "LogFile", lambda *_: 1 / 0)
+        bench.trip()
+        await bench.drive(6)
+
+    assert on_bench(tmp_path, scenario).told.reasons == [Reason.INTERNAL]
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_the_oldest_boxes_go_but_the_newest_of_each_reason_stays(tmp_path: Path):
+    tmp_path.joinpath("notes.txt").write_text("not ours")
+
+    async def scenario(bench):
+        for number, reason in enumerate(
+            (Reason.TILT_STOP, Reason.SCAN_STALE, Reason.SCAN_STALE, Reason.DRIVE_STALE, Reason.SCAN_STALE)
+        ):
+            bench.trip(reason, number)
+            await bench.drive(6)
+
+    bench = on_bench(tmp_path, scenario, interval=0.0, quota_bytes=1)
+    assert [name[9:-5] for name in bench.files] == ["000001-tilt_stop", "000004-drive_stale", "000005-scan_stale"]
+    assert (tmp_path / "notes.txt").exists()
+    another = on_bench(tmp_path, scenario, quota_bytes=10**9)
+    assert another.files[-1][9:15] == "000008", "numbers go on over runs"
+
+
+def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(tmp_path: Path):
+    async def main():
+        bench = Bench(WallClock(), tmp_path, offload=module.in_thread, after=0.05)
+        writing = []
+        original = bench.box._write
+
+        def write(*arguments):
+            writing.append(threading.current_thread())
+            original(*arguments)
+
+        bench.box._write = write
+        async with bench.box:
+            for seq in range(640):
+                bench.put(t.CMD_STEERING, steering(bench.clock.now(), seq))
+            bench.trip()
+            while not bench.told:
+                await asyncio.sleep(0.01)
+        assert writing
+        assert threading.main_thread() not in writing
+        assert len(list(open_log(tmp_path / bench.files[0]))) == 640
+
+    asyncio.run(main())
+
+
+# The ring
+
+
+SPAN = Span(everything=65.0, journal=300.0, pictures=10.0, picture_period=0.5)
+
+
+def picture(now, size=1000):
+    image = CompressedImage(stamp=now, received=now, seq=0, data=b"\xff" * size, format="jpeg", sequence=0)
+    return Entry(t.CAMERA, now, now, 0, wire.encode(t.CAMERA, image))
+
+
+def command(now, size=100):
+    return Entry(t.CMD_DRIVE, now, now, 0, bytes(size))
+
+
+def test_old_pictures_are_thinned_out():
+    ring = Ring(SPAN, 1 << 30)
+    for number in range(15 * 100):
+        ring.add(picture(number * SECOND // 15))
+    times = [entry.log_time / SECOND for entry in ring.snapshot()]
+    newest = times[-1]
+    assert sum(time > newest - 10 for time in times) == pytest.approx(150, abs=1)
+    older = [time for time in times if time < newest - 10.01]
+    assert len(older) == pytest.approx(55 / 0.533, abs=3)
+    assert min(later - earlier for earlier, later in pairwise(older)) >= 0.5
+    assert times[0] >= newest - 65
+    assert ring.lost == 0
+
+
+def test_memory_is_bounded_and_pictures_go_first():
+    limit = 200_000
+    ring = Ring(SPAN, limit)
+    for number in range(600):
+        now = number * SECOND // 15
+        ring.add(picture(now))
+        ring.add(command(now))
+        assert ring.size <= limit
+    entries = ring.snapshot()
+    assert ring.size == sum(len(entry.payload) + OVERHEAD for entry in entries)
+    assert sum(entry.topic is t.CMD_DRIVE for entry in entries) < 600
+    assert sum(entry.topic is t.CAMERA for entry in entries) == 1, "the newest one"
+    assert ring.lost == 1200 - len(entries)
+    ring.add(command(40 * SECOND, 10 * limit))
+    assert len(ring.snapshot()) == 2, "the newest of each sort is kept whatever its size"
+
+
+def test_an_empty_ring_gives_nothing():
+    assert Ring(SPAN, 1000).snapshot() == []
