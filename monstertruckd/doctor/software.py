@@ -49,7 +49,7 @@ def configuration(patient: Patient) -> Iterator[Finding]:
         seen = "none named and none installed: devices were not looked at"
         yield warn("config", Reason.NOT_FOUND, seen, patient.command("doctor", "--config", "FILE"))
     elif patient.complaint is not None:
-        yield fail("config", Reason.BAD_CONFIG, patient.complaint, patient.command("check-config", str(file)))
+        yield fail("config", Reason.BAD_CONFIG, patient.complaint, patient.command("config", "show", str(file)))
     else:
         yield fine("config", str(file))
 

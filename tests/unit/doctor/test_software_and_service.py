@@ -72,7 +72,7 @@ def test_the_configuration_is_the_named_one_else_the_services(tmp_path: Path):
     assert found.reason is Reason.BAD_CONFIG
     assert "truck.yaml:3: speed: unknown key" in found.seen
     assert found.mend is not None
-    assert "check-config" in found.mend
+    assert " config show " in found.mend
 
     def nothing(ward: Ward) -> None:
         ward.patient = admit(ward.folder / "nowhere", PROGRAM, None, 0, ward.clock)
