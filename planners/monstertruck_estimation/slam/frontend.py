@@ -23,10 +23,18 @@ LEAST_SCORE: Final = 0.2
 """Mean likelihood under which the coarse search found nothing."""
 WINDOW: Final = 3.0
 """Half width of the coarse search in standard deviations of the guess."""
-WIDEST: Final = (1.5, 0.8)
+WIDEST: Final = (2.0, 1.6)
 """Most of that, m and rad."""
-CREDIBLE: Final = 4.5
+CREDIBLE: Final = 6.0
 """A match further off the guess than this many standard deviations is not believed."""
+DOUBTFUL: Final = 0.6
+"""Matches that overlap less are compared with one from further away."""
+LEAST_AFAR: Final = 0.5
+"""Overlap of a match that is believed from far away."""
+CLEARLY: Final = 0.15
+"""How much more it must overlap than the one close by."""
+WIDER: Final = 3.0
+"""How much further that search looks."""
 COARSE_POINTS: Final = 160
 """Points of a scan in the coarse search."""
 LEVELS: Final = 4
@@ -82,12 +90,25 @@ class FrontEnd(Protocol):
 
 
 class Planar:
-    """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior."""
+    """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
+
+    What does not fit there is searched for once more in a window ``WIDER`` times as wide, because wheels slip further than
+    any covariance says; a place found that way must fit better (``LEAST_AFAR``).
+    """
 
     def locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
         """See ``FrontEnd``."""
         if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
             return rejected(guess, covariance, Verdict.EMPTY)
+        match = self._locate(scan, guess, covariance, submap)
+        if match.accepted and match.overlap >= DOUBTFUL:
+            return match
+        again = self._locate(scan, guess, covariance * WIDER**2, submap)
+        if again.accepted and again.overlap >= max(LEAST_AFAR, match.overlap + CLEARLY):
+            return again
+        return match
+
+    def _locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
         deviation = deviations(covariance)
         window = min(WINDOW * deviation[0], WIDEST[0]), min(WINDOW * deviation[1], WIDEST[1])
         start = guess
@@ -97,9 +118,7 @@ class Planar:
             peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, LEAST_SCORE)
             if peak is not None:
                 start = peak.pose
-        prior = np.linalg.inv(covariance)
-        fit = register(scan, submap.cloud, guess, prior, start=start)
-        return judge(fit, guess, covariance)
+        return judge(register(scan, submap.cloud, guess, np.linalg.inv(covariance), start=start), guess, covariance)
 
 
 def judge(fit: Fit, guess: Array, covariance: Array) -> Match:

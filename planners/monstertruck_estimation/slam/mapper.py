@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.frontend import FrontEnd, Match, Planar, Verdict, deviations, rejected
+from monstertruck_estimation.slam.frontend import DOUBTFUL, LEAST_PAIRS, FrontEnd, Match, Planar, Verdict, deviations, rejected
 from monstertruck_estimation.slam.graph import drift, optimise
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan
@@ -79,6 +79,7 @@ class Mapper:
         self._stamp: int | None = None
         self._delta = np.zeros(3)
         self._dt = 0.0
+        self._doubts = 0
         self._closer = LoopCloser(self.config)
 
     def step(self, scan: Scan, stamp: int, odom: Array | None = None) -> Step | None:
@@ -100,6 +101,8 @@ class Mapper:
             match = rejected(guess, covariance, Verdict.EMPTY)
         else:
             match = self._front.locate(scan, guess, covariance, self._submap)
+        doubtful = not match.accepted or match.overlap < DOUBTFUL
+        self._doubts = self._doubts + 1 if doubtful else 0
         self._dt = 0.0 if self._stamp is None else (stamp - self._stamp) / 1e9
         self._delta = between(self._pose, match.pose)
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
@@ -125,9 +128,7 @@ class Mapper:
             delta = between(self._odom, np.asarray(odom, dtype=float))
             way = math.hypot(delta[0], delta[1])
             place = math.hypot(config.odometry_floor[0], config.odometry_distance * way)
-            turn = math.hypot(
-                config.odometry_floor[1], config.odometry_turn[0] * delta[2], config.odometry_turn[1] * way
-            ) if False else math.sqrt(
+            turn = math.sqrt(
                 config.odometry_floor[1] ** 2
                 + (config.odometry_turn[0] * delta[2]) ** 2
                 + (config.odometry_turn[1] * way) ** 2
@@ -151,7 +152,7 @@ class Mapper:
             moved = between(self.poses[-1], self._pose)
             if math.hypot(moved[0], moved[1]) < config.key_distance and abs(moved[2]) < config.key_turn:
                 return tuple(events)
-        if len(scan) < 12:
+        if len(scan) < LEAST_PAIRS or (self.keys and 0 < self._doubts < 3):
             return tuple(events)
         thinned = scan.thinned(config.key_cell, config.key_points)
         self.keys.append(Key(stamp, thinned, Cloud.of(thinned)))
