@@ -32,6 +32,8 @@ from monstertruckd.demo.wall import connect, free_endpoint, program, write_overl
 
 FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
 GOAL = 0.5
+SLOWEST = 14.0
+"""Pictures a second below which the camera was not really running."""
 PERIOD = 20_000_000
 WARM_UP = 6.0
 
@@ -86,10 +88,8 @@ async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
         "without_p99_ms": p99[False],
         "with_p99_ms": p99[True],
         "added_ms": added,
-        "goal_ms": GOAL,
         "pictures_per_s": rate,
         "rounds": rounds,
-        "ok": added <= GOAL and rate > 14,
     }
 
 
@@ -113,7 +113,10 @@ def main() -> None:
     result = run_wall(lambda clock: compare(clock, rounds, seconds))
     median, most = loop_cost()
     print(f"one picture takes {median:.3f} ms of the daemon's loop, {most:.3f} ms at most")
-    print(json.dumps(result | {"loop_ms": median, "loop_max_ms": most}))
+    figures = result | {"loop_ms": median, "loop_max_ms": most}
+    met = result["added_ms"] <= GOAL and result["pictures_per_s"] > SLOWEST
+    goals = {"added_ms": GOAL, "pictures_per_s": SLOWEST}
+    print(json.dumps({"bench": "camera", "figures": figures, "goals": goals, "met": met}))
 
 
 if __name__ == "__main__":
