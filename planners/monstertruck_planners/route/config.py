@@ -33,19 +33,19 @@ class GoalConfig(Schema):
 
 
 class DriveCosts(GoalConfig):
-    """What a metre costs, for planners of drivable motions."""
+    """What a metre costs, for planners of drivable motions. As they stand, routes are the shortest ones, nearly."""
 
-    reverse_cost: AtLeastOne = 1.02
-    """Of a metre backward, m."""
+    reverse_cost: AtLeastOne = 1.0
+    """Of a metre backward, m; above 1 for a truck that sees better ahead."""
     cusp_cost: NotNegative = 0.1
     """Of a change of direction, m."""
     swing_cost: NotNegative = 0.01
     """Of a change of curvature, m: few long arcs rather than many short ones."""
-    crab_cost: AtLeastOne = 1.02
+    crab_cost: AtLeastOne = 1.0
     """Of a metre beside the heading, m."""
     clearance: NotNegative = 0.1
     """Nearer to obstacles than this a metre costs more, m."""
-    clearance_cost: NotNegative = 0.2
+    clearance_cost: NotNegative = 0.1
     """Extra cost of a metre in contact, falling to 0 at ``clearance``, m."""
     tilt_cost: NotNegative = 2.0
     """Extra cost of a metre for each radian of tilt, m."""

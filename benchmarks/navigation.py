@@ -1,0 +1,45 @@
+"""Navigation against its peers: motions, routes, deformation, tracking, whole runs.
+
+    python benchmarks/navigation.py [--data DIR] [--only PART ...] [--quick]
+
+DIR holds ``maps/NAME.yaml`` and ``planning/queries.json``. Times are processor time of the calling thread. Plots go to
+runs/navigation. The last line is JSON.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from navigation_parts import Options, Part
+
+PARTS = sorted(p.stem for p in (Path(__file__).parent / "navigation_parts").glob("[a-z]*.py"))
+OUT = Path(__file__).resolve().parents[1] / "runs" / "navigation"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=None)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--quick", action="store_true", help="fewer runs, for a look")
+    arguments = parser.parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    options = Options(arguments.data, OUT, arguments.quick)
+    whole = Part()
+    for name in arguments.only:
+        part = importlib.import_module(f"navigation_parts.{name}").run(options)
+        for key, value in part.figures.items():
+            whole.figures[f"{name}.{key}"] = value
+        for key, value in part.goals.items():
+            whole.goals[f"{name}.{key}"] = value
+    result = {"bench": "navigation", "figures": whole.figures, "goals": whole.goals, "met": whole.met}
+    (OUT / "navigation.json").write_text(json.dumps(result, indent=1))
+    print(json.dumps(result))
+    return 0 if whole.met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""Parts of the navigation benchmark: each a module with ``run(options) -> Part``."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says."""
+
+    data: Path | None
+    """Folder with ``maps`` and ``planning``; None: only what needs no data."""
+    out: Path
+    """Folder for plots."""
+    quick: bool = False
+
+
+@dataclass
+class Part:
+    """What a part found: every goal is an upper bound of the figure of the same name."""
+
+    figures: dict[str, float] = field(default_factory=dict)
+    goals: dict[str, float] = field(default_factory=dict)
+
+    def add(self, name: str, figure: float, goal: float | None = None) -> None:
+        self.figures[name] = round(figure, 6)
+        if goal is not None:
+            self.goals[name] = goal
+
+    @property
+    def met(self) -> bool:
+        return all(self.figures[name] <= goal for name, goal in self.goals.items())
