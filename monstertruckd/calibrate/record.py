@@ -50,6 +50,8 @@ class Estimate(Schema):
     """What the value is, and what its interval covers"""
     key: str | None = None
     """Place in the configuration that it sets; None: for information only"""
+    date: str = ""
+    """When it was measured, UTC by the robot's clock; set when it is saved"""
 
 
 class Result(Schema):
@@ -57,7 +59,7 @@ class Result(Schema):
 
     wizard: WizardName
     date: str = ""
-    """UTC, by the robot's clock; set when it is saved"""
+    """Of the newest estimate; set when it is saved"""
     measured: str
     """What was done, in a sentence"""
     confidence: float = CONFIDENCE
@@ -67,8 +69,18 @@ class Result(Schema):
     """What this measurement cannot tell"""
     readings: tuple[tuple[float, ...], ...] = ()
     """Raw readings that a later run may use again; their meaning is the wizard's"""
+    partial: bool = False
+    """Only these were measured: what the run before found beside them stays"""
     again: str | None = None
-    """Why the wizard has to be run once more after a restart of the daemon"""
+    """What has to be done before the calibration is complete"""
+
+    def over(self, before: "Result | None", date: str) -> "Result":
+        """This result as it is saved on ``date``, with what it keeps of the one ``before``."""
+        fresh = tuple(estimate.model_copy(update={"date": date}) for estimate in self.estimates)
+        names = {estimate.name for estimate in fresh}
+        old = before.estimates if self.partial and before is not None else ()
+        kept = tuple(estimate for estimate in old if estimate.name not in names)
+        return self.model_copy(update={"date": date, "estimates": fresh + kept})
 
     def estimate(self, name: str) -> Estimate | None:
         """The estimate of that name."""

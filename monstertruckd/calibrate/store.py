@@ -86,8 +86,10 @@ class CalibrationStore:
             ConfigError: the newest file is damaged, or the new one cannot be written; nothing has changed then.
         """
         with self._writing:
-            dated = result.model_copy(update={"date": utc(real_ns)})
-            return self._write({result.wizard: dated}, f"{result.wizard} calibrated", real_ns)
+            current = self.current()
+            before = current.results.get(result.wizard) if current is not None else None
+            saved = result.over(before, utc(real_ns))
+            return self._write({result.wizard: saved}, f"{result.wizard} calibrated", real_ns)
 
     def undo(self, wizard: WizardName, real_ns: int) -> Path:
         """Write a new file with the wizard's result as it was before its last change; returns its path.

@@ -1,0 +1,89 @@
+"""Intervals from few measurements."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_T: Final = (
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
+    2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+)  # fmt: skip
+"""Student's t for 95 % both sides, by degrees of freedom from 1 on."""
+
+NORMAL: Final = 1.960
+
+
+def student(freedom: int) -> float:
+    """Half-width of a 95 % interval in standard errors, for a spread known from so many degrees of freedom.
+
+    Raises:
+        ValueError: less than one degree of freedom.
+    """
+    if freedom < 1:
+        raise ValueError(f"freedom is {freedom}: expected at least 1")
+    return _T[freedom - 1] if freedom <= len(_T) else NORMAL + 2.4 / freedom
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A value and half the width of its 95 % interval."""
+
+    value: float
+    half: float
+
+    @property
+    def low(self) -> float:
+        """Lower end."""
+        return self.value - self.half
+
+    @property
+    def high(self) -> float:
+        """Upper end."""
+        return self.value + self.half
+
+    def widened(self, bound: float) -> "Interval":
+        """With a systematic error of at most ``bound`` on top, either way."""
+        return Interval(self.value, self.half + bound)
+
+    def times(self, factor: float) -> "Interval":
+        """Of the value times an exact factor."""
+        return Interval(self.value * factor, self.half * abs(factor))
+
+
+def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
+    """Mean of repeated measurements.
+
+    Args:
+        values: (n,), n > 1.
+        least_error: standard deviation of one measurement that is known to be there, however well the values happen to
+            agree.
+    """
+    data = np.asarray(values, dtype=np.float64)
+    count = data.size
+    spread = student(count - 1) * float(data.std(ddof=1))
+    return Interval(float(data.mean()), max(spread, NORMAL * least_error) / math.sqrt(count))
+
+
+def correlation_factor(residuals: NDArray[np.float64]) -> float:
+    """By how much slow errors inflate the standard error of a fit: root of the integrated autocorrelation, at least 1.
+
+    The sum ends at the first correlation below zero (Sokal's window, simplified).
+
+    Args:
+        residuals: (n,), in the order of time.
+    """
+    centred = residuals - residuals.mean()
+    power = float(centred @ centred)
+    if power == 0.0 or centred.size < 4:
+        return 1.0
+    total = 1.0
+    for lag in range(1, centred.size // 2):
+        correlation = float(centred[lag:] @ centred[:-lag]) / power
+        if correlation <= 0.0:
+            break
+        total += 2.0 * correlation
+    return math.sqrt(total)
