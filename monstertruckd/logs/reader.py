@@ -1,5 +1,6 @@
 """Reading MCAP logs front to back, finished or not."""
 
+import itertools
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -133,6 +134,10 @@ class LogReader:
                     self.damage = f"message of an unknown channel before byte {at} of {size}"
                     return
                 yield record
+
+    def preamble(self) -> Iterator[McapRecord]:
+        """The records before the first message: the recorder writes attachments and metadata there."""
+        return itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
 
     @property
     def size(self) -> int:

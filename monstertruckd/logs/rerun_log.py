@@ -1,5 +1,6 @@
 """A log as a rerun recording: scans, map, path, frames, pictures, states, events and plots, with their layout."""
 
+import json
 import math
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from mcap.records import Attachment
 
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.errors import InputError
@@ -32,8 +34,8 @@ _CAMERA: Final = "camera"
 _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", "Lateness of the control tick")
 """Figures that are in view when the recording opens."""
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
-_BODY: Final = (0.47, 0.34, 0.15)
-"""Size of the truck's box, m, where the log's configuration does not tell."""
+_HEIGHT: Final = 0.15
+"""Of the truck's box, m: no configuration tells it."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 
 
@@ -59,6 +61,7 @@ def convert(log: str | Path, output: str | Path, selection: Selection = ALL, pro
         stream.save(output)
         stream.send_recording_name(reader.path.name)
         scene = Scene(stream, offset)
+        scene.truck(reader)
         for entry, message in selection.of(reader, progress):
             scene.take(entry.topic, entry.log_time, message)
         scene.finish()
@@ -102,7 +105,18 @@ class Scene:
             t.EVENT.name: self._event,
             t.STOP.name: self._stop,
         }
-        self._truck()
+
+    def truck(self, reader: LogReader) -> None:
+        """A box of the size in the log's configuration; logs without one show none."""
+        found = (r.data for r in reader.preamble() if isinstance(r, Attachment) and r.name == "config.json")
+        geometry = json.loads(next(found, b"{}")).get("geometry", {})
+        length, width = geometry.get("length"), geometry.get("width")
+        if length is None or width is None:
+            return
+        box = rr.Boxes3D(sizes=[(length, width, _HEIGHT)], centers=[(0.0, 0.0, _HEIGHT / 2)], colors=_TRUCK)
+        self._stream.log("truck", rr.CoordinateFrame("base"), box, static=True)
+        ahead = rr.Arrows3D(vectors=[(length, 0.0, 0.0)], origins=[(0.0, 0.0, _HEIGHT)], colors=_TRUCK, radii=0.012)
+        self._stream.log("truck/ahead", rr.CoordinateFrame("base"), ahead, static=True)
 
     def take(self, topic: str, log_time: int, message: Message) -> None:
         """Show one message at its log time."""
@@ -141,12 +155,6 @@ class Scene:
         if is_plausible(times[0] + self._offset):
             return rr.TimeColumn(TIMELINE, timestamp=(instants + self._offset).astype("datetime64[ns]"))
         return rr.TimeColumn(TIMELINE, duration=instants.astype("timedelta64[ns]"))
-
-    def _truck(self) -> None:
-        box = rr.Boxes3D(sizes=[_BODY], centers=[(0.0, 0.0, _BODY[2] / 2)], colors=_TRUCK)
-        self._stream.log("truck", rr.CoordinateFrame("base"), box, static=True)
-        ahead = rr.Arrows3D(vectors=[(_BODY[0], 0.0, 0.0)], origins=[(0.0, 0.0, _BODY[2])], colors=_TRUCK, radii=0.012)
-        self._stream.log("truck/ahead", rr.CoordinateFrame("base"), ahead, static=True)
 
     def _scan(self, scan: LaserScan) -> None:
         points = scan_points(scan, (0.0, 0.0, 0.0))
@@ -224,7 +232,7 @@ def blueprint(entities: Collection[str]) -> rrb.Blueprint:
     Args:
         entities: what the recording has of signals and pictures; the rest gets no room.
     """
-    eye = rrb.EyeControls3D(position=(0.0, -0.5, 9.0), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 1.0, 0.0))
+    eye = rrb.EyeControls3D(position=(0.0, -0.4, 6.5), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 1.0, 0.0))
     place = rrb.Spatial3DView(
         name="Place",
         origin="/",
@@ -255,4 +263,10 @@ def blueprint(entities: Collection[str]) -> rrb.Blueprint:
 
 
 def _plot(figure: Figure) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(name=f"{figure.title}, {figure.unit}", origin=f"/signals/{_part(figure.title)}")
+    whole = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    return rrb.TimeSeriesView(
+        name=f"{figure.title}, {figure.unit}",
+        origin=f"/signals/{_part(figure.title)}",
+        axis_x=rrb.TimeAxis(view_range=whole),
+        plot_legend=rrb.Corner2D.RightTop,
+    )

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from mcap.records import Attachment, Header, Metadata
-from mcap.records import Message as McapMessage
 from mcap.writer import Writer
 
 from monstertruck_runtime import wire
@@ -84,13 +83,11 @@ def _begin(writer: Writer, reader: LogReader, offset: int) -> None:
     """Header, attachments and what is known of the run."""
     library = ""
     records: list[Attachment | Metadata] = []
-    for record in reader.records():
+    for record in reader.preamble():
         if isinstance(record, Header):
             library = record.library
         elif isinstance(record, Attachment | Metadata):
             records.append(record)
-        elif isinstance(record, McapMessage):
-            break
     writer.start(library=library)
     for record in records:
         if isinstance(record, Metadata):

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcap.records import Attachment, Header, Metadata
-from mcap.records import Message as McapMessage
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -56,6 +55,8 @@ class Run:
     states: States = field(default_factory=States)
     events: list[Event] = field(default_factory=list)
     event_counts: dict[Severity, int] = field(default_factory=lambda: dict.fromkeys(Severity, 0))
+    stops: dict[int, Stop] = field(default_factory=dict)
+    """By number, each as it was told last."""
     drops: int = 0
     """Messages lost in the daemon's bounded queues, as it last counted them."""
     way: Way = field(default_factory=Way)
@@ -102,6 +103,7 @@ class Collector:
                 self._on(curve.topic.name, _plotter(curve, trace))
         takers: tuple[tuple[Topic[Any], Callable[[int, Any], None]], ...] = (
             (t.EVENT, self._event),
+            (t.STOP, self._stop),
             (t.CLOCK, self._clock),
             (t.ODOMETRY, self._odometry),
             (t.POSE, self._pose),
@@ -144,6 +146,10 @@ class Collector:
         counts[event.severity] += 1
         if counts[event.severity] <= _EVENTS:
             self._run.events.append(event)
+
+    def _stop(self, _: int, stop: Stop) -> None:
+        if stop.number in self._run.stops or len(self._run.stops) < _EVENTS:
+            self._run.stops[stop.number] = stop
 
     def _clock(self, _: int, clock: ClockOffset) -> None:
         self._run.offset = clock.offset
@@ -205,7 +211,7 @@ def collect(path: str | Path, progress: Progress | None = None) -> Run:
 def _describe(run: Run, reader: LogReader) -> None:
     """What stands before the first message: attachments, library, and the offset the run began with."""
     began = 0
-    for record in reader.records():
+    for record in reader.preamble():
         match record:
             case Header():
                 run.library = record.library
@@ -214,8 +220,6 @@ def _describe(run: Run, reader: LogReader) -> None:
                     run.attachments[record.name.removesuffix(".json")] = json.loads(record.data)
             case Metadata(name="run"):
                 began = int(record.metadata.get("real_offset_ns", 0))
-            case McapMessage():
-                break
     if run.offset is None:
         run.offset = began
 

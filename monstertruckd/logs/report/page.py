@@ -10,7 +10,7 @@ from typing import Any
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruckd.logs.report.collect import Run, collect
 from monstertruckd.logs.report.drawing import SEVERITY_TONE, Lines, plots, plotted, scene, timeline
@@ -95,6 +95,7 @@ def page(run: Run) -> str:
             '<div class="pair">',
             f'<div><h2>Way</h2><div class="card map">{scene(run) or "No poses and no scans in this log."}</div></div>',
             f'<div><h2>Events</h2><div class="card events">{_events(run)}</div></div></div>',
+            _stops(run),
             f'<h2>States</h2><div class="card">{timeline(run)}</div>',
             f'<h2>Signals</h2><div class="card plots">{plots(run, chosen)}</div>' if chosen else "",
             _services(run),
@@ -175,6 +176,42 @@ def _event(run: Run, event: Event) -> str:
 
 def _short(value: float | str | bool | None) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _stops(run: Run) -> str:
+    """Every stop with the chain of what was behind it."""
+    rows = "".join(_stop(run, stop) for stop in run.stops.values())
+    return f'<h2>Stops</h2><div class="card stops">{rows}</div>' if rows else ""
+
+
+def _stop(run: Run, stop: Stop) -> str:
+    tone = Tone.CALM if stop.ordered else Tone.BAD
+    seconds = max(stop.stamp - run.start, 0) / SECOND
+    speed = "" if stop.speed is None else f" at {stop.speed:.2f} m/s"
+    facts = [f"{'quick stop' if stop.quick else 'ramp'}{speed}", f"{stop.stopping_distance:.2f} m to go"]
+    if stop.black_box is not None:
+        facts.append(stop.black_box)
+    causes = "".join(f"<li>{_cause(run, cause)}</li>" for cause in stop.causes)
+    return (
+        f'<div data-at="{1e3 * seconds:.0f}"><time>{clock_text(seconds, 2)}</time>'
+        f'<span class="dot {tone.name.lower()}"></span><b>{escape(stop.text)}</b> '
+        f"<small>{escape(', '.join(facts))}</small><ol>{causes}</ol></div>"
+    )
+
+
+def _cause(run: Run, cause: Cause) -> str:
+    since = clock_text(max(cause.since - run.start, 0) / SECOND, 2)
+    measured = ", ".join(
+        f"{m.name} {'unknown' if m.value is None else f'{m.value:.4g}'}"
+        + (f" (limit {m.limit:.4g})" if m.limit is not None else "")
+        + (f" {m.unit}" if m.unit else "")
+        for m in cause.measurements
+    )
+    behind = "" if cause.because is None else f" because of {cause.because + 1}"
+    return (
+        f"{escape(cause.source)}: {escape(cause.text)} <code>{escape(cause.reason.value)} since {since}"
+        f"{behind}</code>" + (f" <small>{escape(measured)}</small>" if measured else "")
+    )
 
 
 def _services(run: Run) -> str:

@@ -12,7 +12,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -41,6 +41,24 @@ def event(now, severity, text):
         source="hub",
         text=text,
         values={"n": 3},
+    )
+
+
+def stop(now):
+    far = Measurement(name="clearance", value=0.12, unit="m", limit=0.2, age=0.03)
+    first = Cause(reason=Reason.SCAN_STALE, source="lidar", since=now - SECOND, text="no <scan>", because=1)
+    behind = Cause(reason=Reason.HUB_LOST, source="usb", since=now - 2 * SECOND, text="hub gone", measurements=(far,))
+    return Stop(
+        stamp=now,
+        received=now,
+        seq=0,
+        number=1,
+        reason=Reason.SCAN_STALE,
+        mode=GateMode.STOPPING,
+        quick=True,
+        causes=(first, behind),
+        black_box="box-1.mcap",
+        text="stopped: no scan because of the hub",
     )
 
 
@@ -129,6 +147,19 @@ def test_page_tells_events_states_losses_and_config(log):
     for title in ("Speed", "Cross-track error", "Yaw", "Rates of the devices"):
         assert f"<b>{title}</b>" in text
     assert "<b>Battery</b>" not in text
+
+
+def test_stops_are_told_with_their_chain(tmp_path):
+    file = tmp_path / "run.mcap"
+    writer = Writer(file)
+    writer.put(t.GATE, gate(SECOND, 0))
+    writer.put(t.STOP, stop(5 * SECOND))
+    writer.log.finish()
+    text = report(file).file.read_text()
+    assert "stopped: no scan because of the hub" in text
+    assert "quick stop, 0.00 m to go, box-1.mcap" in text
+    assert "lidar: no &lt;scan&gt; <code>scan_stale since 0:03.00 because of 2</code>" in text
+    assert "clearance 0.12 (limit 0.2) m" in text
 
 
 def test_cursor_data_belongs_to_the_plots(log):

@@ -29,7 +29,7 @@ GOLDEN = sorted((Path(__file__).parents[2] / "data" / "golden").glob("*/run.mcap
 @pytest.fixture
 def log(tmp_path):
     file = tmp_path / "run-000001-000.mcap"
-    writer = Writer(file)
+    writer = Writer(file, config={"geometry": {"length": 0.5, "width": 0.3}})
     writer.put(t.CLOCK, clock(SECOND))
     writer.put(t.MAP, grid(SECOND, 0))
     writer.put(t.PATH, path(SECOND, 0))
