@@ -1,7 +1,7 @@
 """Plays a log back on Zenoh, on the log's own clock."""
 
 import asyncio
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from monstertruck_runtime.clock import ReplayClock, run_replay
@@ -15,10 +15,25 @@ from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.logs import open_log
 
 
-def replay_log(log: Path, robot: str, endpoint: str, speed: float, topics: Collection[str] | None) -> int:
+def replay_log(
+    log: Path,
+    robot: str,
+    endpoint: str,
+    speed: float,
+    topics: Collection[str] | None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> int:
     """Publish the messages of ``log`` at their own times; returns how many.
 
     Requests are left out: they came from outside and would reach nobody.
+
+    Args:
+        log: file to read.
+        robot: name to publish under.
+        endpoint: where to listen.
+        speed: multiple of real time.
+        topics: only these; none = all.
+        progress: told the bytes of the log read so far.
 
     Raises:
         NotFoundError: no such log, or an unknown topic.
@@ -48,6 +63,7 @@ def replay_log(log: Path, robot: str, endpoint: str, speed: float, topics: Colle
                 topic = BY_NAME.get(entry.topic)
                 if topic is None or topic.writer is Writer.OUTSIDE or (topics and entry.topic not in topics):
                     continue
+                progress(reader.position)
                 await clock.sleep_until(entry.log_time)
                 bus.hand_over(topic, entry.decode())
                 count += 1

@@ -1,20 +1,29 @@
 """Commands on single devices: emulate one on a pty, probe one on a port."""
 
-import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.cli.options import complete_device
+from monstertruckd.cli.output import JsonOption, finish, print_json, print_table, remark, until_stopped
 
 DeviceArgument = Annotated[
     str,
     typer.Argument(
-        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; probe: battery, link, host."
+        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; probe: battery, link, host.",
+        autocompletion=complete_device,
     ),
 ]
+
+OWN_CLIENTS: Final = {
+    "camera": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks"
+}
+"""What an emulator's link is not, by role."""
 
 
 def emulate(
@@ -28,15 +37,18 @@ def emulate(
     [b]line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE[/b], or a fault of the device itself
     (an unknown word lists them).
     """
+    from monstertruckd.catalog import find_kind
     from monstertruckd.sim.console import FaultConsole
     from monstertruckd.sim.single import emulate_device
 
     async def main(clock: Clock) -> None:
         async with emulate_device(device, link, clock, seed) as emulated:
-            typer.echo(f"{device} on {link}; faults on standard input, Ctrl-C ends", err=True)
+            remark(f"{device} on {link}; faults on standard input, Ctrl-C ends")
+            if (limits := OWN_CLIENTS.get(find_kind(device).role)) is not None:
+                remark(f"{device}: {limits}")
             await FaultConsole({device: emulated}, sys.stdin, typer.echo).run()
 
-    run_wall(main)
+    until_stopped(main)
 
 
 def probe(
@@ -46,10 +58,11 @@ def probe(
         typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar; of a camera also a pattern."),
     ] = None,
     baud: Annotated[int | None, typer.Option(help="Bits per second; default: the device's own.")] = None,
+    json_output: JsonOption = False,
 ) -> None:
-    """Handshake with a device and print its identity, state and first samples as JSON. Moves nothing."""
+    """Handshake with a device and print its identity, state and first samples. Moves nothing."""
     from monstertruck_drivers.link import SerialPort
-    from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.errors import InputError, NotFoundError
     from monstertruckd.catalog import find_kind
 
     kind = find_kind(device)
@@ -65,4 +78,28 @@ def probe(
             return await kind.probe()(str(port))
         return await kind.probe()(SerialPort(port, baud or kind.baud), clock)
 
-    typer.echo(json.dumps(run_wall(main), indent=2, default=str))
+    report = run_wall(main)
+    found = [entry for entries in report.values() if isinstance(entries, list) for entry in entries]
+    if kind.asked == "path" and port is not None and not found:
+        raise NotFoundError(f"{port}: no such {kind.role}")
+    if json_output:
+        print_json(report)
+    else:
+        print_table(("what", "value"), list(_rows(report, "")))
+    errors = [entry["error"] for entry in found if isinstance(entry, dict) and "error" in entry]
+    if errors and len(errors) == len(found):
+        finish(Reason.DEVICE_FAULT, "\n".join(errors))
+
+
+def _rows(value: Any, name: str) -> Iterator[tuple[str, str]]:
+    """Every single value of a report under its dotted name."""
+    if isinstance(value, dict) and value:
+        for key, inner in value.items():
+            yield from _rows(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple) and any(isinstance(inner, dict | list | tuple) for inner in value):
+        for index, inner in enumerate(value):
+            yield from _rows(inner, f"{name}.{index}")
+    elif isinstance(value, list | tuple):
+        yield name, ", ".join(map(str, value)) or "-"
+    else:
+        yield name, "-" if value is None else str(value)

@@ -1,9 +1,9 @@
 """Commands on logs: look inside, repair, export, play back."""
 
-import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.cli.options import ENDPOINT, complete_topic
-from monstertruckd.cli.output import JsonOption, print_json, progress
+from monstertruckd.cli.output import JsonOption, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
     from monstertruckd.logs.selection import Progress, Selection
@@ -38,44 +38,82 @@ class ExportFormat(StrEnum):
 LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.", show_default=False)]
 
 
-@app.command("info")
-def info_command(log: LogArgument, json_output: Annotated[bool, typer.Option("--json")] = False) -> None:
-    """What a log holds: topics, counts, rates, attachments, damage."""
-    from rich.console import Console
-    from rich.table import Table
+@app.command("list")
+def list_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of logs, with all folders in it.")] = Path("logs"),
+    json_output: JsonOption = False,
+) -> None:
+    """The logs of a folder: when, how long, how much, finished or not."""
+    from monstertruckd.logs.listing import LogState, list_logs
 
+    logs = list_logs(folder)
+    if json_output:
+        print_json([asdict(log) for log in logs])
+        return
+    if not logs:
+        remark(f"{folder}: no logs")
+        return
+    print_table(
+        ("log", "begins (UTC)", "seconds", "messages", "MB", "state"),
+        [
+            (
+                str(log.path),
+                log.started or "-",
+                "-" if log.duration is None else f"{log.duration:.1f}",
+                "-" if log.messages is None else str(log.messages),
+                f"{log.size / 1e6:.2f}",
+                log.state.value,
+            )
+            for log in logs
+        ],
+        right=("seconds", "messages", "MB"),
+    )
+    if any(log.state is LogState.UNFINISHED for log in logs):
+        remark("`monstertruckd log recover FILE` finishes an unfinished log")
+
+
+@app.command("info")
+def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
+    """What a log holds: topics, counts, rates, attachments, damage."""
     from monstertruckd.logs import info
 
     summary = info(log)
     if json_output:
-        typer.echo(json.dumps(summary, indent=2))
+        print_json(summary)
         return
-    console = Console()
-    console.print(f"[bold]{log}[/bold]  {summary['size'] / 1e6:.2f} MB, {summary['duration']:.1f} s, ", end="")
-    console.print(f"{summary['messages']} messages")
+    size = f"{summary['size'] / 1e6:.2f} MB"
+    print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
     if summary["damage"]:
-        console.print(f"[yellow]damaged: {summary['damage']}; `monstertruckd log recover` repairs it[/yellow]")
-    table = Table(box=None, header_style="bold")
-    for heading in ("topic", "schema", "messages", "Hz", "kB"):
-        table.add_column(heading, justify="left" if heading in ("topic", "schema") else "right")
-    for name, row in summary["topics"].items():
-        rate = "" if row["rate"] is None else f"{row['rate']:.1f}"
-        table.add_row(name, row["schema"], str(row["messages"]), rate, f"{row['bytes'] / 1e3:.1f}")
-    console.print(table)
-    for name, size in summary["attachments"].items():
-        console.print(f"attached: {name} ({size} bytes)")
+        print(f"damaged: {summary['damage']}; `monstertruckd log recover` repairs it")
+    rows = [
+        (
+            name,
+            row["schema"],
+            str(row["messages"]),
+            "" if row["rate"] is None else f"{row['rate']:.1f}",
+            f"{row['bytes'] / 1e3:.1f}",
+        )
+        for name, row in summary["topics"].items()
+    ]
+    print_table(("topic", "schema", "messages", "Hz", "kB unpacked"), rows, right=("messages", "Hz", "kB unpacked"))
+    for name, bytes_ in summary["attachments"].items():
+        print(f"attached: {name} ({bytes_} bytes)")
 
 
 @app.command("recover")
 def recover_command(
     log: LogArgument,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Default: repaired in place.")] = None,
+    json_output: JsonOption = False,
 ) -> None:
     """Repair an unfinished or truncated log: everything up to the first error is kept."""
     from monstertruckd.logs import recover
 
     done = recover(log, output or log)
-    typer.echo(f"{done.path}: {done.messages} messages kept" + (f"; {done.damage}" if done.damage else ", was sound"))
+    if json_output:
+        print_json(asdict(done))
+    else:
+        print(f"{done.path}: {done.messages} messages kept" + (f"; {done.damage}" if done.damage else ", was sound"))
 
 
 @app.command("report")
@@ -190,8 +228,12 @@ def replay(
     speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
     topics: TopicsOption = None,
 ) -> None:
-    """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber."""
+    """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber.
+
+    Ctrl-C or SIGTERM end it like its last message does, with exit code 0.
+    """
     from monstertruckd.replay import replay_log
 
-    count = replay_log(log, robot, endpoint, speed, topics)
-    typer.echo(f"{count} messages replayed")
+    with suppress(KeyboardInterrupt), progress("replay", log.stat().st_size if log.exists() else None) as done:
+        count = replay_log(log, robot, endpoint, speed, topics, done)
+        remark(f"{count} messages replayed")

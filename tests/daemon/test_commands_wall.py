@@ -52,7 +52,7 @@ async def test_every_emulator_answers_its_probe(device: str, expected: str, tmp_
     try:
         assert emulator.stderr is not None
         assert device in (await emulator.stderr.readline()).decode()
-        probed = await command("probe", device, "--port", str(link))
+        probed = await command("probe", device, "--port", str(link), "--json")
         assert probed.returncode == 0, probed.stderr
         assert expected in json.dumps(json.loads(probed.stdout))
         assert emulator.stdin is not None
@@ -83,7 +83,7 @@ def short_lap(folder: Path) -> Path:
     [("camera", "nodes"), ("battery", "converters"), ("link", "interfaces"), ("host", "cores")],
 )
 async def test_what_hangs_on_no_line_is_probed_without_one(device: str, expected: str):
-    probed = await command("probe", device)
+    probed = await command("probe", device, "--json")
     assert probed.returncode == 0, probed.stderr
     assert expected in json.loads(probed.stdout)
 
@@ -132,6 +132,7 @@ async def _replay(log: Path, folder: Path, scans: int) -> None:
             once = await command("status", "--endpoint", endpoint)
             assert once.returncode == 0, once.stderr
             assert once.stdout.startswith("gate ")
+        assert await end(player) == 0, "SIGTERM is its ordinary end"
     finally:
         await end(player)
 
