@@ -247,10 +247,7 @@ def fuzz_whole(whole: Whole, total: int, rng: np.random.Generator) -> dict[str, 
 
 
 def fuzz_exchange(total: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Figures of the EPOS handshake: its frames have no marks to search for, so it takes part as a whole.
-
-    A hundredth of the bytes is enough: each burst costs an exchange of its own.
-    """
+    """Figures of the EPOS handshake: its frames have no marks to search for, so it takes part as a whole."""
 
     async def main(clock: VirtualClock) -> dict[str, Any]:
         port = MemoryPort("epos")
@@ -260,7 +257,7 @@ def fuzz_exchange(total: int, rng: np.random.Generator) -> dict[str, Any]:
         try:
             async with await port.open() as link:
                 exchanger = Exchanger(link, clock, 1)
-                while sent < total // 100:
+                while sent < total:
                     noise = rng.bytes(int(rng.integers(1, 200)))
                     sent += len(noise)
                     port.device.write(noise) if rng.random() < 0.5 else setattr(port.device.faults, "garbage", noise)
