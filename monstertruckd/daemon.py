@@ -40,10 +40,12 @@ from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
 from monstertruckd.health import ClockService, HealthBoard, MeterService
+from monstertruckd.journal import published
 from monstertruckd.notify import notify_from, status_line
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
+from monstertruckd.stall import StallWatch
 from monstertruckd.versions import running_versions
 
 ACTUATORS = (*SHAFTS, "steering")
@@ -125,6 +127,8 @@ class Daemon:
             self._start_devices(actuators, ACTUATORS, OnBug.EXIT)
             self._start(gate, self.gate, OnBug.EXIT)
             self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
+            if self._seed is None:
+                self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_devices(sensors, SENSORS, OnBug.FAIL)
             for service in build_monitors(self.config, self._computer, self.clock, self.bus):
                 self._start(sensors, service)
@@ -143,20 +147,23 @@ class Daemon:
 
     @asynccontextmanager
     async def _outside(self) -> AsyncIterator[None]:
-        async with scope("bus") as bus_scope:
-            if self._seed is None:
-                bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self.rpc)
-                await bridge.open()
-                self._start(bus_scope, bridge, OnBug.EXIT)
-            self._start(
-                bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events)
-            )
-            self._start(bus_scope, self._board)
-            if self._cabling.service is not None:
-                self._start(bus_scope, self._cabling.service)
-            if self._notify is not None:
-                self._start(bus_scope, self._notify)
-            yield
+        log_out = self.bus.publisher(topics.LOG, Writer.DAEMON)
+        with published(self.clock, log_out, self.bus.add_drops, reproducible=self._seed is not None):
+            async with scope("bus") as bus_scope:
+                await self._start_outside(bus_scope)
+                yield
+
+    async def _start_outside(self, bus_scope: Scope) -> None:
+        if self._seed is None:
+            bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self.rpc)
+            await bridge.open()
+            self._start(bus_scope, bridge, OnBug.EXIT)
+        self._start(bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events))
+        self._start(bus_scope, self._board)
+        if self._cabling.service is not None:
+            self._start(bus_scope, self._cabling.service)
+        if self._notify is not None:
+            self._start(bus_scope, self._notify)
 
     @asynccontextmanager
     async def _recording(self) -> AsyncIterator[None]:

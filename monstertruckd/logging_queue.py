@@ -1,11 +1,14 @@
 """Logging that never blocks the control loop: records go through a bounded queue to a thread that writes them."""
 
+import io
 import logging
 import logging.handlers
 import os
 import queue
+import re
 import sys
 import threading
+from collections.abc import Mapping
 from typing import Final, TextIO
 
 DEPTH: Final = 1000
@@ -14,6 +17,25 @@ PATIENCE: Final = 1.0
 """Seconds the end of the process waits for a stuck output."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels of syslog, which journald reads from a line's head."""
+
+_SECRETS: Final = (
+    (re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL), "<private key>"),
+    (re.compile(r"(?<=://)[^\s/@:]+:[^\s/@]+(?=@)"), "***"),
+    (
+        re.compile(
+            r"(?i)\b((?:[a-z0-9]+[_-])*(?:password|passwd|secret|token|api[_-]?key))(['\"]?\s*[=:]\s*['\"]?)[^\s'\",;&]+"
+        ),
+        r"\1\2***",
+    ),
+)
+"""What no log may show: private keys, credentials in addresses, values named like a secret."""
+
+
+def redacted(text: str) -> str:
+    """``text`` without passwords, tokens and keys."""
+    for pattern, instead in _SECRETS:
+        text = pattern.sub(instead, text)
+    return text
 
 
 class LossyQueueHandler(logging.handlers.QueueHandler):
@@ -30,29 +52,39 @@ class LossyQueueHandler(logging.handlers.QueueHandler):
 
 
 class LogWriter:
-    """The thread that writes; a stuck output never keeps the process from ending."""
+    """The thread that writes; a stuck output never keeps the process from ending.
 
-    def __init__(self, records: "queue.Queue[logging.LogRecord | None]", output: logging.Handler) -> None:
-        self._records = records
+    Args:
+        handler: where the records come from.
+        output: where they go.
+    """
+
+    def __init__(self, handler: LossyQueueHandler, output: logging.Handler) -> None:
+        self._handler = handler
         self._output = output
+        self._told = 0
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """Write what still waits, as far as the output takes it within ``PATIENCE``."""
         try:
-            self._records.put(None, timeout=PATIENCE)
+            self._handler.queue.put(None, timeout=PATIENCE)
         except queue.Full:
             return
         self._thread.join(PATIENCE)
 
     def _run(self) -> None:
-        while (record := self._records.get()) is not None:
+        while (record := self._handler.queue.get()) is not None:
             self._output.handle(record)
+            if (lost := self._handler.lost) > self._told:
+                text = f"{lost - self._told} records lost: this output was stuck"
+                self._told = lost
+                self._output.handle(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))
 
 
 class PlainFormatter(logging.Formatter):
-    """One line a record, with journald's priority in front where the journal reads."""
+    """One line a record, without secrets, with journald's priority in front where the journal reads."""
 
     def __init__(self, *, journal: bool) -> None:
         super().__init__("%(levelname)-7s %(name)s: %(message)s")
@@ -60,19 +92,34 @@ class PlainFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record's text; every line of a traceback keeps the priority."""
-        text = super().format(record)
+        text = redacted(super().format(record))
         if not self._journal:
             return text
         head = f"<{PRIORITIES.get(record.levelno, 6)}>"
         return "\n".join(head + line for line in text.splitlines())
 
 
+def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> bool:
+    """Whether systemd's journal reads ``stream``: JOURNAL_STREAM names its device and inode (systemd.exec(5)).
+
+    The variable alone does not tell, as it is inherited by whoever has its output elsewhere.
+    """
+    named = environment.get("JOURNAL_STREAM")
+    if named is None:
+        return False
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError, io.UnsupportedOperation):
+        return False
+    return named == f"{status.st_dev}:{status.st_ino}"
+
+
 def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogWriter:
     """Send all logging to ``stream`` from a thread; ``stop()`` of what is returned writes what still waits."""
     output = logging.StreamHandler(stream)
-    output.setFormatter(PlainFormatter(journal="JOURNAL_STREAM" in os.environ))
-    records: queue.Queue[logging.LogRecord | None] = queue.Queue(DEPTH)
+    output.setFormatter(PlainFormatter(journal=read_by_journal(stream)))
+    handler = LossyQueueHandler(queue.Queue(DEPTH))
     root = logging.getLogger()
     root.setLevel(logging.DEBUG if verbose else logging.INFO)
-    root.addHandler(LossyQueueHandler(records))
-    return LogWriter(records, output)
+    root.addHandler(handler)
+    return LogWriter(handler, output)

@@ -123,7 +123,14 @@ class GateConfig(Schema):
     battery: SensorLimit = _limit(topics.BATTERY, critical=False)
     max_latency: Positive = 0.4
     """Greatest distance between a sample's stamp and its arrival, s; beyond it the sample is not a good one."""
-    tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = ("recorder", "camera", "link", "host", "usb")
+    tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = (
+        "recorder",
+        "camera",
+        "link",
+        "host",
+        "usb",
+        "stalls",
+    )
     """Services whose failure does not stop the truck."""
 
     tick_stall: Positive = 0.15

@@ -1,6 +1,7 @@
 """The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule, and alone writes to the actuators."""
 
 import asyncio
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +24,8 @@ from monstertruckd.gate.latch import Latch
 from monstertruckd.gate.meter import Lateness, TickMeter
 from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.stops import Trip
+
+log = logging.getLogger(__name__)
 
 STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` goes out on every change and at least this often, ns."""
@@ -199,7 +202,9 @@ class GateService:
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
         for trip in output.trips:
-            self._outputs.stops.put(self._stop(trip, now))
+            stop = self._stop(trip, now)
+            self._outputs.stops.put(stop)
+            log.log(logging.INFO if stop.ordered else logging.WARNING, "%s", stop.text)
         news = (output.mode, output.holder, output.reasons)
         if news != self._told or now - self._told_at >= STATE_PERIOD:
             self._told, self._told_at = news, now

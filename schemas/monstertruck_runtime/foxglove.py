@@ -15,6 +15,7 @@ from monstertruck_runtime.foxglove_layouts import (
     FRAME_TRANSFORMS,
     GRID,
     LASER_SCAN,
+    LOG,
     OCCUPANCY,
     POSE,
     POSE_IN_FRAME,
@@ -27,6 +28,7 @@ from monstertruck_runtime.foxglove_layouts import (
 from monstertruck_runtime.foxglove_scan import decode_scan, encode_scan
 from monstertruck_runtime.protobuf import Layout
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
@@ -172,6 +174,19 @@ def _transform(raw: bytes) -> Transform:
     return Transform.model_validate(values)
 
 
+_LEVELS: Final = dict(enumerate(LogLevel, start=1))
+"""Numbers of ``foxglove.Log.Level``; 0 is unknown."""
+_LEVEL_NUMBERS: Final = {level: number for number, level in _LEVELS.items()}
+
+
+def _log_values(record: LogRecord) -> dict[str, Any]:
+    return vars(record) | {"level": _LEVEL_NUMBERS[record.level]}
+
+
+def _log_model(values: dict[str, Any]) -> LogRecord:
+    return LogRecord.model_validate(values | {"level": _LEVELS.get(values["level"], LogLevel.INFO)})
+
+
 @dataclass(frozen=True, slots=True)
 class Binding:
     """How one of our models travels as a well-known message."""
@@ -197,4 +212,5 @@ BINDINGS: Final[Mapping[type[Message], Binding]] = {
     Path: _by_values(POSES_IN_FRAME, _path_values, _path_model),
     Grid: _by_values(GRID, _grid_values, _grid_model),
     Transforms: _by_values(FRAME_TRANSFORMS, _transforms_values, _transforms_model),
+    LogRecord: _by_values(LOG, _log_values, _log_model),
 }

@@ -161,6 +161,17 @@ FRAME_TRANSFORMS: Final = Layout(
     Field(1002, "stamp", FIXED_INT64),
     Field(1003, "frame", STRING),
 )
+LOG: Final = Layout(
+    "foxglove.Log",
+    Field(1, "timestamp", STAMP, key="stamp"),
+    Field(2, "level", ENUM),
+    Field(3, "message", STRING, key="text"),
+    Field(4, "name", STRING),
+    Field(5, "file", STRING),
+    Field(6, "line", FIXED_UINT32),
+    *_OWN_HEADER,
+    Field(1002, "frame", STRING),
+)
 
 _INT8: Final = 2
 """``foxglove.PackedElementField.NumericType.INT8``."""

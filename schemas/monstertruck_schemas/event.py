@@ -89,3 +89,24 @@ class Stop(Message):
     """Name of the file that will hold the minute before; None = none is written."""
     text: str
     """All of it in one line."""
+
+
+class LogLevel(StrEnum):
+    """Levels of the journal."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+    FATAL = "fatal"
+
+
+class LogRecord(Message):
+    """One line of the daemon's journal."""
+
+    level: LogLevel
+    name: str
+    """Logger: the module it came from."""
+    text: str
+    file: str = ""
+    line: Annotated[int, Field(ge=0, lt=2**32)] = 0

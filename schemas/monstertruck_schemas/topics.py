@@ -8,7 +8,7 @@ from typing import Final, Generic, TypeVar
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
-from monstertruck_schemas.event import Event, Stop
+from monstertruck_schemas.event import Event, LogRecord, Stop
 from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth
 from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
@@ -150,6 +150,7 @@ USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
 STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the truck was stopped, with the chain of causes", retained=True)
+LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", foxglove="foxglove.Log")
 
 REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, 0.3)
 REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
-from monstertruck_schemas.event import Cause, Measurement
+from monstertruck_schemas.event import Cause, LogLevel, LogRecord, Measurement
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
@@ -123,6 +123,7 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.PATH: paths,
     t.MAP: grids,
     t.TRANSFORMS: trees,
+    t.LOG: st.builds(LogRecord, **header, level=st.sampled_from(LogLevel), line=st.integers(0, 2**32 - 1)),
 }
 
 

@@ -1,0 +1,131 @@
+"""A control tick that does not come leaves all tracebacks behind."""
+
+import asyncio
+import ctypes
+import logging
+import time
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import WallClock
+from monstertruckd import stall
+from monstertruckd.stall import StallWatch
+
+pytestmark = pytest.mark.wall
+
+
+def a_driver_that_waits_for_its_device(seconds):
+    time.sleep(seconds)
+
+
+def an_extension_that_keeps_the_lock(seconds):
+    ctypes.PyDLL(None).usleep(round(seconds * 1e6))  # a PyDLL call holds the interpreter's lock
+
+
+async def watched(folder, scenario, **settings):
+    """Run ``scenario`` beside a control tick of 50 Hz."""
+    ticks = 0
+
+    async def tick():
+        nonlocal ticks
+        while True:
+            ticks += 1
+            await asyncio.sleep(0.02)
+
+    watch = StallWatch(WallClock(), lambda: ticks, folder, **settings)
+    tasks = [asyncio.create_task(tick()), asyncio.create_task(watch.run(lambda: None))]
+    try:
+        await asyncio.sleep(0.15)
+        await scenario()
+        await asyncio.sleep(0.15)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+
+
+def dumps(folder):
+    return sorted(folder.glob("stall-*.txt"))
+
+
+def test_a_blocked_loop_is_dumped_while_it_is_blocked_and_not_again_soon(tmp_path: Path, caplog):
+    async def scenario():
+        a_driver_that_waits_for_its_device(0.5)
+        await asyncio.sleep(0.1)
+        a_driver_that_waits_for_its_device(0.4)
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(watched(tmp_path, scenario))
+    (file,) = dumps(tmp_path)
+    assert file.name == "stall-000001.txt"
+    text = file.read_text()
+    assert text.startswith("no control tick for 0.")
+    assert "a_driver_that_waits_for_its_device" in text
+    assert "a_driver_that_waits_for_its_device" in caplog.text
+    levels = {record.levelno for record in caplog.records if "all threads" in record.message}
+    assert levels == {logging.ERROR}
+    assert "the control tick is back after 0." in caplog.text
+
+
+def test_punctual_ticks_leave_nothing(tmp_path: Path):
+    asyncio.run(watched(tmp_path, lambda: asyncio.sleep(0.8), stall=0.6))
+    assert dumps(tmp_path) == []
+
+
+def test_a_loop_that_has_not_ticked_yet_is_starting(tmp_path: Path):
+    async def main():
+        watch = asyncio.create_task(StallWatch(WallClock(), lambda: 0, tmp_path, stall=0.05).run(lambda: None))
+        await asyncio.sleep(0.3)
+        watch.cancel()
+        await asyncio.wait([watch])
+
+    asyncio.run(main())
+    assert dumps(tmp_path) == []
+
+
+def test_a_held_interpreter_lock_is_dumped_by_the_c_thread(tmp_path: Path, caplog):
+    async def scenario():
+        an_extension_that_keeps_the_lock(0.7)
+        await asyncio.sleep(0.1)
+
+    asyncio.run(watched(tmp_path, scenario, held=0.3))
+    (file,) = dumps(tmp_path)
+    assert "no Python thread ran" in file.read_text()
+    assert "an_extension_that_keeps_the_lock" in file.read_text()
+    assert (tmp_path / "stalling.txt").read_bytes() == b""
+
+
+def test_what_a_killed_daemon_left_is_told_at_the_next_start(tmp_path: Path, caplog):
+    (tmp_path / "stalling.txt").write_text("Thread 0x1: in usleep")
+    asyncio.run(watched(tmp_path, lambda: asyncio.sleep(0)))
+    assert "the daemon was killed while no Python thread ran; all threads:\nThread 0x1: in usleep" in caplog.text
+    (file,) = dumps(tmp_path)
+    assert "in usleep" in file.read_text()
+
+
+def test_a_folder_that_cannot_be_written_costs_the_file_only(tmp_path: Path, caplog):
+    blocked = tmp_path / "file"
+    blocked.touch()
+
+    async def scenario():
+        a_driver_that_waits_for_its_device(0.4)
+
+    asyncio.run(watched(blocked, scenario))
+    assert "a_driver_that_waits_for_its_device" in caplog.text
+    assert "tracebacks are in the log only" in caplog.text
+
+
+def test_old_dumps_go(tmp_path: Path):
+    for number in range(1, stall.KEPT + 6):
+        (tmp_path / f"stall-{number:06d}.txt").touch()
+    (tmp_path / "notes.txt").touch()
+
+    async def scenario():
+        a_driver_that_waits_for_its_device(0.4)
+
+    asyncio.run(watched(tmp_path, scenario))
+    files = dumps(tmp_path)
+    assert len(files) == stall.KEPT
+    assert files[-1].name == f"stall-{stall.KEPT + 6:06d}.txt"
+    assert (tmp_path / "notes.txt").exists()
