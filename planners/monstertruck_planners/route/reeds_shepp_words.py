@@ -122,7 +122,7 @@ def _three_arcs(
     phi: float, r1: float, a1: float, r2: float, xi2: float, eta2: float,
 ) -> None:  # fmt: skip
     """Patterns that are also valid in reversed order: LRL, LRSL, LRSR; polar (r, a) of the end circle's centre."""
-    if r1 <= 4.0:
+    if r1 <= 4.0 and 0.5 * r1 < best[COST]:
         u = -2.0 * asin(r1 / 4.0)
         t = _up(a1 + u / 2 + pi)
         if t >= -SLACK:
@@ -130,11 +130,12 @@ def _three_arcs(
     if r1 >= 2.0:
         r = sqrt(r1 * r1 - 4.0)
         u = 2.0 - r
-        t = _up(a1 + atan2(r, -2.0))
-        v = _down(phi - pi / 2 - t)
-        if t >= -SLACK and u <= SLACK and v <= SLACK:
-            _offer(best, pieces, weights, LRSL, flip, mirror, backward, t, u, v)
-    if r2 >= 2.0:
+        if u <= SLACK and pi / 2 - u < best[COST]:
+            t = _up(a1 + atan2(r, -2.0))
+            v = _down(phi - pi / 2 - t)
+            if t >= -SLACK and v <= SLACK:
+                _offer(best, pieces, weights, LRSL, flip, mirror, backward, t, u, v)
+    if r2 >= 2.0 and pi / 2 + r2 - 2.0 < best[COST]:
         u = 2.0 - r2
         t = _up(atan2(xi2, -eta2))
         v = _down(t + pi / 2 - phi)
@@ -149,30 +150,32 @@ def _others(
 ) -> None:  # fmt: skip
     """Patterns that reversed are again one of their own."""
     t = _up(a1)
-    v = _up(phi - t)
-    if t >= -SLACK and v >= -SLACK:
-        _offer(best, pieces, weights, LSL, flip, mirror, 1.0, t, r1, v)
+    if t >= -SLACK and r1 + t < best[COST]:
+        v = _up(phi - t)
+        if v >= -SLACK:
+            _offer(best, pieces, weights, LSL, flip, mirror, 1.0, t, r1, v)
     if r2 >= 2.0:
         u = sqrt(r2 * r2 - 4.0)
-        t = _up(a2 + atan2(2.0, u))
-        v = _up(t - phi)
-        if t >= -SLACK and v >= -SLACK:
-            _offer(best, pieces, weights, LSR, flip, mirror, 1.0, t, u, v)
+        if u < best[COST]:
+            t = _up(a2 + atan2(2.0, u))
+            v = _up(t - phi)
+            if t >= -SLACK and v >= -SLACK:
+                _offer(best, pieces, weights, LSR, flip, mirror, 1.0, t, u, v)
         u = 4.0 - u
-        if u <= SLACK:
+        if u <= SLACK and pi - u < best[COST]:
             t = _up(atan2((4.0 - u) * xi2 - 2.0 * eta2, -2.0 * xi2 + (u - 4.0) * eta2))
             v = _up(t - phi)
             if t >= -SLACK and v >= -SLACK:
                 _offer(best, pieces, weights, LRSLR, flip, mirror, 1.0, t, u, v)
     rho = (2.0 + r2) / 4.0
-    if rho <= 1.0:
+    if rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
         u = acos(rho)
         t, v = _tau_omega(u, -u, xi2, eta2, phi)
         t, v = _up(t), _down(v)
         if t >= -SLACK and v <= SLACK:
             _offer(best, pieces, weights, LRLR_SAME, flip, mirror, 1.0, t, u, v)
     rho = (20.0 - r2 * r2) / 16.0
-    if 0.0 <= rho <= 1.0:
+    if 0.0 <= rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
         u = -acos(rho)
         t, v = _tau_omega(u, u, xi2, eta2, phi)
         t, v = _up(t), _up(v)
