@@ -1,15 +1,17 @@
 """The demo, and the emulated robot it drives."""
 
 import itertools
-import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.cli.options import ConfigOption
-from monstertruckd.cli.output import JsonOption
+from monstertruckd.cli.options import ConfigOption, SimulatedOption
+from monstertruckd.cli.output import JsonOption, console, finish, print_json, print_table, remark, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruckd.sim.config import SimulatedTruckConfig
 
 DEMO_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
 
@@ -17,7 +19,7 @@ DEMO_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
 def demo(
     fast: Annotated[bool, typer.Option("--fast", help="Virtual clock: as fast as it computes, reproducible.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of world and devices; default: the configuration's.")] = None,
-    config: Annotated[Path, typer.Option("--config", "-c", help="Simulated truck to drive.")] = DEMO_CONFIG,
+    config: SimulatedOption = DEMO_CONFIG,
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder for log, map and outputs.")] = Path(
         "runs/demo"
     ),
@@ -29,18 +31,40 @@ def demo(
     from monstertruckd.demo.fast import run_fast_demo
     from monstertruckd.demo.wall import run_wall_demo
 
+    load_simulated(config)
     folder = _fresh(output)
-    if fast:
-        summary = run_fast_demo(config, folder, seed)
-    else:
-        screen = sys.stdout.isatty() and not json_output
-        summary = run_wall(lambda clock: run_wall_demo(clock, config, folder, seed, screen=screen))
+    screen = sys.stdout.isatty() and not json_output
+    try:
+        if fast:
+            summary = run_fast_demo(config, folder, seed)
+        else:
+            summary = run_wall(lambda clock: run_wall_demo(clock, config, folder, seed, screen=screen))
+    except KeyboardInterrupt:
+        remark(f"log and outputs so far: {folder}")
+        raise
     if json_output:
-        typer.echo(json.dumps(summary.as_json(), indent=2))
+        print_json(summary.as_json())
     else:
         _print(summary.rows(), summary.messages)
     if summary.lap.outcome is not Reason.GOAL_REACHED:
-        raise typer.Exit(summary.lap.outcome.exit_code or Reason.INTERNAL.exit_code)
+        finish(summary.lap.outcome)
+        finish(Reason.INTERNAL)
+
+
+def load_simulated(config: Path) -> "SimulatedTruckConfig":
+    """A configuration with a world in it.
+
+    Raises:
+        ConfigError: it is refused, or describes a real truck.
+    """
+    from monstertruck_runtime.errors import ConfigError
+    from monstertruckd.config.validate import load_config
+    from monstertruckd.config.yaml_tree import load_tree
+    from monstertruckd.sim.config import SimulatedTruckConfig
+
+    if "sim" not in load_tree(config).data:
+        raise ConfigError(f"{config}: describes a real truck: it has no section `sim`, as configs/full.yaml has")
+    return load_config(config, SimulatedTruckConfig)[0]
 
 
 def _fresh(folder: Path) -> Path:
@@ -50,18 +74,10 @@ def _fresh(folder: Path) -> Path:
 
 
 def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
     for name, value in rows:
-        console.print(f"[bold]{name:20}[/bold] {value}", soft_wrap=True, highlight=False)
-    counts = Table(box=None, header_style="bold", title="messages per topic", title_justify="left")
-    counts.add_column("topic")
-    counts.add_column("messages", justify="right")
-    for name, count in sorted(messages.items()):
-        counts.add_row(name, str(count))
-    console.print(counts)
+        console().print(f"[bold]{name:20}[/bold] {value}", soft_wrap=True)
+    print()
+    print_table(("topic", "messages"), [(name, str(n)) for name, n in sorted(messages.items())], right=("messages",))
 
 
 def simulate(
@@ -73,7 +89,7 @@ def simulate(
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows).
     """
-    from monstertruck_runtime.clock import run_wall
     from monstertruckd.sim.host import serve
 
-    run_wall(lambda clock: serve(clock, config, truth))
+    load_simulated(config)
+    until_stopped(lambda clock: serve(clock, config, truth))

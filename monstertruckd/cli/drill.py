@@ -1,14 +1,15 @@
 """``monstertruckd drill``: seeded faults on an emulated truck, and a scored report."""
 
-import json
 import os
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.cli.output import JsonOption
+from monstertruckd.cli.demo import load_simulated
+from monstertruckd.cli.options import SimulatedOption
+from monstertruckd.cli.output import JsonOption, console, print_json, print_table, progress
 
 if TYPE_CHECKING:
     from monstertruckd.sim.drill import Drill, Outcome, Report
@@ -19,7 +20,7 @@ FULL_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "full.yaml"
 def drill(
     seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
     count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
-    config: Annotated[Path, typer.Option("--config", "-c", help="Simulated truck to drill.")] = FULL_CONFIG,
+    config: SimulatedOption = FULL_CONFIG,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -28,14 +29,11 @@ def drill(
     Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
     did not come back.
     """
-    from monstertruckd.config.validate import load_config
-    from monstertruckd.sim.config import SimulatedTruckConfig
     from monstertruckd.sim.drill import Drill
 
-    truck = load_config(config, SimulatedTruckConfig)[0]
-    report = _run(Drill(seed, count, truck), jobs or os.cpu_count() or 1)
+    report = _run(Drill(seed, count, load_simulated(config)), jobs or os.cpu_count() or 1)
     if json_output:
-        typer.echo(json.dumps(report.as_json(), indent=2))
+        print_json(report.as_json())
     else:
         _print(report)
     if report.unsafe or report.stuck:
@@ -43,37 +41,29 @@ def drill(
 
 
 def _run(drill: "Drill", jobs: int) -> "Report":
-    if not sys.stderr.isatty():
-        return drill.run(jobs=jobs)
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress
+    finished = 0
+    with progress("faults", drill.count) as done:
 
-    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=Console(stderr=True)) as progress:
-        bar = progress.add_task("faults", total=drill.count)
-        return drill.run(jobs=jobs, tell=lambda outcomes: progress.advance(bar, len(outcomes)))
+        def tell(outcomes: "Sequence[Outcome]") -> None:
+            nonlocal finished
+            finished += len(outcomes)
+            done(finished)
+
+        return drill.run(jobs=jobs, tell=tell)
 
 
 def _print(report: "Report") -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=None if sys.stdout.isatty() else 120)
-    table = Table(box=box.SIMPLE)
-    for column in ("fault", "reaction", "reason"):
-        table.add_column(column)
-    for column in ("stop bytes s", "standstill s", "metres", "back s", "score"):
-        table.add_column(column, justify="right")
-    for outcome in report.outcomes:
-        table.add_row(*_cells(outcome))
-    console.print(table)
+    numbers = ("stop bytes s", "standstill s", "metres", "back s", "score")
+    rows = [_cells(outcome) for outcome in report.outcomes]
+    print_table(("fault", "reaction", "reason", *numbers), rows, right=numbers)
+    out = console()
     for outcome in report.outcomes:
         for violation in outcome.violations:
             text = f"{outcome.fault}: after {violation.seconds:.2f} s {violation.rule}: {violation.text}"
-            console.print(text, style="red")
+            out.print(text, style="red")
         if outcome.stuck:
-            console.print(f"{outcome.fault}: not back: {', '.join(outcome.stuck)}", style="yellow")
-    console.print(
+            out.print(f"{outcome.fault}: not back: {', '.join(outcome.stuck)}", style="yellow")
+    out.print(
         f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck, "
         f"{report.blocked} times set back by hand; "
         f"back after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "

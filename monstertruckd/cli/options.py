@@ -50,6 +50,10 @@ ConfigOption = Annotated[
         autocompletion=complete_config,
     ),
 ]
+SimulatedOption = Annotated[
+    Path,
+    typer.Option("--config", "-c", help="Configuration of a simulated truck.", autocompletion=complete_config),
+]
 ConfigArgument = Annotated[
     Path, typer.Argument(help="Configuration (YAML).", show_default=False, autocompletion=complete_config)
 ]
