@@ -76,7 +76,7 @@ class Result(Schema):
 
     def over(self, before: "Result | None", date: str) -> "Result":
         """This result as it is saved on ``date``, with what it keeps of the one ``before``."""
-        fresh = tuple(estimate.model_copy(update={"date": date}) for estimate in self.estimates)
+        fresh = tuple(e if e.date else e.model_copy(update={"date": date}) for e in self.estimates)
         names = {estimate.name for estimate in fresh}
         old = before.estimates if self.partial and before is not None else ()
         kept = tuple(estimate for estimate in old if estimate.name not in names)

@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.calibrate.guide import CLEAR, Guide
 from monstertruckd.calibrate.record import STEERING, Estimate, Result
 from monstertruckd.calibrate.statistics import NORMAL
-from monstertruckd.calibrate.steering_model import AXLES, Leg, Maps, SteeringModel, half_widths
+from monstertruckd.calibrate.steering_model import AXLES, SLIP, Leg, Maps, SteeringModel, half_widths
 from monstertruckd.calibrate.steps import Confirm, Move, Number
 
 ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
@@ -48,6 +48,8 @@ SHORT: Final = math.radians(2.0)
 """Servo angle, rad, that has to be missing before a stop is believed."""
 MARGIN: Final = 1.0
 """Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
+SCALE: Final = 0.02
+"""Share by which the scale known from short arcs may be wrong."""
 SEEN: Final = 5.0
 """Standard errors of a turn that make its direction sure."""
 
@@ -184,7 +186,10 @@ class SteeringWizard:
                     key=f"{STEERING}.{name}.scale_us_per_deg",
                 ),
             ]
-            estimates += [e for reach in travel if reach.axle == axle for e in reach.estimates(name, centre, scale)]
+            before = guide.known.get("steering")
+            for reach in travel:
+                if reach.axle == axle:
+                    estimates += reach.estimates(name, centre, scale, before)
         strings = f"along {self.strings} strings" if self.strings else "without a string"
         return Result(
             wizard="steering",
@@ -212,43 +217,49 @@ class Reach:
     stopped: bool
     """Something stopped it there, short of its pulse."""
 
+    half: float
+    """Half the 95 % interval of that, rad."""
+
     @classmethod
     def of(cls, axle: int, sign: int, legs: list[Leg], model: SteeringModel, maps: Maps) -> "Reach":
         """From arcs with the wheels far over."""
-        pairs = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0)
-        reached, meant = float(pairs[0]), float(pairs[1])
+        reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
-        return cls(axle, sign, servo, float(model.linkages[axle].axle_from_servo(servo)), stopped)
+        angle = float(model.linkages[axle].axle_from_servo(servo))
+        noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
+        return cls(axle, sign, servo, angle, stopped, abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE))
 
-    def estimates(self, name: str, centre: float, scale: float) -> list[Estimate]:
-        """What is told of it, and the limit of the pulse, us, where something stops the wheels."""
-        side = "left" if self.sign > 0 else "right"
-        found = [
-            Estimate(
-                name=f"{name}_{side}_travel",
-                value=math.degrees(self.axle_angle),
-                unit="deg",
-                samples=2,
-                meaning="axle angle at which something stops the wheels"
-                if self.stopped
-                else "axle angle followed to; the limits of gate and servo allow no more",
-            )
-        ]
+    def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
+        """What is told of it, and the limit of the pulse, us, where something stops the wheels.
+
+        A limit set ``before`` hides the stop behind it, and stays.
+        """
+        side, end = "left" if self.sign > 0 else "right", "max_us" if self.sign * scale > 0 else "min_us"
+        value, half = math.degrees(self.axle_angle), math.degrees(self.half)
+        travel = Estimate(
+            name=f"{name}_{side}_travel",
+            value=value,
+            low=value - half if self.stopped else None,
+            high=value + half if self.stopped else None,
+            unit="deg",
+            samples=2,
+            meaning="axle angle at which something stops the wheels; 95 % of the legs' noise and 2 % of scale"
+            if self.stopped
+            else "axle angle that the wheels follow to; the limits of gate and servo allow no more",
+        )
+        limit = None if before is None else before.estimate(f"{name}_{end}")
         if self.stopped:
-            end = "max_us" if self.sign * scale > 0 else "min_us"
             degrees = math.degrees(self.servo) - self.sign * MARGIN
-            found.append(
-                Estimate(
-                    name=f"{name}_{end}",
-                    value=centre + scale * degrees,
-                    unit="us",
-                    samples=2,
-                    meaning=f"limit of the pulse, {MARGIN:g} deg of the servo before its stop",
-                    key=f"{STEERING}.{name}.{end}",
-                )
+            limit = Estimate(
+                name=f"{name}_{end}",
+                value=centre + scale * degrees,
+                unit="us",
+                samples=2,
+                meaning=f"limit of the pulse, {MARGIN:g} deg of the servo before its stop",
+                key=f"{STEERING}.{name}.{end}",
             )
-        return found
+        return [travel] if limit is None else [travel, limit]
 
 
 def _steered(axle: int, angle: float) -> tuple[float, float]:

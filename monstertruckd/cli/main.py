@@ -4,6 +4,7 @@ import typer
 
 from monstertruckd import __version__
 from monstertruckd.cli import (
+    calibrate,
     config,
     demo,
     devices,
@@ -65,6 +66,7 @@ app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
 app.add_typer(config.app, name="config")
+app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 

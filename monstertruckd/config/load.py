@@ -12,6 +12,15 @@ def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
     """The configuration at ``path``, calibrated; with a section ``sim`` the world's settings are checked too.
 
     Raises:
+        ConfigError: one line per mistake, in the file or in its calibration.
+    """
+    return calibrated(*load_uncalibrated(path))
+
+
+def load_uncalibrated(path: Path) -> tuple[TruckConfig, Tree]:
+    """The configuration as written.
+
+    Raises:
         ConfigError: one line per mistake.
     """
     model: type[TruckConfig] = TruckConfig
@@ -20,4 +29,4 @@ def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
         from monstertruckd.sim.config import SimulatedTruckConfig  # noqa: PLC0415
 
         model = SimulatedTruckConfig
-    return calibrated(*load_config(path, model))
+    return load_config(path, model)

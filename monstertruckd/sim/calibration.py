@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_drivers.world.truck_plant import TruthState
+from monstertruck_drivers.world.truck_plant import GRAVITY, TruthState
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruckd.calibrate.apply import store_of, with_values
 from monstertruckd.calibrate.guide import Wizard, calibrate
-from monstertruckd.calibrate.record import Result
+from monstertruckd.calibrate.record import Result, Value, WizardName
 from monstertruckd.calibrate.steps import Confirm, Number
 from monstertruckd.daemon import Daemon
 from monstertruckd.demo.operator import LocalOperator
@@ -21,6 +21,8 @@ from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.faults_drill import with_overlay
 from monstertruckd.sim.rig import VirtualRig
 
+STOPPED: Final = 0.2
+"""Chance that something stops a servo on its way to one side."""
 START_UP: Final = 3.0
 """Seconds in which every device of the emulated truck is up."""
 
@@ -161,11 +163,16 @@ class SimulatedOperator:
 def hidden(config: SimulatedTruckConfig, rng: np.random.Generator, seed: int) -> SimulatedTruckConfig:
     """``config`` with a truck whose every calibrated value differs from what the daemon believes."""
 
+    def stop() -> float:
+        return float(rng.uniform(23, 30)) if rng.random() < STOPPED else 45.0
+
     def servo(channel: int) -> dict[str, Any]:
         return {
             "channel": channel,
             "centre_us": 1439.2 + rng.uniform(-40, 40),
             "us_per_degree": float(rng.choice((-1, 1))) * 10.48 * rng.uniform(0.9, 1.1),
+            "left_stop_deg": stop(),
+            "right_stop_deg": stop(),
         }
 
     truck = {
@@ -181,6 +188,52 @@ def hidden(config: SimulatedTruckConfig, rng: np.random.Generator, seed: int) ->
     return with_overlay(
         config, {"sim": {"seed": seed, "world": {"truck": truck, "compass": compass, "battery": battery}}}
     )
+
+
+def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
+    """True values of what the wizards estimate, by wizard and name."""
+    world = config.sim.world
+    truck, iron = world.truck, world.compass.iron
+    rolling = truck.slip_per_newton * truck.rolling_resistance * truck.mass * GRAVITY
+    turns = truck.motor.ratio / (2 * math.pi * truck.wheel_radius) / (1 - rolling)
+    soft = np.linalg.inv(((iron.soft_x, iron.soft_xy), (iron.soft_xy, iron.soft_y)))
+    soft /= math.sqrt(np.linalg.det(soft))
+    steering: dict[str, Value] = {}
+    linkage = truck.chassis().linkage
+    assert linkage is not None
+    axles = (("front", truck.front_servo, linkage.front), ("rear", truck.rear_servo, linkage.rear))
+    for name, servo, polynomials in axles:
+        stops = math.radians(servo.left_stop_deg), -math.radians(servo.right_stop_deg)
+        left, right = (math.degrees(float(polynomials.axle_from_servo(stop))) for stop in stops)
+        steering |= {
+            f"{name}_centre": servo.centre_us,
+            f"{name}_scale": abs(servo.us_per_degree),
+            f"{name}_direction": 1 if servo.us_per_degree > 0 else -1,
+            f"{name}_left_travel": left,
+            f"{name}_right_travel": right,
+        }
+    drive = config.devices.drive
+    assert drive is not None
+    return {
+        "battery": {
+            "gain": world.battery.divider / 10,
+            "offset": -world.battery.divider * world.battery.analog_offset,
+        },
+        "compass": {
+            "hard_x": 0.1 * iron.hard_x,
+            "hard_y": 0.1 * iron.hard_y,
+            "soft_xx": float(soft[0, 0]),
+            "soft_xy": float(soft[0, 1]),
+            "soft_yy": float(soft[1, 1]),
+        },
+        "drive": {
+            "inverted": truck.motor.inverted,
+            "drive_ratio": truck.motor.ratio * config.geometry.wheel_radius / truck.wheel_radius,
+            "turns_per_metre": turns,
+            "ticks_per_metre": 4 * (drive.driver.encoder_pulses_per_turn or 0) * turns,
+        },
+        "steering": steering,
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,3 +274,32 @@ def run_session(
             return Session(result, Path(file), (clock.now() - began) / SECOND)
 
     return run_virtual(main)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One estimate beside its truth."""
+
+    name: str
+    """wizard.estimate"""
+    value: Value
+    low: float | None
+    high: float | None
+    truth: Value
+
+    @property
+    def holds(self) -> bool:
+        """Whether the truth lies in the stated interval; what has none must be right."""
+        if self.low is None or self.high is None:
+            return self.value == self.truth
+        return self.low <= self.truth <= self.high
+
+
+def verdicts(result: Result, config: SimulatedTruckConfig) -> list[Verdict]:
+    """Every estimate of ``result`` whose truth is known; travel counts where something stopped the wheels."""
+    known = truths(config)[result.wizard]
+    return [
+        Verdict(f"{result.wizard}.{e.name}", e.value, e.low, e.high, known[e.name])
+        for e in result.estimates
+        if e.name in known and not (e.name.endswith("_travel") and e.low is None)
+    ]

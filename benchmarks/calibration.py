@@ -1,0 +1,138 @@
+"""Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
+
+    python benchmarks/calibration.py [--seeds 20] [--jobs 1]
+
+Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
+has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval.
+"""
+
+import argparse
+import json
+import logging
+import sys
+from collections import defaultdict
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+import numpy as np
+
+from monstertruck_runtime.errors import TruckError
+from monstertruckd.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
+from monstertruckd.calibrate.drive import DriveWizard
+from monstertruckd.calibrate.steering import SteeringWizard
+from monstertruckd.config.validate import load_config
+from monstertruckd.sim.calibration import Verdict, hidden, run_session, verdicts
+from monstertruckd.sim.config import SimulatedTruckConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"
+GOAL = 0.9
+EMPTIER = (0.15,)
+"""Charge of the second pack that the battery wizard sees."""
+
+
+@dataclass(frozen=True)
+class Truck:
+    """One truck, calibrated."""
+
+    seed: int
+    verdicts: list[Verdict]
+    minutes: dict[str, float]
+    """By wizard, on the truck's clock."""
+    cpu_s: float
+
+
+def calibrate(seed: int) -> Truck:
+    """The whole procedure on one truck."""
+    logging.disable(logging.CRITICAL)
+    began = process_time()
+    rng = np.random.default_rng([seed, 4])
+    found: list[Verdict] = []
+    minutes: dict[str, float] = defaultdict(float)
+    base = load_config(ROOT / "configs" / "yard.yaml", SimulatedTruckConfig)[0]
+    with TemporaryDirectory(prefix="monstertruck-") as folder:
+        quiet = base.model_copy(update={"recorder": None, "state_directory": Path(folder)})
+        truck = hidden(quiet, rng, seed)
+        for step in (
+            battery_wizard(),
+            drive_wizard(DriveWizard(sign_only=True)),
+            steering_wizard(SteeringWizard(rough=True)),
+            compass_wizard(),
+            drive_wizard(),
+            steering_wizard(),
+        ):
+            try:
+                session = run_session(truck, step, rng, charges=EMPTIER if step.name == "battery" else ())
+            except TruckError as error:
+                print(f"truck {seed}: {step.name}: {error}", flush=True)
+                found.append(Verdict(f"{step.name}.finished", False, None, None, True))
+                continue
+            found.append(Verdict(f"{step.name}.finished", True, None, None, True))
+            rough = "rough." if session.result.partial else ""
+            minutes[rough + step.name] += session.seconds / 60
+            found += [Verdict(rough + v.name, v.value, v.low, v.high, v.truth) for v in verdicts(session.result, truck)]
+    return Truck(seed, found, dict(minutes), process_time() - began)
+
+
+def figures(trucks: Iterable[Truck]) -> dict[str, dict[str, float]]:
+    """By estimate: trucks, share of them whose truth lies inside, median half-width, error over half-width (rms)."""
+    rows: dict[str, list[Verdict]] = defaultdict(list)
+    for truck in trucks:
+        for verdict in truck.verdicts:
+            rows[verdict.name].append(verdict)
+    out = {}
+    for name, found in rows.items():
+        ends = [(v.value, v.truth, (v.high - v.low) / 2) for v in found if v.low is not None and v.high is not None]
+        out[name] = {"trucks": len(found), "inside": sum(v.holds for v in found) / len(found)}
+        if ends:
+            value, truth, half = np.array(ends, dtype=float).T
+            out[name] |= {
+                "half_width": float(np.median(half)),
+                "error_rms": float(np.sqrt(np.mean((value - truth) ** 2))),
+            }
+    return out
+
+
+def main() -> int:
+    """Calibrate; 0 = every estimate holds in 90 % of the trucks."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=1)
+    arguments = parser.parse_args()
+    trucks = []
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        for truck in pool.map(calibrate, range(arguments.seeds)):
+            trucks.append(truck)
+            missed = [v.name for v in truck.verdicts if not v.holds]
+            print(f"truck {truck.seed}: {len(truck.verdicts)} estimates, outside: {missed or 'none'}", flush=True)
+    table = figures(trucks)
+    print("| estimate | trucks | inside | half-width | rms error |\n|---|---:|---:|---:|---:|")
+    for name, row in table.items():
+        half, error = (f"{row[key]:.4g}" if key in row else "" for key in ("half_width", "error_rms"))
+        print(f"| {name} | {row['trucks']} | {row['inside']:.0%} | {half} | {error} |")
+    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
+    OUTPUT.write_text(json.dumps([asdict(truck) for truck in trucks], indent=1), encoding="utf-8")
+    worst = min(table.values(), key=lambda row: row["inside"])["inside"]
+    sums = {
+        "trucks": len(trucks),
+        "estimates": sum(len(truck.verdicts) for truck in trucks),
+        "inside": sum(v.holds for truck in trucks for v in truck.verdicts) / sum(len(t.verdicts) for t in trucks),
+        "worst_estimate_inside": worst,
+        "inside_by_estimate": {name: row["inside"] for name, row in table.items()},
+        "minutes": {
+            name: round(float(np.mean([t.minutes.get(name, 0.0) for t in trucks])), 1) for name in trucks[0].minutes
+        },
+        "cpu_s_per_truck": round(float(np.mean([truck.cpu_s for truck in trucks])), 1),
+    }
+    goals = {"worst_estimate_inside": GOAL}
+    met = worst >= GOAL
+    print(json.dumps({"bench": "calibration", "figures": sums, "goals": goals, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

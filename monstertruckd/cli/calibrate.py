@@ -1,0 +1,272 @@
+"""``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config
+from monstertruckd.cli.output import JsonOption, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
+    from monstertruckd.calibrate.guide import Wizard
+    from monstertruckd.calibrate.record import Estimate, Result, WizardName
+
+app = typer.Typer(
+    help="Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C.",
+    no_args_is_help=True,
+)
+
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Take it that everything asked to be done is done.")]
+AnswerOption = Annotated[
+    list[str] | None,
+    typer.Option("--answer", "-a", metavar="NAME=VALUE", help="Answer beforehand; repeated in the order of asking."),
+]
+UndoOption = Annotated[bool, typer.Option("--undo", help="Go back to what held before the last run; twice is redo.")]
+FileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", "-c", help="With --undo and show: this configuration's files, without a daemon.",
+        autocompletion=complete_config,
+    ),
+]  # fmt: skip
+
+
+@app.command()
+def drive(
+    runs: Annotated[int, typer.Option(min=3, max=50, help="Taped runs.")] = 4,
+    metres: Annotated[float, typer.Option(min=0.5, max=20, help="Length of a run.")] = 2.0,
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
+    sign_only: Annotated[bool, typer.Option("--sign-only", help="End once it is clear where forward is.")] = False,
+    yes: YesOption = False,
+    answer: AnswerOption = None,
+    undo: UndoOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Which way is forward, and how far a turn of the motor goes: runs along a tape.
+
+    Asks [b]clear[/b], [b]forward[/b] and, for each run, [b]mark[/b] and [b]distance[/b] (m).
+    """
+    from monstertruckd.calibrate.catalog import drive_wizard
+    from monstertruckd.calibrate.drive import DriveWizard
+
+    wizard = drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
+    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+
+@app.command()
+def steering(
+    rough: Annotated[
+        bool, typer.Option("--rough", help="Directions and a first centre: before the compass is calibrated.")
+    ] = False,
+    strings: Annotated[int, typer.Option(min=0, max=20, help="Straight runs along a string; 0 = there is none.")] = 3,
+    string_error: Annotated[
+        float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
+    ] = 3.5,
+    yes: YesOption = False,
+    answer: AnswerOption = None,
+    undo: UndoOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
+
+    Asks [b]clear[/b] and, for each string, [b]string[/b] and [b]offset[/b] (cm).
+    """
+    from monstertruckd.calibrate.catalog import steering_wizard
+    from monstertruckd.calibrate.steering import SteeringWizard
+
+    wizard = steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
+    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+
+@app.command()
+def compass(
+    yes: YesOption = False,
+    answer: AnswerOption = None,
+    undo: UndoOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks [b]clear[/b]."""
+    from monstertruckd.calibrate.catalog import compass_wizard
+
+    _run(compass_wizard(), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+
+@app.command()
+def battery(
+    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent.")] = 0.5,
+    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="And the rest of it, V.")] = 0.02,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
+    yes: YesOption = False,
+    answer: AnswerOption = None,
+    undo: UndoOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Scale of the battery voltage from a multimeter; nothing moves.
+
+    Asks [b]meter[/b] (V) and [b]another[/b] (yes or no), until that is no.
+    """
+    from monstertruckd.calibrate.battery import BatteryWizard
+    from monstertruckd.calibrate.catalog import battery_wizard
+
+    wizard = battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
+    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+
+@app.command()
+def show(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Print what was calibrated, when, how well, and which file the daemon runs on."""
+    from monstertruck_runtime.clock import run_wall
+    from monstertruckd.calibrate.record import CalibrationFile
+    from monstertruckd.calibrate.rpc import SHOW
+
+    if config is not None:
+        store = _store(config)
+        newest, file = store.newest(), store.current()
+        state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file}
+    else:
+
+        async def ask(clock: "Clock") -> dict[str, Any]:
+            async with _client(robot, endpoint, clock) as client:
+                return await client.call(SHOW)
+
+        state = run_wall(ask)
+        content = state["content"]
+        file = None if content is None else CalibrationFile.model_validate_json(_json(content))
+    if json_output:
+        print_json(state)
+        return
+    if file is None:
+        remark(f"nothing calibrated yet: no file in {state['folder']}")
+        return
+    for result in file.results.values():
+        _print(result)
+    remark(f"file: {state['newest']} ({file.change})")
+    if "loaded" in state and state["loaded"] != state["newest"]:
+        remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What every wizard's command is told."""
+
+    robot: str
+    endpoint: str
+    config: Path | None
+    answers: list[str]
+    yes: bool
+    undo: bool
+    json_output: bool
+
+
+def _run(wizard: "Wizard", call: _Call) -> None:
+    from monstertruck_runtime.clock import run_wall
+
+    if call.undo:
+        _undo(wizard.name, call)
+        return
+    result, file = run_wall(lambda clock: _guide(wizard, call, clock))
+    if call.json_output:
+        print_json({"result": result, "file": file})
+    else:
+        _print(result)
+    remark(f"saved in {file}; it counts from the next start of the daemon")
+    if result.again is not None:
+        remark(f"not complete: {result.again}")
+
+
+async def _guide(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
+    from monstertruckd.calibrate.guide import calibrate
+    from monstertruckd.calibrate.record import CalibrationFile
+    from monstertruckd.calibrate.rpc import SHOW
+    from monstertruckd.cli.calibrate_panel import TerminalPanel
+    from monstertruckd.config.truck import TruckConfig
+
+    async with _client(call.robot, call.endpoint, clock) as client:
+        running = await client.call("config")
+        running.pop("sim", None)  # the world's truth is nothing a wizard may know
+        config = TruckConfig.model_validate_json(_json(running))
+        content = (await client.call(SHOW))["content"]
+        known = {} if content is None else CalibrationFile.model_validate_json(_json(content)).results
+        with TerminalPanel(call.answers, yes=call.yes) as panel:
+            return await calibrate(wizard, client, panel, clock, config, known)
+
+
+def _undo(name: "WizardName", call: _Call) -> None:
+    from monstertruck_runtime.clock import WallClock, run_wall
+    from monstertruckd.calibrate.rpc import UNDO
+
+    if call.config is not None:
+        clock = WallClock()
+        file = str(_store(call.config).undo(name, clock.now() + clock.real_offset()))
+    else:
+
+        async def ask(clock: "Clock") -> dict[str, Any]:
+            async with _client(call.robot, call.endpoint, clock) as client:
+                return await client.call(UNDO, {"wizard": name, "by": client.source})
+
+        file = run_wall(ask)["file"]
+    if call.json_output:
+        print_json({"file": file})
+    remark(f"{name}: as before, in {file}; it counts from the next start of the daemon")
+
+
+def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
+    from monstertruck_runtime.client import TruckClient
+
+    return TruckClient(robot, endpoint, clock=clock, timeout=10.0)
+
+
+def _store(config: Path) -> Any:
+    from monstertruckd.calibrate.apply import store_of
+    from monstertruckd.config.load import load_uncalibrated
+
+    return store_of(load_uncalibrated(config)[0])
+
+
+def _json(value: Any) -> str:
+    import json
+
+    return json.dumps(value)
+
+
+def _print(result: "Result") -> None:
+    rows = [
+        (f"{result.wizard}.{e.name}", _number(e), e.unit, str(e.samples), e.date.replace("T", " "), e.meaning)
+        for e in result.estimates
+    ]
+    print_table(("what", "value", "unit", "samples", "measured", "meaning"), rows, right=("value", "samples"))
+    for missing in result.unobserved:
+        remark(f"not seen: {missing}")
+
+
+def _number(estimate: "Estimate") -> str:
+    """The value with half its interval, to two digits of that."""
+    value, low, high = estimate.value, estimate.low, estimate.high
+    if isinstance(value, bool) or low is None or high is None:
+        return f"{value:.5g}" if isinstance(value, float) else str(value).lower()
+    import math
+
+    half = (high - low) / 2
+    digits = max(0, 1 - math.floor(math.log10(half))) if half > 0 else 3
+    return f"{value:.{digits}f} ± {half:.{digits}f}"
