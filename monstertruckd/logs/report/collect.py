@@ -48,6 +48,8 @@ class Run:
     damage: str | None = None
     library: str = ""
     attachments: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, str] = field(default_factory=dict)
+    """What the log says of its run."""
     offset: int | None = None
     """Real minus daemon time, ns, as the log last knew it."""
     traces: dict[Curve, Trace] = field(default_factory=dict)
@@ -85,8 +87,15 @@ class Run:
         return math.sqrt(self.cross_track_square / self.cross_track_count) if self.cross_track_count else None
 
     @property
+    def is_black_box(self) -> bool:
+        """Pictures are thinned out on purpose, and the file counts its losses itself."""
+        return "stopped_at_ns" in self.metadata
+
+    @property
     def lost(self) -> int:
         """Messages that were published but are not in the log."""
+        if self.is_black_box:
+            return int(self.metadata.get("lost", 0))
         return sum(row.lost for row in self.traffic.values())
 
 
@@ -210,7 +219,6 @@ def collect(path: str | Path, progress: Progress | None = None) -> Run:
 
 def _describe(run: Run, reader: LogReader) -> None:
     """What stands before the first message: attachments, library, and the offset the run began with."""
-    began = 0
     for record in reader.preamble():
         match record:
             case Header():
@@ -219,9 +227,9 @@ def _describe(run: Run, reader: LogReader) -> None:
                 with suppress(ValueError):
                     run.attachments[record.name.removesuffix(".json")] = json.loads(record.data)
             case Metadata(name="run"):
-                began = int(record.metadata.get("real_offset_ns", 0))
+                run.metadata = dict(record.metadata)
     if run.offset is None:
-        run.offset = began
+        run.offset = int(run.metadata.get("real_offset_ns", 0))
 
 
 def _decoded(entry: LogMessage) -> Message | None:

@@ -74,7 +74,7 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
 
 def robot(run: Run) -> str:
     """Name of the robot by its configuration."""
-    return str(run.attachments.get("config", {}).get("robot", "unknown robot"))
+    return str(run.attachments.get("config", {}).get("robot") or run.metadata.get("robot", "unknown robot"))
 
 
 def began(run: Run) -> str | None:
@@ -128,7 +128,7 @@ def _head(run: Run) -> str:
         badges.append((f"{run.drops} messages dropped in the daemon", Tone.WARNING))
     shown = "".join(f'<span class="badge {tone.name.lower()}">{escape(text)}</span>' for text, tone in badges)
     return (
-        f'<div class="over">Run report</div><h1>{escape(robot(run))}</h1>'
+        f'<div class="over">{"Black box" if run.is_black_box else "Run report"}</div><h1>{escape(robot(run))}</h1>'
         f'<div class="under">{escape(when)} · {escape(run.path.name)}</div><div class="badges">{shown}</div>'
     )
 
@@ -248,13 +248,15 @@ def _traffic(run: Run) -> str:
                 f"{row.bytes / 1e3:.0f}",
             ]
         )
-    heads = ("topic", "messages", "Hz", "nominal", "lost", "silences", "longest, s", "kB")
+    missing = "left out" if run.is_black_box else "lost"
+    heads = ("topic", "messages", "Hz", "nominal", missing, "silences", "longest, s", "kB")
     note = (
-        "Lost: published, but not in this log. Silence: longer than the topic's staleness limit without a message. "
+        f"{missing.capitalize()}: published, but not in this log. "
+        "Silence: longer than the topic's staleness limit without a message. "
         + (f"{sum(row.undecodable for row in run.traffic.values())} messages could not be decoded. ")
         * any(row.undecodable for row in run.traffic.values())
     )
-    table = _table(heads, rows, right=set(range(1, 8)), alarm={4})
+    table = _table(heads, rows, right=set(range(1, 8)), alarm=set() if run.is_black_box else {4})
     return f'<h2>Messages</h2><div class="card scroll">{table}<p class="note">{note}</p></div>'
 
 

@@ -15,8 +15,8 @@ MAY_2026 = 1_777_600_000 * SECOND
 class Writer:
     """A log written message by message, counting sequences as the recorder does."""
 
-    def __init__(self, file, **attachments):
-        self.log = LogFile(file, "lz4", 1 << 16, attachments, {"real_offset_ns": "5"}, SECOND)
+    def __init__(self, file, metadata=None, **attachments):
+        self.log = LogFile(file, "lz4", 1 << 16, attachments, {"real_offset_ns": "5"} | (metadata or {}), SECOND)
         self.sequences = {}
 
     def put(self, topic, message, skip=0):

@@ -162,6 +162,20 @@ def test_stops_are_told_with_their_chain(tmp_path):
     assert "clearance 0.12 (limit 0.2) m" in text
 
 
+def test_pictures_left_out_of_a_black_box_are_no_loss(tmp_path):
+    file = tmp_path / "box.mcap"
+    writer = Writer(file, {"robot": "digger", "stopped_at_ns": "5", "lost": "2"})
+    writer.put(t.GATE, gate(SECOND, 0))
+    writer.put(t.GATE, gate(2 * SECOND, 1), skip=50)
+    writer.log.finish()
+    done = report(file)
+    assert (done.figures()["lost"], done.figures()["robot"]) == (2, "digger")
+    text = done.file.read_text()
+    assert "Black box" in text
+    assert "left out" in text
+    assert "alarm" not in re.search(r"<h2>Messages.*?</table>", text, re.DOTALL)[0]
+
+
 def test_cursor_data_belongs_to_the_plots(log):
     text = report(log).file.read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', text)[1])
