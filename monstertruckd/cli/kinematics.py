@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.cli.kinematics_fit import fit
-from monstertruckd.cli.kinematics_output import figure, print_json, print_table, refusals, text
+from monstertruckd.cli.kinematics_output import figure, refusals, text
+from monstertruckd.cli.output import JsonOption, print_json, print_table
 
 if TYPE_CHECKING:
     from monstertruck_kinematics.truck import Mode
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Kinematics of the truck and of every wheeled-robot family.", no_args_is_help=True)
 app.command("fit")(fit)
 
-Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 Png = Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")]
 Family = Annotated[str, typer.Argument(help="Drive family; `kinematics show` lists them.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", "-s", help="Parameter as name=value, repeatable.")]
@@ -28,7 +28,7 @@ Track = Annotated[float, typer.Option(help="Track, m.")]
 def show_command(
     family: Annotated[str | None, typer.Argument(help="One family in detail.")] = None,
     settings: Settings = None,
-    json_output: Json = False,
+    json_output: JsonOption = False,
 ) -> None:
     """The drive families, or one of them: inputs, parameters, mobility."""
     from monstertruck_kinematics.catalog import FAMILIES, build_drive, parameters_of
@@ -72,7 +72,7 @@ def mobility_command(
     settings: Settings = None,
     wheels: Annotated[Path | None, typer.Option("--wheels", "-w", help="YAML list of wheels instead.")] = None,
     png: Png = None,
-    json_output: Json = False,
+    json_output: JsonOption = False,
 ) -> None:
     """Degrees of mobility, steerability and manoeuvrability, and the turning centre."""
     from monstertruck_kinematics.catalog import build_drive
@@ -102,6 +102,7 @@ def mobility_command(
         print_table(
             ("wheel", "kind", "x m", "y m", "heading deg"),
             [(w.name, type(w).__name__, f"{w.x:.3f}", f"{w.y:.3f}", f"{math.degrees(w.heading):.2f}") for w in chosen],
+            right=("x m", "y m", "heading deg"),
         )
     if png:
         _draw_wheels(png, chosen, mobility.icr)
@@ -113,7 +114,7 @@ def radius_table_command(
     wheelbase: Wheelbase = 0.32,
     track: Track = 0.26,
     png: Png = None,
-    json_output: Json = False,
+    json_output: JsonOption = False,
 ) -> None:
     """Least turning radius by steering mode and steering limit."""
     from monstertruck_kinematics.truck import FourWheelSteering
@@ -139,6 +140,7 @@ def radius_table_command(
         print_table(
             ("mode", "limit deg", "radius m", "if every wheel keeps the limit, m"),
             [(mode, f"{limit:.1f}", f"{axle:.3f}", f"{every:.3f}") for mode, limit, axle, every in table],
+            right=("limit deg", "radius m", "if every wheel keeps the limit, m"),
         )
     if png:
         angles = [5.0 + 0.25 * i for i in range(141)]
@@ -160,7 +162,7 @@ def linkage_command(
     arms: Annotated[str, typer.Option(help="forward or rearward.")] = "rearward",
     polynomials: Annotated[str, typer.Option(help="corrected, as_published or 2016.")] = "corrected",
     png: Png = None,
-    json_output: Json = False,
+    json_output: JsonOption = False,
 ) -> None:
     """Wheel angles over the servo angle: a linkage beside the truck's fitted front polynomials.
 
@@ -199,7 +201,8 @@ def linkage_command(
             )
             for row in zip(*columns.values(), strict=True)
         ]
-        print_table(tuple(n.replace("_", " ") for n in columns), rows)
+        headings = tuple(n.replace("_", " ") for n in columns)
+        print_table(headings, rows, right=headings)
         typer.echo("angles in degrees; defect: tan l - tan r - (w/L) tan l tan r, 0 for ideal Ackermann wheels")
     if png:
         with figure(png, "servo, deg", "wheel, deg") as axes:

@@ -3,16 +3,28 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruckd.cli.kinematics_output import figure, print_json, print_table, refusals
+from monstertruckd.cli.kinematics_output import figure, refusals
+from monstertruckd.cli.output import JsonOption, print_json, print_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from monstertruck_kinematics.identification import SkidModel
+
+ABOUT: Final = """\
+A skid-steer robot drove seven circles, published with their radii and speeds: columns are the ratio of its sides' wheel
+rates and the faster one, rad/s. Each line is a model fitted to all of them, and how far it is off a circle:
+  ideal             nominal wheel radius and track, no slip
+  effective radius  one wheel radius for both sides
+  symmetric         and one effective track
+  centre of mass    and, instead of the track, an offset of the centre
+  icr               and, instead, a turning centre for each side
+  icr and slip      and a ratio of the sides' wheel radii
+ls: least squares over radii and speeds; max: least worst error. A trajectory of one's own: kinematics fit FILE"""
 
 
 def fit(
@@ -25,7 +37,7 @@ def fit(
     window: Annotated[int, typer.Option(help="Samples over which motion is compared.")] = 10,
     bounded: Annotated[bool, typer.Option(help="Believable parameters only.")] = True,
     png: Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    json_output: JsonOption = False,
 ) -> None:
     """Identify a skid-steer robot: from a trajectory, or from the skid-steer paper's circles."""
     from monstertruck_kinematics.identification import MODEL_NAMES, skid_model
@@ -55,7 +67,7 @@ def _fit_file(path: Path, models: "list[SkidModel]", window: int, *, json_output
     for f in fits:
         typer.echo(f"{f.model.name}: rms {f.fit.rms:.3f} of the expected noise")
         rows = [(n, f"{v:.5f}", f"{e:.5f}" if math.isfinite(e) else "open") for n, v, e in f.parameter_table()]
-        print_table(("parameter", "value", "standard error"), rows)
+        print_table(("parameter", "value", "standard error"), rows, right=("value", "standard error"))
 
 
 def _fit_paper(models: "list[SkidModel]", png: Path | None, *, json_output: bool) -> None:
@@ -91,19 +103,19 @@ def _fit_paper(models: "list[SkidModel]", png: Path | None, *, json_output: bool
             }
         )
         return
+    ratios = [c.label.removesuffix(" rad/s").replace("left ", "").replace(", ", "\n") for c in PUBLISHED_CIRCLES]
+    print(ABOUT)
     for quantity, title in ((0, "radius error, %"), (1, "speed error, %")):
-        ratios = [c.label.removesuffix(" rad/s").replace("left ", "").replace(", ", "\n") for c in PUBLISHED_CIRCLES]
         heads = (title, *ratios, "worst")
         rows = [
             (name, *(f"{v:+.1f}" for v in e[quantity]), f"{abs(e[quantity]).max():.1f}") for name, e in errors.items()
         ]
-        print_table(heads, rows)
-    print_table(
-        ("worst error of fits of less, %", "all radii, no speeds", "2:1 and 3:1, both"),
-        [(name, f"{radii[name]:.1f}", f"{driven[name]:.1f}") for name in driven],
-    )
-    typer.echo("ls: least squares over radii and speeds; max: least worst error")
-    typer.echo(f"Equal ratios were measured up to {floor:.1f} % off one common speed per rate: no model explains that.")
+        print()
+        print_table(heads, rows, right=heads[1:])
+    print()
+    heads = ("worst error of fits of less, %", "all radii, no speeds", "2:1 and 3:1, both")
+    print_table(heads, [(name, f"{radii[name]:.1f}", f"{driven[name]:.1f}") for name in driven], right=heads[1:])
+    print(f"\nEqual ratios were measured up to {floor:.1f} % off one common speed per rate: no model explains that.")
     if png:
         _draw_errors(png, {name: abs(e).max(axis=0) for name, e in errors.items()})
 

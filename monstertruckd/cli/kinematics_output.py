@@ -1,13 +1,11 @@
-"""How the kinematics commands print, draw and refuse."""
+"""How the kinematics commands write facts, draw and refuse."""
 
-import json
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import typer
+from monstertruckd.cli.output import remark
 
 
 @contextmanager
@@ -24,34 +22,6 @@ def refusals() -> Iterator[None]:
         yield
     except KinematicsError as error:
         raise InputError(str(error)) from error
-
-
-def print_json(value: Any) -> None:
-    """One JSON value; what is not finite becomes null."""
-
-    def plain(item: Any) -> Any:
-        if isinstance(item, float):
-            return item if math.isfinite(item) else None
-        if isinstance(item, dict):
-            return {key: plain(entry) for key, entry in item.items()}
-        if isinstance(item, list | tuple):
-            return [plain(entry) for entry in item]
-        return item
-
-    typer.echo(json.dumps(plain(value), indent=2))
-
-
-def print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table without frame, its first column to the left."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for i, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
 
 
 def text(value: object) -> str:
@@ -86,4 +56,4 @@ def figure(path: Path, across: str, up: str) -> Iterator[Any]:
         drawing.savefig(path, dpi=120, format="png")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
-    typer.echo(f"wrote {path}", err=True)
+    remark(f"wrote {path}")

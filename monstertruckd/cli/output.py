@@ -110,7 +110,7 @@ def print_table(
 
 
 def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[str]) -> list[str]:
-    lines = [list(headings), *map(list, rows)]
+    lines = [[heading.replace("\n", " ") for heading in headings], *map(list, rows)]
     widths = [max(len(cell) for cell in column if len(cell) <= WIDE_CELL) for column in zip(*lines, strict=True)]
     to_the_right = [heading in right for heading in headings]
     return [
