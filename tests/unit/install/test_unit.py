@@ -34,6 +34,7 @@ def test_a_daemon_that_hangs_or_dies_is_replaced_and_the_drive_stopped():
     assert unit["Type"] == ["notify"]
     assert unit["WatchdogSec"] == ["3"]
     assert unit["TimeoutAbortSec"] == ["1"], "a frozen process takes no SIGABRT"
+    assert unit["TimeoutStartSec"] == ["30"], "the watchdog counts from READY on only"
     assert unit["Restart"] == ["always"]
     assert unit["RestartSec"] == ["1"]
     assert unit["StartLimitIntervalSec"] == ["0"]
