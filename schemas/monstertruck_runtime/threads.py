@@ -47,9 +47,15 @@ class ThreadHop(Generic[T]):
                 ranks = [self._rank(waiting) for waiting in self._items]
                 del self._items[ranks.index(min(ranks))]
                 self._lost += 1
-            if not self._scheduled:
-                self._scheduled = True
-                self._loop.call_soon_threadsafe(self._take)
+            if self._scheduled:
+                return
+            self._scheduled = True
+        # Without the lock: the loop may run at once, and would have to wait for it.
+        try:
+            self._loop.call_soon_threadsafe(self._take)
+        except RuntimeError:  # the loop was closed meanwhile
+            if not self._closed:
+                raise
 
     def close(self) -> None:
         """Discard what waits and everything to come; to be called while the loop lives."""

@@ -1,0 +1,191 @@
+"""What typed messages cost over plain ones: a scan of 682 beams to another process and back.
+
+    python benchmarks/bus.py [--rounds N]
+
+Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them: the
+product (message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh,
+asyncio), the same without asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``),
+rospy's ``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100
+round trips a second. The codec is measured alone, in processor time. The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import select
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bus_peers import scan
+
+from monstertruck_runtime import wire
+from monstertruck_schemas.topics import SCAN
+from monstertruckd.demo.wall import free_endpoint
+
+HERE = Path(__file__).resolve().parent
+SYSTEM_PYTHON = Path("/usr/bin/python3")
+GOALS = {
+    "p50_over_raw": 1.3,
+    "cpu_over_raw": 1.5,
+    "codec_us": 10.0,
+    "p50_over_rospy": 1.3,
+    "cpu_over_rospy": 1.3,
+}
+BURST, PACED, RATE = 400, 150, 100.0
+
+
+class Pair:
+    """Two running ends, driven through the standard input of one."""
+
+    def __init__(self, ping: subprocess.Popen[bytes], echo: subprocess.Popen[bytes]) -> None:
+        self._ping = ping
+        self._clocks = [_process_clock(process.pid) for process in (ping, echo)]
+        assert self._answer() == b"ready\n"
+
+    def round_trips(self, count: int, rate: float) -> tuple[np.ndarray, float]:
+        """Times in us and processor seconds of both processes per 1000 messages."""
+        before = self._used()
+        assert self._ping.stdin is not None
+        self._ping.stdin.write(b"%d %f\n" % (count, rate))
+        self._ping.stdin.flush()
+        times = json.loads(self._answer())
+        return np.array(times) / 1e3, (self._used() - before) / (2 * count) * 1000
+
+    def _used(self) -> float:
+        return sum(map(time.clock_gettime, self._clocks))
+
+    def _answer(self) -> bytes:
+        assert self._ping.stdout is not None
+        if not select.select([self._ping.stdout], [], [], 60)[0]:
+            raise RuntimeError(f"{self._ping.args} does not answer")
+        return self._ping.stdout.readline()
+
+
+def _process_clock(pid: int) -> int:
+    """Number of the clock of another process's processor time, as clock_getcpuclockid(3) makes it."""
+    return (~pid << 3) | 2
+
+
+@contextmanager
+def _processes(ping: list[str], echo: list[str], **options: Any) -> Iterator[Pair]:
+    pipe = subprocess.PIPE
+    echoing = subprocess.Popen(echo, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, **options)
+    pinging = subprocess.Popen(ping, stdin=pipe, stdout=pipe, **options)
+    try:
+        yield Pair(pinging, echoing)
+    finally:
+        for process in (pinging, echoing):
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def zenoh_pair(kind: str) -> Iterator[Pair]:
+    """Ends of ``bus_peers``."""
+    one, other = free_endpoint(), free_endpoint()
+    program = [sys.executable, str(HERE / "bus_peers.py"), kind]
+    with _processes([*program, "ping", one, other], [*program, "echo", other, one]) as pair:
+        yield pair
+
+
+@contextmanager
+def rospy_pair() -> Iterator[Pair]:
+    """Ends of ``bus_rospy`` with a master of their own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = {**os.environ, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
+    environment.pop("PYTHONPATH", None)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    master = subprocess.Popen(["rosmaster", "--core", "-p", str(port)], env=environment, **quiet)
+    program = [str(SYSTEM_PYTHON), str(HERE / "bus_rospy.py")]
+    try:
+        time.sleep(3.0)
+        with _processes([*program, "ping"], [*program, "echo"], env=environment) as pair:
+            yield pair
+    finally:
+        master.kill()
+        master.wait()
+
+
+def has_rospy() -> bool:
+    """Whether the system's Python finds Debian's ROS 1."""
+    if shutil.which("rosmaster") is None:
+        return False
+    check = [str(SYSTEM_PYTHON), "-c", "import rospy, sensor_msgs.msg"]
+    return subprocess.run(check, capture_output=True, check=False).returncode == 0
+
+
+def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
+    """Processor us of encoding one scan and of decoding it: median of short bursts, which take turns."""
+    message = scan(1234, time.monotonic_ns())
+    data = wire.encode(SCAN, message)
+    jobs: tuple[Callable[[], object], ...] = lambda: wire.encode(SCAN, message), lambda: wire.decode(SCAN, data)
+    costs = np.empty((repeats, len(jobs)))
+    for row in costs:
+        for i, job in enumerate(jobs):
+            begin = time.thread_time_ns()
+            for _ in range(burst):
+                job()
+            row[i] = (time.thread_time_ns() - begin) / 1e3 / burst
+    encode, decode = np.median(costs, axis=0)
+    return float(encode), float(decode)
+
+
+def compare(rounds: int) -> dict[str, float]:
+    """Medians over the rounds; ratios are those of one round."""
+    with ExitStack() as stack:
+        pairs = {kind: stack.enter_context(zenoh_pair(kind)) for kind in ("typed", "raw", "thread")}
+        if has_rospy():
+            pairs["rospy"] = stack.enter_context(rospy_pair())
+        p50 = {kind: np.empty(rounds) for kind in pairs}
+        p99, cpu = ({kind: np.empty(rounds) for kind in pairs} for _ in range(2))
+        for pair in pairs.values():
+            pair.round_trips(BURST, 0)
+        for number in range(rounds):
+            for kind, pair in pairs.items():
+                times, _ = pair.round_trips(BURST, 0)
+                p50[kind][number], p99[kind][number] = np.percentile(times, (50, 99))
+                cpu[kind][number] = pair.round_trips(PACED, RATE)[1]
+    figures = {}
+    for kind in pairs:
+        figures |= {f"{kind}_p50_us": _median(p50[kind]), f"{kind}_p99_us": _median(p99[kind])}
+        figures[f"{kind}_cpu_s_per_1000"] = _median(cpu[kind])
+    for kind in pairs.keys() - {"typed"}:
+        figures |= {
+            f"p50_over_{kind}": _median(p50["typed"] / p50[kind]),
+            f"cpu_over_{kind}": _median(cpu["typed"] / cpu[kind]),
+        }
+    return figures
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=10)
+    figures = compare(parser.parse_args().rounds)
+    figures["encode_us"], figures["decode_us"] = codec()
+    figures["codec_us"] = figures["encode_us"] + figures["decode_us"]
+    for name, value in figures.items():
+        print(f"{name:24} {value:9.3f}")
+    goals = {name: goal for name, goal in GOALS.items() if name in figures}
+    if missing := GOALS.keys() - goals.keys():
+        print(f"not measured, because Debian's ROS 1 is not installed: {', '.join(sorted(missing))}")
+    met = all(figures[name] <= goal for name, goal in goals.items())
+    print(json.dumps({"bench": "bus", "figures": figures, "goals": goals, "met": met}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""The two ends of ``bus.py``: scans to and fro over Zenoh, as the product does it and as plain bytes.
+
+    python bus_peers.py typed|raw|thread ping|echo HERE THERE
+
+``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
+``raw``: plain bytes, put and awaited in asyncio. ``thread``: plain bytes answered in Zenoh's own thread, no asyncio
+at all. Every end listens at HERE and dials THERE. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
+other) on its standard input and answers with a JSON list of round trips in ns.
+"""
+
+import asyncio
+import json
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+
+import numpy as np
+import zenoh
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import WallClock, run_wall
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+from monstertruck_schemas.topics import SCAN, Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
+from monstertruckd.bus.zenoh_session import ZenohBridge
+from monstertruckd.demo.wall import connect
+
+BEAMS = 682
+RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)
+CODES = np.full(BEAMS, VALID_BEAM, np.uint8)
+PATIENCE = 5.0
+OTHER = {"ping": "echo", "echo": "ping"}
+
+
+def scan(number: int, stamp: int) -> LaserScan:
+    """One scan as a driver makes it."""
+    return LaserScan(
+        stamp=stamp,
+        received=stamp,
+        seq=number,
+        frame="lidar",
+        start_angle=-2.086,
+        end_angle=2.086,
+        time_increment=0.1 / 1024,
+        scan_time=0.1,
+        range_min=0.02,
+        range_max=5.6,
+        ranges=RANGES,
+        codes=CODES,
+        tilt=0.01,
+    )
+
+
+@asynccontextmanager
+async def typed(me: str, here: str, there: str) -> AsyncIterator[tuple[Callable[[LaserScan], None], Callable]]:
+    """Put function and receive function of the product's own classes."""
+    clock = WallClock()
+    bus = Bus(clock)
+    out = bus.publisher(SCAN, Writer.DRIVER)
+    ready = asyncio.Event()
+    bridge = ZenohBridge(me, bus, ZenohConfig(listen=(here,)), clock, Rpc(clock))
+    serving = asyncio.create_task(bridge.run(ready.set))
+    await ready.wait()
+    async with await connect(clock, OTHER[me], there) as client:
+        with client.subscribe(SCAN, fifo(16)) as scans:
+            yield out.put, scans.next
+    serving.cancel()
+    await asyncio.wait([serving])
+
+
+class Inbox:
+    """Plain bytes from Zenoh's thread to one waiting coroutine: the least that does it."""
+
+    def __init__(self) -> None:
+        self._items: deque[bytes] = deque(maxlen=16)
+        self._loop = asyncio.get_running_loop()
+        self._waiter: asyncio.Future[None] | None = None
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Take a sample; called by Zenoh."""
+        self._items.append(sample.payload.to_bytes())
+        self._loop.call_soon_threadsafe(self._wake)
+
+    async def get(self) -> bytes:
+        """Wait for the next one."""
+        while not self._items:
+            self._waiter = self._loop.create_future()
+            await self._waiter
+        return self._items.popleft()
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+
+@asynccontextmanager
+async def raw(
+    me: str, here: str, there: str, receive: Callable[[zenoh.Sample], None]
+) -> AsyncIterator[Callable[[bytes], None]]:
+    """Put function of plain bytes; ``receive`` is called with every sample of the other end.
+
+    Sessions are configured as the product's are, for the comparison is of what lies between them and the reader.
+    """
+    listening = zenoh.open(zenoh.Config.from_json5(session_config(me, ZenohConfig(listen=(here,)))))
+    dial = json.loads(session_config(me, ZenohConfig(connect=(there,)), probe=True))
+    while True:
+        try:
+            dialled = zenoh.open(zenoh.Config.from_json5(json.dumps(dial)))
+            break
+        except zenoh.ZError:
+            await asyncio.sleep(0.2)
+    with listening, dialled:
+        dialled.declare_subscriber(SCAN.key(OTHER[me]), receive)
+        yield listening.declare_publisher(
+            SCAN.key(me), encoding=wire.encoding(SCAN), congestion_control=zenoh.CongestionControl.DROP
+        ).put
+
+
+async def pings(put: Callable[[int], None], receive: Callable[[], Awaitable[object]]) -> None:
+    """Serve the commands on standard input."""
+    await asyncio.sleep(1.0)  # until the other end has subscribed
+    print("ready", flush=True)
+    while words := (await asyncio.to_thread(sys.stdin.readline)).split():
+        count, rate = int(words[0]), float(words[1])
+        times = []
+        due = time.monotonic()
+        for number in range(count):
+            if rate:
+                due += 1 / rate
+                await asyncio.sleep(max(0.0, due - time.monotonic()))
+            begin = time.perf_counter_ns()
+            put(number)
+            async with asyncio.timeout(PATIENCE):
+                await receive()
+            times.append(time.perf_counter_ns() - begin)
+        print(json.dumps(times), flush=True)
+
+
+async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> None:
+    """Play one end until standard input ends (ping) or for ever (echo)."""
+    payload = wire.encode(SCAN, scan(0, time.monotonic_ns()))
+    async with AsyncExitStack() as stack:
+        if kind == "typed":
+            put, receive = await stack.enter_async_context(typed(me, here, there))
+            if me == "ping":
+                await pings(lambda number: put(scan(number, time.monotonic_ns())), receive)
+            while True:
+                put(await receive())
+        if kind == "raw":
+            inbox = Inbox()
+            send = await stack.enter_async_context(raw(me, here, there, inbox.put))
+            if me == "ping":
+                await pings(lambda _: send(payload), inbox.get)
+            while True:
+                send(await inbox.get())
+        await in_thread(stack, partial(raw, me, here, there), me, payload)
+
+
+async def in_thread(
+    stack: AsyncExitStack, session: Callable[[Callable[[zenoh.Sample], None]], object], me: str, payload: bytes
+) -> None:
+    """Both ends without asyncio: echoed in Zenoh's thread, awaited by blocking."""
+    arrived = threading.Semaphore(0)
+    sends: list[Callable[[bytes], None]] = []
+
+    def receive(sample: zenoh.Sample) -> None:
+        data = sample.payload.to_bytes()
+        if me == "echo":
+            sends[0](data)
+        else:
+            arrived.release()
+
+    sends.append(await stack.enter_async_context(session(receive)))
+    if me == "echo":
+        await asyncio.Event().wait()
+
+    async def blocking() -> None:
+        assert arrived.acquire(timeout=PATIENCE)
+
+    await pings(lambda _: sends[0](payload), blocking)
+
+
+if __name__ == "__main__":
+    run_wall(lambda clock: run(clock, *sys.argv[1:]))
