@@ -15,7 +15,7 @@ from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Event, Severity, Stop
+from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
@@ -37,6 +37,13 @@ _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28
 _HEIGHT: Final = 0.15
 """Of the truck's box, m: no configuration tells it."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+_JOURNAL: Final = {
+    LogLevel.DEBUG: "DEBUG",
+    LogLevel.INFO: "INFO",
+    LogLevel.WARNING: "WARN",
+    LogLevel.ERROR: "ERROR",
+    LogLevel.FATAL: "CRITICAL",
+}
 
 
 def convert(log: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None) -> Path:
@@ -104,6 +111,7 @@ class Scene:
             t.HEALTH.name: self._health,
             t.EVENT.name: self._event,
             t.STOP.name: self._stop,
+            t.LOG.name: self._journal,
         }
 
     def truck(self, reader: LogReader) -> None:
@@ -215,6 +223,10 @@ class Scene:
 
     def _stop(self, stop: Stop) -> None:
         self._stream.log("events", rr.TextLog(stop.text, level="INFO" if stop.ordered else "ERROR"))
+
+    def _journal(self, record: LogRecord) -> None:
+        level = _JOURNAL[record.level]
+        self._stream.log("events/journal", rr.TextLog(f"{record.name}: {record.text}", level=level))
 
 
 def entity(figure: Figure, curve: Curve) -> str:

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
+from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruckd.cli.logs import app, needs_extra
 from monstertruckd.logs.rerun_log import TIMELINE, convert
 from monstertruckd.logs.selection import Selection
@@ -22,7 +23,20 @@ from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 from tests.unit.logs.test_export import grid, image, path, transforms
 from tests.unit.recorder.conftest import scan
 
-MAKERS = {t.SCAN: scan, t.ODOMETRY: odometry, t.POSE: odometry, t.GATE: gate, t.TRANSFORMS: transforms, t.CAMERA: image}
+
+def record(now, seq):
+    return LogRecord(stamp=now, received=now, seq=seq, level=LogLevel.WARNING, name="gate", text="late")
+
+
+MAKERS = {
+    t.SCAN: scan,
+    t.ODOMETRY: odometry,
+    t.POSE: odometry,
+    t.GATE: gate,
+    t.TRANSFORMS: transforms,
+    t.CAMERA: image,
+    t.LOG: record,
+}
 GOLDEN = sorted((Path(__file__).parents[2] / "data" / "golden").glob("*/run.mcap"))
 
 
@@ -56,6 +70,7 @@ def test_every_kind_of_message_becomes_an_entity(log, tmp_path):
     found = read(convert(log, tmp_path / "out" / "run.rrd"))
     assert {"/scan", "/map", "/path", "/way", "/camera", "/frames/base", "/truck", "/states/gate"} <= found.keys()
     assert rows(found["/scan"]) == rows(found["/camera"]) == rows(found["/frames/base"]) == 20
+    assert rows(found["/events/journal"]) == 20
     assert rows(found["/states/gate"]) == 1, "only changes of a state"
     assert rows(found["/signals/speed/measured"]) == 20
     assert all(chunk.timeline_names == [TIMELINE] for chunk in found["/scan"])
