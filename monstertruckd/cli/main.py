@@ -50,6 +50,7 @@ app.command("drill")(drill.drill)
 app.command("run")(robot.run)
 app.command("check-config", hidden=True)(config.show)  # its name before there were others
 app.command("topics")(robot.topics)
+app.command("reasons")(robot.reasons)
 app.command("status")(live.status)
 app.command("echo")(live.echo)
 app.command("drive")(drive.drive)

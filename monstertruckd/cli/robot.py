@@ -1,4 +1,4 @@
-"""Commands of the robot itself: run the daemon, print its topic table."""
+"""Commands of the robot itself: run the daemon, print its tables of topics and reasons."""
 
 from typing import Annotated
 
@@ -53,3 +53,14 @@ def topics(json_output: JsonOption = False) -> None:
         right=("Hz", "stale s"),
         title="Topics: mt/<robot>/<name>",
     )
+
+
+def reasons(json_output: JsonOption = False) -> None:
+    """Print the reasons of events, refusals and ends, each with the exit code it gives a command."""
+    from monstertruck_schemas.reasons import Reason
+
+    if json_output:
+        print_json([{"reason": reason, "exit_code": reason.exit_code, "text": reason.text} for reason in Reason])
+        return
+    rows = [(reason.value, str(reason.exit_code), reason.text) for reason in Reason]
+    print_table(("reason", "exit code", "what"), rows, right=("exit code",))
