@@ -1,0 +1,49 @@
+"""The commands on logs, as a user types them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from monstertruckd.cli.main import app
+
+GOLDEN = max((Path(__file__).parents[2] / "data" / "golden").glob("*/run.mcap"))
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["log", *map(str, arguments)])
+
+
+def test_report_names_its_file_or_prints_its_figures(tmp_path):
+    page = tmp_path / "page.html"
+    assert run("report", GOLDEN, "--output", page).output.strip() == str(page)
+    assert page.read_text().startswith("<!doctype html>")
+    figures = json.loads(run("report", GOLDEN, "--output", page, "--json").stdout)
+    assert figures["robot"] == "truck"
+
+
+@pytest.mark.parametrize("form", ["csv", "npz", "ros2", "mcap"])
+def test_export_lists_what_it_wrote(tmp_path, form):
+    target = tmp_path / "out"
+    done = run("export", GOLDEN, target, "--format", form, "--topic", "sensor/scan", "--start", 1, "--end", 2, "--json")
+    assert done.exit_code == 0, done.output
+    files = json.loads(done.stdout)
+    assert files.keys() == {"sensor/scan"}
+    assert Path(files["sensor/scan"]).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (("report", "gone.mcap"), 4, "gone.mcap: no such log"),
+        (("export", GOLDEN, "out", "--topic", "sensor/nose"), 4, "no topic sensor/nose"),
+        (("export", GOLDEN, "out", "--start", "2", "--end", "1"), 3, "expected an end after the start"),
+        (("view", "gone.mcap", "--save", "x.rrd"), 4, "gone.mcap: no such log"),
+    ],
+)
+def test_refusals_have_a_sentence_and_an_exit_code(tmp_path, monkeypatch, arguments, code, text):
+    monkeypatch.chdir(tmp_path)
+    done = run(*arguments)
+    assert done.exit_code == code
+    assert text in done.output
