@@ -132,7 +132,4 @@ def _installed(system: Path, unit: str) -> Path | None:
 
 
 def _runs_daemon(words: list[str]) -> bool:
-    return any(
-        Path(program).name == "monstertruckd" and command == "run"
-        for program, command in pairwise(words)
-    )
+    return any(Path(program).name == "monstertruckd" and command == "run" for program, command in pairwise(words))
