@@ -54,7 +54,9 @@ class RouteMap:
     ) -> "RouteMap":
         """Map of an occupancy grid, unknown cells by policy."""
         cells = grid.cells.reshape(grid.height, grid.width)
-        return cls.from_cells(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), unknown, tilt, roughness)
+        return cls.from_cells(
+            cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), unknown, tilt, roughness
+        )
 
     @classmethod
     def from_cells(
@@ -226,7 +228,11 @@ def check_ends(
 def _tolerated(position: float, yaw: float) -> list[Array]:
     """Small displacements within the tolerances, the smallest first."""
     around = [(0.0, 0.0)]
-    around += [(s * position * math.cos(k), s * position * math.sin(k)) for s in (0.5, 0.98) for k in np.arange(8) * math.pi / 4]
+    around += [
+        (s * position * math.cos(k), s * position * math.sin(k))
+        for s in (0.5, 0.98)
+        for k in np.arange(8) * math.pi / 4
+    ]
     return [np.array([x, y, t * yaw]) for x, y in around for t in (0.0, 0.5, -0.5, 0.98, -0.98)][1:]
 
 

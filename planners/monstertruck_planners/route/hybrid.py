@@ -34,6 +34,9 @@ BATCH = 1000
 PATIENCE = 12
 """Rounds of improvement without gain after which the route is taken to be the best."""
 
+FINE = (0.1, 0.03, 0.01)
+"""Shares of a stretch by which poses move at last."""
+
 LAST_SHARE = 0.3
 """Of the budget, for shortening with translations."""
 
@@ -177,9 +180,7 @@ class _Run:
         status = search.RUNNING
         while status == search.RUNNING and self.budget.left() > 0.0 and nodes.counts[search.EXPANDED] < most:
             before = int(nodes.counts[search.EXPANDED])
-            status = search.expand(
-                field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, CHUNK
-            )
+            status = search.expand(field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, CHUNK)
             done = int(nodes.counts[search.EXPANDED]) - before
             self.budget.work += done
             self.statistics["expanded"] += done
@@ -194,9 +195,10 @@ class _Run:
         rows = self._rounds(rows, self._other_ways(go), PATIENCE, LAST_SHARE if car.crab > 0.0 else 0.0)
         self.car = car
         if car.crab > 0.0:
-            rows = self._rounds(rows, iter(()), 2, 0.0)
+            rows = self._rounds(rows, iter(()), 4, 0.05)
         best = self._draft(rows)
-        self._settle(best, 1e-4)
+        for shift in FINE:
+            self._settle(best, 1e-4, shift)
         return best.rows[: best.count[0]].copy()
 
     def _rounds(self, rows: Array, others: Iterator[Array], patience: int, reserve: float) -> Array:
@@ -225,12 +227,12 @@ class _Run:
         rows = draft.rows[: draft.count[0]].copy()
         return rows, self._cost(rows)
 
-    def _settle(self, draft: Draft, gain: float = 1e-3) -> None:
+    def _settle(self, draft: Draft, gain: float = 1e-3, shift: float = 0.25) -> None:
         """Shorten until a batch of trials gains less than a share of the cost."""
         last = np.inf
         while self.budget.left() > 0.0 and (cost := self._cost(draft.rows[: draft.count[0]])) < (1.0 - gain) * last:
             last = cost
-            self._trials(draft, BATCH)
+            self._trials(draft, BATCH, shift)
 
     def _cost(self, rows: Array) -> float:
         return float(search.rows_cost(self.field, self.layer, self.car, self.start, rows, len(rows), 0.0))
@@ -269,9 +271,9 @@ class _Run:
         tidy(draft)
         return draft
 
-    def _trials(self, draft: Draft, count: int) -> None:
+    def _trials(self, draft: Draft, count: int, shift: float) -> None:
         reach = 40.0 * self.vehicle.radius
-        kept = shorten(self.field, self.body, self.layer, self.car, draft, reach, self.random.random((count, 6)))
+        kept = shorten(self.field, self.body, self.layer, self.car, draft, reach, shift, self.random.random((count, 6)))
         self.budget.work += count
         self.statistics["trials"] += count
         self.statistics["kept"] += kept

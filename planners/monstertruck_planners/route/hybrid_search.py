@@ -138,7 +138,13 @@ def add(
         nodes.closed[other] = True
     k = nodes.counts[USED]
     nodes.pose[k, 0], nodes.pose[k, 1], nodes.pose[k, 2] = x, y, yaw
-    nodes.cost[k], nodes.parent[k], nodes.action[k], nodes.sense[k], nodes.closed[k] = cost, parent, action, sense, False
+    nodes.cost[k], nodes.parent[k], nodes.action[k], nodes.sense[k], nodes.closed[k] = (
+        cost,
+        parent,
+        action,
+        sense,
+        False,
+    )
     nodes.table[row, column, heading] = k + 1
     nodes.counts[USED] = k + 1
     nodes.counts[WAITING] = push(nodes.keys, nodes.items, nodes.counts[WAITING], cost + greed * left, k)
@@ -192,7 +198,9 @@ def expand(
             if not _target(field, go, pose[0], pose[1], car.leaps[i], car.radius, target):
                 continue
             many = connect(pose, target, car.radius, car.crab, car.weights, rows, best, scratch)
-            if best[COST] * car.radius < 2.0 * car.leaps[i] + 6.0 * car.radius and rows_free(field, body, car, pose, rows, many):
+            if best[COST] * car.radius < 2.0 * car.leaps[i] + 6.0 * car.radius and rows_free(
+                field, body, car, pose, rows, many
+            ):
                 price = rows_cost(field, layer, car, pose, rows, many, sense)
                 end = rows[many - 1, 0]
                 add(field, go, table, car, goal, nodes, greed, target[0], target[1], target[2], cost + price, n, LEAP,

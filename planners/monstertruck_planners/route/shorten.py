@@ -101,7 +101,9 @@ def tidy(draft: Draft) -> None:
 
 
 @njit(cache=True)
-def _splice(draft: Draft, begin: float, i: int, end: float, j: int, middle: FloatArray, many: int, spare: FloatArray) -> None:
+def _splice(
+    draft: Draft, begin: float, i: int, end: float, j: int, middle: FloatArray, many: int, spare: FloatArray
+) -> None:
     """Replace the stretch from ``begin`` (in row i) to ``end`` (in row j)."""
     used = 0
     first = max(i - 1, 0)
@@ -139,7 +141,14 @@ def _stretch(draft: Draft, begin: float, i: int, end: float, j: int, out: FloatA
 
 @njit(cache=True)
 def shorten(
-    field: FieldData, body: BodyData, layer: Layer, car: Car, draft: Draft, reach: float, random: FloatArray
+    field: FieldData,
+    body: BodyData,
+    layer: Layer,
+    car: Car,
+    draft: Draft,
+    reach: float,
+    shift: float,
+    random: FloatArray,
 ) -> int:
     """As many trials as there are rows of ``random``.
 
@@ -150,6 +159,7 @@ def shorten(
         car: limits and costs.
         draft: the path, changed in place.
         reach: longest stretch, m.
+        shift: a pose in between moves by up to this share of the stretch.
         random: shape (n, 6), uniform in 0 to 1.
 
     Returns:
@@ -173,7 +183,9 @@ def shorten(
         i, j = _row_at(draft, begin), _row_at(draft, end)
         _pose_at(draft, i, begin, a)
         _pose_at(draft, j, end, b)
-        before = draft.rows[i, 0] if begin - draft.travelled[i] > LEAST_ROW else (draft.rows[i - 1, 0] if i > 0 else 0.0)
+        before = (
+            draft.rows[i, 0] if begin - draft.travelled[i] > LEAST_ROW else (draft.rows[i - 1, 0] if i > 0 else 0.0)
+        )
         after = draft.rows[j, 0] if draft.travelled[j + 1] - end > LEAST_ROW else (
             draft.rows[j + 1, 0] if j + 1 < draft.count[0] else 0.0
         )  # fmt: skip
@@ -189,7 +201,7 @@ def shorten(
         else:
             middle = 0.5 * (begin + end)
             _pose_at(draft, _row_at(draft, middle), middle, q)
-            size = 0.25 * (end - begin) * random[n, 3] ** 2
+            size = shift * (end - begin) * random[n, 3] ** 2
             q[0] += size * (2.0 * random[n, 4] - 1.0)
             q[1] += size * (2.0 * random[n, 5] - 1.0)
             q[2] += 1.5 * min(size / max(end - begin, 1e-3), 0.5) * (2.0 * random[n, 2] - 1.35) / 0.65

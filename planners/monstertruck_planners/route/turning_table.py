@@ -44,9 +44,7 @@ def turning_table(crab: float) -> NDArray[np.float32]:
 
 
 @njit(cache=True)
-def turning_bound(
-    table: NDArray[np.float32], radius: float, x: float, y: float, yaw: float, goal: FloatArray
-) -> float:
+def turning_bound(table: NDArray[np.float32], radius: float, x: float, y: float, yaw: float, goal: FloatArray) -> float:
     """Length in metres from a pose to the goal, at the nearest entry; the straight distance beyond the table."""
     dx, dy = (x - goal[0]) / radius, (y - goal[1]) / radius
     # The way back is as long: look from the goal.
