@@ -166,7 +166,7 @@ class SteeringWizard:
     ) -> Result:
         fit = model.fit(legs, first)
         halves, share = half_widths(fit), _way_error(guide) + WHEELBASE
-        eye = "" if self.strings else "; errors common to both axles are told by the eye alone"
+        eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
         estimates: list[Estimate] = []
         for axle, name in enumerate(AXLES):
@@ -198,7 +198,7 @@ class SteeringWizard:
             unobserved=(
                 "the linkage: its polynomials and the wheelbase are taken as configured, their errors show as scale",
                 "travel beyond the limits of gate and servo",
-                *(() if self.strings else ("equal errors of both centres: the truck crabs, and no compass sees it",)),
+                *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
             ),
         )
 

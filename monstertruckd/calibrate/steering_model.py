@@ -3,7 +3,7 @@
 Both axles are steered, so a turn shows the difference of their angles only: wz = v_x (tan front - tan rear) / L.
 Driving arcs with one axle at a time tells the gain of each, and straight driving the difference of their centres. Equal
 errors of both centres make the truck crab without turning, which no compass sees: they show as a sideways offset from a
-string.
+string, and faintly as unlike circles to the left and to the right, as far as the linkage is what it is taken for.
 """
 
 import math
@@ -32,10 +32,15 @@ CURVE: Final = 0.006
 """And by the compass's own slow error over the heading, rad; a full turn is free of it."""
 SLIP: Final = 0.004
 """Standard deviation of a turn per root metre by tyres that never roll quite along their plane, rad."""
+LINKAGE: Final = 0.005
+"""Share of a turn by which the linkage may differ from its polynomials."""
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
 GAIN: Final = 0.15
 """Share by which a pulse map may differ from the configured one, where nothing else tells."""
+
+
+_ROUNDS: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +112,7 @@ class Leg:
         motor, *servos = track.steps()
         turn, noise = track.turn()
         part = abs(math.remainder(turn, 2 * math.pi))
-        sigma = math.hypot(HEADING, noise, CURVE * min(part, 1.0))
+        sigma = math.hypot(HEADING, noise, CURVE * min(part, 1.0), LINKAGE * turn)
         pulses = maps.pulses(0, servos[0]), maps.pulses(1, servos[1])
         return cls(motor, pulses, turn, sigma, offset, offset_sigma)
 
@@ -178,14 +183,16 @@ class SteeringModel:
 
         The other axle is taken as the maps have it. Valid for a leg with steady steering.
         """
-        forward, _, _ = self.moves(leg, maps)
-        tangent = leg.turn * self.chassis.bicycle.wheelbase / float(forward.sum())
-        other = float(np.tan(self.angles(leg, maps)[1 - axle]).mean())
-        angle = math.atan(tangent + other if axle == 0 else other - tangent)
-        linkage = self.linkages[axle]
-        low, high = linkage.axle_limits
-        meant = float(maps.servo(axle, leg.pulses[axle]).mean())
-        return float(linkage.servo_from_axle(min(max(angle, low), high))), meant
+        bicycle, linkage = self.chassis.bicycle, self.linkages[axle]
+        rolled = float(self.chassis.drivetrain.distance(leg.motor.sum()))
+        angles = [float(side.mean()) for side in self.angles(leg, maps)]
+        other = math.tan(angles[1 - axle])
+        for _ in range(_ROUNDS):  # how far the body gets per turn of the wheels depends on their angle a little
+            forward, _, _ = bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)
+            tangent = leg.turn * bicycle.wheelbase / forward
+            angle = math.atan(other + tangent if axle == 0 else other - tangent)
+            angles[axle] = min(max(angle, linkage.axle_limits[0]), linkage.axle_limits[1])
+        return float(linkage.servo_from_axle(angles[axle])), float(maps.servo(axle, leg.pulses[axle]).mean())
 
 
 def half_widths(fit: Fit, priors: int = 3) -> Array:

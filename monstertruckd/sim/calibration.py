@@ -1,6 +1,7 @@
 """Calibration against a world that hides the true values: an operator with tape, string and meter, and the judge."""
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -160,34 +161,47 @@ class SimulatedOperator:
         return sigma * float(self._rng.standard_normal())
 
 
-def hidden(config: SimulatedTruckConfig, rng: np.random.Generator, seed: int) -> SimulatedTruckConfig:
-    """``config`` with a truck whose every calibrated value differs from what the daemon believes."""
+def hidden(
+    config: SimulatedTruckConfig,
+    rng: np.random.Generator,
+    seed: int,
+    parts: Collection[WizardName] = ("battery", "compass", "drive", "steering"),
+) -> SimulatedTruckConfig:
+    """``config`` with a truck whose true values differ from what the daemon believes.
 
+    Args:
+        config: the believed truck.
+        rng: of the differences.
+        seed: of the world.
+        parts: what differs, by the wizard that has to find it.
+    """
+    truck: dict[str, Any] = {}
+    world: dict[str, Any] = {"truck": truck}
+    if "battery" in parts:
+        world["battery"] = {"divider": 10 * rng.uniform(0.94, 1.06), "analog_offset": rng.uniform(-0.009, 0.009)}
+    if "compass" in parts:
+        hard = dict(zip(("hard_x", "hard_y", "hard_z"), rng.uniform(-70, 70, 3).tolist(), strict=True))
+        soft = dict(zip(("soft_x", "soft_y", "soft_z"), rng.uniform(0.88, 1.12, 3).tolist(), strict=True))
+        world["compass"] = {"iron": {**hard, **soft, "soft_xy": rng.uniform(-0.06, 0.06)}}
+    if "drive" in parts:
+        truck["wheel_radius"] = 0.075 * rng.uniform(0.95, 1.05)
+        truck["motor"] = {"ratio": rng.uniform(500, 680), "inverted": bool(rng.integers(2))}
+    if "steering" in parts:
+        truck["front_servo"], truck["rear_servo"] = _servo(1, rng), _servo(0, rng)
+    return with_overlay(config, {"sim": {"seed": seed, "world": world}})
+
+
+def _servo(channel: int, rng: np.random.Generator) -> dict[str, Any]:
     def stop() -> float:
         return float(rng.uniform(23, 30)) if rng.random() < STOPPED else 45.0
 
-    def servo(channel: int) -> dict[str, Any]:
-        return {
-            "channel": channel,
-            "centre_us": 1439.2 + rng.uniform(-40, 40),
-            "us_per_degree": float(rng.choice((-1, 1))) * 10.48 * rng.uniform(0.9, 1.1),
-            "left_stop_deg": stop(),
-            "right_stop_deg": stop(),
-        }
-
-    truck = {
-        "wheel_radius": 0.075 * rng.uniform(0.95, 1.05),
-        "motor": {"ratio": rng.uniform(500, 680), "inverted": bool(rng.integers(2))},
-        "front_servo": servo(1),
-        "rear_servo": servo(0),
+    return {
+        "channel": channel,
+        "centre_us": 1439.2 + rng.uniform(-40, 40),
+        "us_per_degree": float(rng.choice((-1, 1))) * 10.48 * rng.uniform(0.9, 1.1),
+        "left_stop_deg": stop(),
+        "right_stop_deg": stop(),
     }
-    hard = dict(zip(("hard_x", "hard_y", "hard_z"), rng.uniform(-70, 70, 3).tolist(), strict=True))
-    soft = dict(zip(("soft_x", "soft_y", "soft_z"), rng.uniform(0.88, 1.12, 3).tolist(), strict=True))
-    compass = {"iron": {**hard, **soft, "soft_xy": rng.uniform(-0.06, 0.06)}}
-    battery = {"divider": 10 * rng.uniform(0.94, 1.06), "analog_offset": rng.uniform(-0.009, 0.009)}
-    return with_overlay(
-        config, {"sim": {"seed": seed, "world": {"truck": truck, "compass": compass, "battery": battery}}}
-    )
 
 
 def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:

@@ -1,0 +1,47 @@
+"""Bounds of the voltage scale from readings of a meter."""
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.calibrate.battery import GROUND, BatteryWizard, Reading
+
+WIZARD = BatteryWizard(meter_share=0.005, meter_digits=0.02)
+
+
+def test_one_reading_tells_the_scale_but_not_the_offset():
+    gain, offset = WIZARD.bounds([Reading(24.0, 24.6, 0.0)])
+    assert gain.value == pytest.approx(24.6 / 24.0)
+    assert gain.half == pytest.approx((0.02 + GROUND) / 24.0)
+    assert (offset.value, offset.half) == (0.0, GROUND)
+
+
+def test_readings_far_apart_with_a_good_meter_tell_the_offset():
+    fine = BatteryWizard(meter_share=0.0, meter_digits=0.002)
+    gain, offset = fine.bounds([Reading(raw, 1.02 * raw + 0.05, 0.0) for raw in (20.0, 24.5)])
+    assert offset.value == pytest.approx(0.05, abs=0.002)
+    assert offset.half < 0.03
+    assert gain.value == pytest.approx(1.02, abs=1e-3)
+
+
+def test_the_truth_is_inside_whatever_the_meter_does_within_its_bounds():
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        true_gain, true_offset = rng.uniform(0.9, 1.1), rng.uniform(-GROUND, GROUND)
+        raws = rng.uniform(19, 25, int(rng.integers(1, 4)))
+        meter = rng.uniform(-WIZARD.meter_share, WIZARD.meter_share)
+        readings = [
+            Reading(raw, (true_gain * raw + true_offset) * (1 + meter) + rng.uniform(-0.02, 0.02), 0.001)
+            for raw in raws
+        ]
+        gain, offset = WIZARD.bounds(readings)
+        scale = gain.widened(gain.value * WIZARD.meter_share)
+        assert scale.low * 0.9999 <= true_gain <= scale.high * 1.0001
+        assert (
+            offset.low - 0.006 * abs(true_offset) - 1e-9 <= true_offset <= offset.high + 0.006 * abs(true_offset) + 1e-9
+        )
+
+
+def test_readings_that_contradict_each_other_are_refused():
+    with pytest.raises(InputError, match=r"no scale fits all 2 readings.*--fresh"):
+        WIZARD.bounds([Reading(24.0, 24.6, 0.0), Reading(20.0, 22.6, 0.0)])

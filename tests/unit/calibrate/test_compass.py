@@ -1,0 +1,102 @@
+"""Ellipse to circle: what a flat circle tells, what it does not, and what is no circle."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.calibrate.compass import Circle, result_of
+
+HARD = np.array((6.0, -4.0))
+SOFT = np.array(((1.1, 0.06), (0.06, 0.93)))
+"""What the iron does to the field; its inverse, scaled to determinant 1, is what takes it out."""
+MOTOR = np.array((0.3, 0.8))
+
+
+def circle(
+    *,
+    turns: float = 2.1,
+    noise: float = 0.03,
+    seed: int = 1,
+    tilt: float = 0.0,
+    count: int = 800,
+    strength: float = 25.0,
+) -> Circle:
+    rng = np.random.default_rng(seed)
+    there = np.linspace(0, math.pi * turns, count // 2)
+    heading = np.concatenate((there, there[::-1]))
+    current = np.concatenate((np.full(count // 2, 0.25), np.full(count // 2, -0.25))) + 0.02 * rng.standard_normal(
+        count
+    )
+    level = strength * np.array((np.cos(heading), np.sin(heading)))
+    # The floor slopes: the truck's pitch changes as it turns.
+    pitch, roll = tilt * np.cos(heading), -tilt * np.sin(heading)
+    up = np.full(count, -39.0)
+    x = np.cos(pitch) * level[0] - np.sin(pitch) * up
+    z = np.sin(pitch) * level[0] + np.cos(pitch) * up
+    y, z = np.cos(roll) * level[1] + np.sin(roll) * z, np.cos(roll) * z - np.sin(roll) * level[1]
+    flat = SOFT @ np.array((x, y)) + HARD[:, None] + MOTOR[:, None] * current
+    flat += noise * rng.standard_normal(flat.shape)
+    believed = np.arctan2(flat[1], flat[0])
+    return Circle(flat[0], flat[1], z, pitch, roll, current, np.unwrap(believed))
+
+
+def truth() -> dict[str, float]:
+    soft = np.linalg.inv(SOFT)
+    soft /= math.sqrt(np.linalg.det(soft))
+    return {
+        "hard_x": HARD[0],
+        "hard_y": HARD[1],
+        "soft_xx": soft[0, 0],
+        "soft_xy": soft[0, 1],
+        "soft_yy": soft[1, 1],
+    }
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.05])
+def test_hard_and_soft_iron_and_the_motors_field(tilt: float):
+    result = result_of(circle(tilt=tilt))
+    for name, value in truth().items():
+        estimate = result.estimate(name)
+        assert estimate is not None
+        assert estimate.value == pytest.approx(value, abs=0.02 if name.startswith("hard") else 0.001)
+        assert estimate.low is not None
+        assert estimate.high is not None
+        assert estimate.low < value < estimate.high
+
+
+def test_the_noise_part_of_the_interval_is_honest():
+    inside = []
+    for seed in range(120):
+        result = result_of(circle(seed=seed, count=200))
+        for name in ("soft_xx", "soft_xy", "soft_yy"):
+            estimate = result.estimate(name)
+            assert estimate is not None
+            assert estimate.low is not None
+            assert estimate.high is not None
+            inside.append(estimate.low < truth()[name] < estimate.high)
+    assert 0.92 < np.mean(inside) < 0.98
+
+
+def test_strength_is_not_observed():
+    weak, strong = result_of(circle(noise=0.0)), result_of(circle(noise=0.0, strength=50.0))
+    for name in ("soft_xx", "soft_xy", "soft_yy"):
+        ours, theirs = weak.estimate(name), strong.estimate(name)
+        assert ours is not None
+        assert theirs is not None
+        assert ours.value == pytest.approx(theirs.value)
+    assert any("strength" in text for text in weak.unobserved)
+    assert any("along z" in text for text in weak.unobserved)
+
+
+def test_part_of_a_circle_is_refused():
+    with pytest.raises(InputError, match=r"not turned all the way round: 1\d\d deg"):
+        result_of(circle(turns=1.1))
+
+
+def test_a_unit_with_other_axes_is_refused():
+    turned = circle()
+    with pytest.raises(InputError, match="axes are not x forward, y left"):
+        result_of(replace(turned, heading=-turned.heading))

@@ -1,0 +1,62 @@
+"""Turns per metre of single runs, and how runs are judged."""
+
+import math
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
+from monstertruckd.calibrate.drive import Run, arc
+from monstertruckd.calibrate.track import Track
+
+
+def track(turns: float, turn: float = 0.0) -> Track:
+    """A run with a second of rest at both ends."""
+
+    def drive(second: float, position: float) -> DriveFeedback:
+        stamp = round(second * SECOND)
+        return DriveFeedback(
+            stamp=stamp, received=stamp, seq=0, position=position, velocity=0.0, mode=DriveMode.ENABLED, current=0.1
+        )
+
+    def compass(second: float, heading: float) -> Attitude:
+        stamp = round(second * SECOND)
+        return Attitude(stamp=stamp, received=stamp, seq=0, heading=heading % (2 * math.pi), roll=0.0, pitch=0.0)
+
+    angle = 2 * math.pi * turns
+    before = [compass(i / 20, 0.1 + 0.001 * (i % 2)) for i in range(20)]
+    moving = [compass(1 + i / 20, 0.1 - turn * i / 80) for i in range(80)]
+    after = [compass(5.05 + i / 20, 0.1 - turn + 0.001 * (i % 2)) for i in range(20)]
+    return Track(
+        drive=[drive(0, 0.0), drive(1, 0.0), drive(5, angle), drive(6, angle)],
+        attitude=[*before, *moving, *after],
+        left=SECOND,
+        arrived=5 * SECOND,
+    )
+
+
+def test_a_straight_run():
+    run = Run.of(track(2732.0), 2.0)
+    assert run.turns / run.way == pytest.approx(1366.0, rel=1e-5)
+    assert Run.of(track(-2732.0), 2.0).turns == pytest.approx(2732.0)
+
+
+def test_the_tape_measures_the_chord_of_a_bend():
+    radius, turn = 8.0, 0.25
+    run = Run.of(track(2732.0, turn), 2 * radius * math.sin(turn / 2))
+    assert run.way == pytest.approx(radius * turn, rel=1e-4)
+    assert run.bend == pytest.approx(turn**2 / 24, rel=0.02)
+    assert arc(2.0, 0.0) == 2.0
+
+
+def test_a_crooked_run_measures_nothing():
+    with pytest.raises(InputError, match=r"turned by 29 deg on its way: run `calibrate steering --rough` first"):
+        Run.of(track(2732.0, 0.5), 2.0)
+
+
+def test_no_headings_at_rest():
+    short = track(2732.0)
+    short.attitude = short.attitude[:-18]
+    with pytest.raises(InputError, match="20 and 2 headings at rest: expected 5"):
+        Run.of(short, 2.0)

@@ -1,0 +1,131 @@
+"""Pulse maps from legs: what turns tell, what only the string tells, and stops."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.chassis import TruckChassis, build_chassis
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.errors import InputError
+from monstertruckd.calibrate.steering import Reach, _directions, _rough
+from monstertruckd.calibrate.steering_model import Leg, Maps, SteeringModel, half_widths
+
+CHASSIS = build_chassis("truck", drivetrain=DriveTrain())
+assert isinstance(CHASSIS, TruckChassis)
+MODEL = SteeringModel(CHASSIS)
+BELIEVED = Maps((1439.2, 1439.2), (-10.48, -10.48))
+TRUE = Maps((1462.0, 1425.0), (-9.9, -11.0))
+
+
+def leg(
+    front: float,
+    rear: float,
+    metres: float,
+    true: Maps = TRUE,
+    rng: np.random.Generator | None = None,
+    *,
+    string: bool = False,
+    stop: float = math.pi / 4,
+) -> Leg:
+    """What a truck with the maps ``true`` does when it is told axle angles by the believed ones."""
+    count = 16
+    motor = np.full(count, CHASSIS.drivetrain.motor_angle(metres) / count)
+    servos = CHASSIS.servos(front, rear)
+    pulses = BELIEVED.pulses(0, np.full(count, servos[0])), BELIEVED.pulses(1, np.full(count, servos[1]))
+    arm = np.clip(true.servo(0, pulses[0]), -stop, stop)
+    real = Leg(motor, (true.pulses(0, arm), pulses[1]), 0.0, 0.002)
+    turn, aside = MODEL.predict(real, true)
+    if rng is not None:
+        turn += float(rng.normal(0, math.hypot(0.002, 0.005 * turn, 0.004 * math.sqrt(abs(metres)))))
+        aside += float(rng.normal(0, 0.008))
+    return Leg(motor, pulses, turn, math.hypot(0.002, 0.005 * turn), aside if string else None, 0.008)
+
+
+def session(true: Maps, rng: np.random.Generator | None = None, *, string: bool = True) -> list[Leg]:
+    straights = [leg(0, 0, sign * 2.0, true, rng, string=string and sign > 0) for _ in range(3) for sign in (1, -1)]
+    return [
+        *straights,
+        *(leg(sign * 0.35, 0, 5.0, true, rng) for sign in (1, -1)),
+        *(leg(0, sign * 0.35, 5.0, true, rng) for sign in (1, -1)),
+    ]
+
+
+def test_without_noise_the_maps_are_found_exactly():
+    fit = MODEL.fit(session(TRUE), BELIEVED, gain=10.0)
+    assert fit.parameters[[0, 2]] == pytest.approx(TRUE.parameters[[0, 2]], abs=0.3)
+    assert fit.parameters[[1, 3]] == pytest.approx(TRUE.parameters[[1, 3]], rel=2e-3)
+
+
+def test_the_intervals_are_honest():
+    rng = np.random.default_rng(5)
+    inside = []
+    for _ in range(40):
+        true = Maps(tuple(1439.2 + rng.uniform(-40, 40, 2)), tuple(-10.48 * rng.uniform(0.9, 1.1, 2)))
+        fit = MODEL.fit(session(true, rng), BELIEVED)
+        inside.append(np.abs(fit.parameters - true.parameters) < half_widths(fit))
+    assert 0.9 <= np.mean(inside) <= 0.99
+
+
+def test_without_a_string_the_common_error_of_both_axles_is_not_seen_and_the_interval_says_so():
+    crabbing = Maps((1439.2 + 25, 1439.2 + 25), (-10.48, -10.48))
+    rng = np.random.default_rng(2)
+    blind = MODEL.fit(session(crabbing, rng, string=False), BELIEVED)
+    seeing = MODEL.fit(session(crabbing, rng, string=True), BELIEVED)
+    errors = [np.abs(fit.parameters - crabbing.parameters)[[0, 2]].max() for fit in (blind, seeing)]
+    halves = [half_widths(fit)[[0, 2]].max() for fit in (blind, seeing)]
+    assert halves[0] > 2 * halves[1]
+    assert (np.array(errors) < halves).all()
+    assert halves[1] < 8
+
+
+@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
+    true = Maps(TRUE.centres, (TRUE.scales[0] * signs[0], TRUE.scales[1] * signs[1]))
+    arcs = tuple(
+        [leg(*(axle == 0) * np.array((s * 0.1, 0.0)) + (axle == 1) * np.array((0.0, s * 0.1)), d * 0.4, true)
+         for s in (1, -1) for d in (1, -1)]
+        for axle in (0, 1)
+    )  # fmt: skip
+    assert _directions(arcs) == signs  # type: ignore[arg-type]
+    start = Maps(BELIEVED.centres, (BELIEVED.scales[0] * signs[0], BELIEVED.scales[1] * signs[1]))
+    result = _rough(arcs, MODEL, start, None)  # type: ignore[arg-type]
+    for axle, (name, sign) in enumerate(zip(("front", "rear"), signs, strict=True)):
+        direction, centre = result.estimate(f"{name}_direction"), result.estimate(f"{name}_centre")
+        assert direction is not None
+        assert centre is not None
+        assert direction.value == -sign
+        assert centre.low is not None
+        assert centre.high is not None
+        assert centre.low < true.centres[axle] < centre.high
+
+
+def test_wheels_that_do_not_steer_are_named():
+    dead = ([leg(0, 0, d * 0.4, BELIEVED) for d in (1, -1, 1, -1)],) * 2
+    with pytest.raises(InputError, match="front wheels: steered, they turn the truck by"):
+        _directions(dead)
+
+
+def test_a_stop_is_found_and_kept_clear_of():
+    far = [leg(0.43, 0, d * 0.6, TRUE, stop=math.radians(25)) for d in (1, -1)]
+    reach = Reach.of(0, 1, far, MODEL, TRUE)
+    assert reach.stopped
+    assert math.degrees(reach.servo) == pytest.approx(25, abs=0.3)
+    travel, limit = reach.estimates("front", TRUE.centres[0], TRUE.scales[0], None)
+    assert travel.low is not None
+    assert (limit.name, limit.key) == ("front_min_us", "devices.steering.driver.front.min_us")
+    assert limit.value == pytest.approx(TRUE.centres[0] + TRUE.scales[0] * 24, abs=4)
+
+
+def test_a_free_axle_has_no_limit_and_a_limit_found_before_stays():
+    far = [leg(0.3, 0, d * 0.6, TRUE) for d in (1, -1)]
+    reach = Reach.of(0, 1, far, MODEL, TRUE)
+    assert not reach.stopped
+    assert [e.name for e in reach.estimates("front", *TRUE.parameters[:2], None)] == ["front_left_travel"]
+    stopped = Reach.of(0, 1, [leg(0.43, 0, 0.6, TRUE, stop=math.radians(25))] * 2, MODEL, TRUE)
+    earlier = _rough(([leg(0.1, 0, 0.4)] * 4, [leg(0, 0.1, 0.4)] * 4), MODEL, BELIEVED, None)
+    limit = stopped.estimates("front", *TRUE.parameters[:2], None)[1].model_copy(
+        update={"date": "2026-01-01T00:00:00Z"}
+    )
+    before = earlier.model_copy(update={"estimates": (limit,)})
+    assert reach.estimates("front", *TRUE.parameters[:2], before)[1] == limit
