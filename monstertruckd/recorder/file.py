@@ -6,9 +6,8 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
@@ -26,8 +25,7 @@ _COMPRESSION: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """A message on its way to the log."""
 
     topic: Topic[Any]
@@ -92,11 +90,11 @@ class LogFile:
     @property
     def size(self) -> int:
         """Bytes in the file."""
-        return self._output.tell()
+        return self._output.size
 
     def add(self, entry: Entry) -> None:
         """Put a message into the open chunk."""
-        before = self.size
+        before = self._output.size
         self._writer.add_message(
             self._channels.of(entry.topic),
             entry.log_time,
@@ -104,7 +102,7 @@ class LogFile:
             max(0, entry.stamp),
             entry.sequence & 0xFFFFFFFF,
         )
-        if self.size != before:
+        if self._output.size != before:
             self.open_since = None
         elif self.open_since is None:
             self.open_since = entry.log_time
@@ -137,18 +135,18 @@ class _Output:
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         fcntl.flock(self._fd, fcntl.LOCK_EX)
-        self._size = 0
+        self.size = 0
 
     def write(self, data: bytes) -> int:
         rest = memoryview(data)
         while rest:
             written = os.write(self._fd, rest)
-            self._size += written
+            self.size += written
             rest = rest[written:]
         return len(data)
 
     def tell(self) -> int:
-        return self._size
+        return self.size
 
     def flush(self) -> None:
         """Nothing is held back."""

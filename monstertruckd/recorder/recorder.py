@@ -204,8 +204,8 @@ class Recorder:
                 if self._digest is not None:
                     self._digest.update(entry.topic.name, entry.stamp, entry.payload)
                 writer.write(entry)
-                self._written += 1
-                self._progress.set()
+            self._written += len(batch)
+            self._progress.set()
             self._path = writer.path
 
     def _fail(self, reason: Reason, text: str) -> None:

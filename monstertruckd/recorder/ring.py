@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from heapq import merge
 from operator import attrgetter
 from typing import Final
@@ -81,7 +81,7 @@ class Ring:
         """Everything kept, by log time; what is from before the window stands at its begin."""
         parts = (self._rest, self._journal, self._thinned, self._fresh)
         begin = next((part.entries[0].log_time for part in parts if part.entries), 0)
-        heads = [replace(head, log_time=begin) for head in self._heads.values()]
+        heads = [head._replace(log_time=begin) for head in self._heads.values()]
         return list(merge(heads, *(part.entries for part in parts), key=attrgetter("log_time")))
 
     def _part(self, entry: Entry) -> _Part:

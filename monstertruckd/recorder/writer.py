@@ -1,6 +1,5 @@
 """What the recorder's thread does: chunks, rotation, quota. Synchronous; driven by log times alone."""
 
-import dataclasses
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,7 +64,7 @@ class LogWriter:
             self._file = self._open(entry.log_time)
             self._synced = entry.log_time
             for kept in self._retained.values():
-                self._file.add(dataclasses.replace(kept, log_time=entry.log_time))
+                self._file.add(kept._replace(log_time=entry.log_time))
         if entry.topic.retained:
             self._retained[entry.topic.name] = entry
         self._file.add(entry)
