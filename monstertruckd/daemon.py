@@ -299,7 +299,7 @@ class Daemon:
             self.clock,
             self._recorder_failed,
             attachments=self._attachments,
-            digest=self.digest,
+            digest=self.digest if self._seed is not None else None,
             deterministic=self._seed is not None,
         )
 
