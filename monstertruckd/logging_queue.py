@@ -41,12 +41,15 @@ def redacted(text: str) -> str:
 class LossyQueueHandler(logging.handlers.QueueHandler):
     """Counts what does not fit instead of waiting or complaining."""
 
-    lost = 0
+    def __init__(self) -> None:
+        self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(DEPTH)
+        super().__init__(self.records)
+        self.lost = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
         """Put the record into the queue, or lose it."""
         try:
-            self.queue.put_nowait(record)
+            self.records.put_nowait(record)
         except queue.Full:
             self.lost += 1
 
@@ -69,13 +72,13 @@ class LogWriter:
     def stop(self) -> None:
         """Write what still waits, as far as the output takes it within ``PATIENCE``."""
         try:
-            self._handler.queue.put(None, timeout=PATIENCE)
+            self._handler.records.put(None, timeout=PATIENCE)
         except queue.Full:
             return
         self._thread.join(PATIENCE)
 
     def _run(self) -> None:
-        while (record := self._handler.queue.get()) is not None:
+        while (record := self._handler.records.get()) is not None:
             self._output.handle(record)
             if (lost := self._handler.lost) > self._told:
                 text = f"{lost - self._told} records lost: this output was stuck"
@@ -118,7 +121,7 @@ def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogWriter:
     """Send all logging to ``stream`` from a thread; ``stop()`` of what is returned writes what still waits."""
     output = logging.StreamHandler(stream)
     output.setFormatter(PlainFormatter(journal=read_by_journal(stream)))
-    handler = LossyQueueHandler(queue.Queue(DEPTH))
+    handler = LossyQueueHandler()
     root = logging.getLogger()
     root.setLevel(logging.DEBUG if verbose else logging.INFO)
     root.addHandler(handler)

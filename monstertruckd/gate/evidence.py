@@ -58,7 +58,8 @@ class Evidence:
             began = since.get(reason, now)
             if reason is Reason.SERVICE_FAILED:
                 causes += [
-                    Cause(reason=reason, source=name, since=began, text=reason.text) for name in self._watch.failed
+                    Cause(reason=reason, source=name, since=began, text=f"{reason.text}: {name}")
+                    for name in self._watch.failed
                 ]
             elif reason in STALE_SENSORS:
                 causes.append(self._silence(reason, now, began))

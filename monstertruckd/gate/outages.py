@@ -80,7 +80,9 @@ class Outages:
         loss = next((loss for loss in losses if loss.back is None or head.since <= loss.back), None)
         if loss is not None:
             row = loss.first
-            yield Cause(reason=row.reason, source=row.name, since=row.since, text=row.detail or row.reason.text)
+            detail = row.detail or row.reason.text
+            text = detail if row.name in detail else f"{row.name}: {detail}"
+            yield Cause(reason=row.reason, source=row.name, since=row.since, text=text)
             root = self._roots.get(row.name)
             if root is not None and root.stamp >= row.since - TOGETHER:
                 yield _told(root)

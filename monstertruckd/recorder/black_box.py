@@ -25,11 +25,12 @@ from monstertruckd.recorder.ring import Ring, Span
 
 log = logging.getLogger(__name__)
 
-BATCH: Final = 32
-"""Messages written without a pause: under a millisecond in which the control loop would have to wait."""
-PAUSE: Final = 0.002
+BATCH: Final = 8
+"""Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
+PAUSE: Final = 0.001
 """Seconds between two batches, for the control loop."""
-CHUNK: Final = 256 * 1024
+CHUNK: Final = 64 * 1024
+"""Bytes compressed at once; more takes longer."""
 
 
 @dataclass(slots=True)

@@ -124,7 +124,7 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
         (Reason.HUB_LOST, None),
     ]
     assert sentence(better.causes, better.at) == (
-        "no fresh lidar scan (for 20 ms, age 20 ms, limit 250 ms), because port vanished (for 20 ms), "
+        "no fresh lidar scan (for 20 ms, age 20 ms, limit 250 ms), because lidar: port vanished (for 20 ms), "
         "because hub 1-2 vanished: lidar, camera"
     )
     rig.tick(200)
@@ -177,6 +177,7 @@ def test_a_failed_service_is_named_with_what_it_failed_of():
         (Reason.SERVICE_FAILED, "tracker", 1),
         (Reason.INTERNAL, "tracker", None),
     ]
+    assert sentence(trip.causes, trip.at).startswith("a service failed: tracker, because tracker: unexpected exception")
     assert trip.quick
 
 
@@ -276,7 +277,7 @@ def test_a_refused_arming_says_what_is_missing():
     rig.tick(50)
     assert rig.order(Order.ARM) is Reason.SCAN_STALE
     assert rig.tick().events[0].text == (
-        "no fresh lidar scan (for 1.0 s, age 1.0 s, limit 250 ms), because unplugged (for 1.0 s)"
+        "no fresh lidar scan (for 1.0 s, age 1.0 s, limit 250 ms), because lidar: unplugged (for 1.0 s)"
     )
 
 
