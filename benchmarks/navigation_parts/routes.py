@@ -69,7 +69,9 @@ def run(options: Options) -> Part:
             row = {"map": name, "query": number, "known_m": query.known}
             for kind, planner in planners.items():
                 result = planner.plan(ground, query.start, query.goal, time.thread_time)
-                row |= {f"{key}_{kind}": value for key, value in judged(result, world, planner, query, tolerance).items()}
+                row |= {
+                    f"{key}_{kind}": value for key, value in judged(result, world, planner, query, tolerance).items()
+                }
                 if result.path is not None:
                     row[f"xy_{kind}"] = result.path.sample(0.05).poses[:, :2].tolist()
             row |= peer(occupied, resolution, footprint, radius, query, 2 if options.quick else RUNS)

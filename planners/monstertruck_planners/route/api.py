@@ -106,8 +106,8 @@ class Vehicle:
         reference: x of the reference point in base, m.
     """
 
-    footprint: Footprint | DiscFootprint = Footprint()
-    radius: float = 0.378
+    footprint: Footprint | DiscFootprint
+    radius: float
     crab_angle: float = 0.0
     steering: Steering = "counter"
     reference: float = 0.0

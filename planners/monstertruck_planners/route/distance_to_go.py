@@ -1,7 +1,7 @@
 """Length of the shortest way to the goal round the obstacles, for a point, on a coarse grid, compiled.
 
-The first of the two heuristics, and the guide of the search: every cell also knows its next one. A coarse cell is open if
-any cell inside it may hold the middle of the footprint; near obstacles a metre counts more, as the footprint is no point.
+The first of the two heuristics, and the guide of the search: every cell also knows its next one. A coarse cell is open
+if any cell inside it may hold the middle of the footprint; near obstacles a metre counts more: the truck is no point.
 """
 
 from typing import NamedTuple
@@ -22,6 +22,9 @@ BUCKETS = 1024
 STEPS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
 """Column and row of each neighbour, counter-clockwise."""
 
+DEAREST = 7.0
+"""Greatest cost of a step, in those in the open: keeps within the buckets."""
+
 COARSE = 0.1
 """Cells are joined up to about this size, m."""
 
@@ -40,11 +43,14 @@ class ToGo(NamedTuple):
 
 
 @njit(cache=True)
-def tolls(field: FieldData, factor: int, closed: float, side: float, wide: float) -> NDArray[np.int16]:
+def tolls(
+    field: FieldData, price: NDArray[np.float32], factor: int, closed: float, side: float, wide: float
+) -> NDArray[np.int16]:
     """Cost of a straight step into each coarse cell.
 
     Args:
         field: the fine grid.
+        price: extra cost of a metre in each of its cells, see ``pricing.Layer``.
         factor: fine cells per coarse one, each way.
         closed: nearer to obstacles than this no pose can be free, m: 0.
         side: nearer than this only the footprint's ends may be, m: four times UNIT.
@@ -55,16 +61,20 @@ def tolls(field: FieldData, factor: int, closed: float, side: float, wide: float
     result = np.zeros((height, width), np.int16)
     for row in range(height):
         for column in range(width):
-            best = np.float32(0.0)
+            best, extra = np.float32(0.0), np.inf
             for r in range(row * factor, min((row + 1) * factor, rows)):
                 for c in range(column * factor, min((column + 1) * factor, columns)):
                     best = max(best, field.distance[r, c])
-            if best >= wide:
-                result[row, column] = UNIT
-            elif best >= side:
-                result[row, column] = int(UNIT * (1.0 + 0.5 * (wide - best) / (wide - side)))
-            elif best >= closed:
-                result[row, column] = 4 * UNIT
+                    if price.size > 0:
+                        extra = min(extra, price[r, c])
+            if best < closed:
+                continue
+            toll = 4.0
+            if best >= side:
+                toll = 1.0 + 0.5 * max(wide - best, 0.0) / (wide - side)
+            if price.size > 0:
+                toll *= 1.0 + extra
+            result[row, column] = int(UNIT * min(toll, DEAREST))
     return result
 
 

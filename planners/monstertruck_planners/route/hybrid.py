@@ -11,6 +11,7 @@ from monstertruck_planners.route import hybrid_search as search
 from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.pricing import Layer
 from monstertruck_planners.route.redraft import redraft
 from monstertruck_planners.route.shorten import Draft, shorten, tidy
 from monstertruck_planners.route.turning_table import turning_table
@@ -74,9 +75,10 @@ class HybridPlanner:
     def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or HybridConfig()
-        self._steer = vehicle.steer(self.config)
-        self._table = turning_table(vehicle.crab_angle)
-        self._body = vehicle.footprint.body()
+        self.steer = vehicle.steer(self.config)
+        self.table = turning_table(vehicle.crab_angle)
+        self.body = vehicle.footprint.body()
+        self.side = self.body.half_width or self.body.radius
 
     def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Route of the vehicle's reference point.
@@ -96,21 +98,55 @@ class HybridPlanner:
             return ends
         return _Run(self, ground, ends, budget).route()
 
+    @property
+    def tolerance(self) -> float:
+        """How far off the goal a route may end, m and rad."""
+        return max(self.config.position_tolerance, self.config.yaw_tolerance)
+
+    def free(self, ground: RouteMap, path: MotionPath) -> bool:
+        """Whether the vehicle may drive a path of its reference point."""
+        rows = np.ascontiguousarray(path.rows)
+        return bool(search.rows_free(ground.field.data(), self.body, self.car(LEVELS[0]), path.start, rows, len(rows)))
+
+    def cost(self, ground: RouteMap, path: MotionPath) -> float:
+        """What a path costs, m."""
+        layer = self.layer(ground)
+        rows = np.ascontiguousarray(path.rows)
+        car = self.car(LEVELS[0])
+        return float(search.rows_cost(ground.field.data(), layer, car, path.start, rows, len(rows), 0.0))
+
+    def layer(self, ground: RouteMap) -> Layer:
+        """Prices on a map."""
+        return ground.layer(self.config, self.side + 0.5 * ground.field.resolution)
+
+    def car(self, level: Level) -> search.Car:
+        """The vehicle as the compiled search takes it, with moves of one level."""
+        radius, crab = self.vehicle.radius, self.vehicle.crab_angle
+        length = level.move * radius
+        moves = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
+        if crab > 0.0:
+            moves += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
+        leaps = np.array([16.0, 8.0, 4.0, 2.0]) * radius
+        weights, swing, margin = self.steer.weights, self.config.swing_cost, self.config.margin + SKIN
+        return search.Car(radius, crab, weights, swing, np.array(moves), leaps, CHECK_STEP, margin)
+
 
 class _Run:
     """One planning request."""
 
     def __init__(self, planner: HybridPlanner, ground: RouteMap, ends: Ends, budget: Budget) -> None:
-        self.vehicle, self.config, self.budget = planner.vehicle, planner.config, budget
-        self.steer, self.table, self.body = planner._steer, planner._table, planner._body
+        self.planner, self.vehicle, self.config, self.budget = planner, planner.vehicle, planner.config, budget
+        self.table, self.body = planner.table, planner.body
         self.start, self.goal = ends.start, ends.goal
         self.field = ground.field.data()
-        side = self.body.half_width or self.body.radius
-        self.layer = ground.layer(self.config, side + 0.5 * self.field.resolution)
+        self.layer = planner.layer(ground)
         self.factor = max(round(togo.COARSE / self.field.resolution), 1)
         self.cell = self.factor * self.field.resolution
-        self.toll = togo.tolls(self.field, self.factor, self.body.inscribed, side, side + 0.25 * self.vehicle.radius)
-        self.car = self._car(LEVELS[0])
+        self.toll = togo.tolls(
+            self.field, self.layer.price, self.factor,
+            self.body.inscribed, planner.side, planner.side + 0.25 * self.vehicle.radius,
+        )  # fmt: skip
+        self.car = planner.car(LEVELS[0])
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
 
@@ -136,22 +172,12 @@ class _Run:
         return {**self.statistics, "elapsed_s": self.budget.elapsed}
 
     def _cell(self, pose: Array) -> tuple[int, int]:
-        return togo.cell_at(self.field, self.cell, pose[0], pose[1])  # type: ignore[no-any-return]
+        return togo.cell_at(self.field, self.cell, pose[0], pose[1])
 
     def _ways(self, allowed: NDArray[np.bool_], stretch: float) -> togo.ToGo:
         row, column = self._cell(self.start)
         cost, step = togo.spread(self.toll, allowed, *self._cell(self.goal), row * self.toll.shape[1] + column, stretch)
         return togo.ToGo(cost, step, self.toll, self.cell)
-
-    def _car(self, level: Level) -> search.Car:
-        radius, crab = self.vehicle.radius, self.vehicle.crab_angle
-        length = level.move * radius
-        moves = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
-        if crab > 0.0:
-            moves += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
-        leaps = np.array([16.0, 8.0, 4.0, 2.0]) * radius
-        weights, swing, margin = self.steer.weights, self.config.swing_cost, self.config.margin + SKIN
-        return search.Car(radius, crab, weights, swing, np.array(moves), leaps, CHECK_STEP, margin)
 
     def _nodes(self, level: Level) -> search.Nodes:
         cell = level.cell * self.vehicle.radius
@@ -165,22 +191,25 @@ class _Run:
 
     def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason]:
         for level in LEVELS:
-            rows, reason = self._search(go, level, self.config.greed, np.inf)
+            rows, reason = self._search(go, level)
             if rows is not None or reason is Reason.ROUTE_TIMEOUT:
                 return rows, reason
         whole = self._ways(np.zeros((0, 0), np.bool_), stretch=1e4)
-        return self._search(whole, LEVELS[1], self.config.greed, np.inf)
+        return self._search(whole, LEVELS[1])
 
     def _search(
-        self, go: togo.ToGo, level: Level, greed: float, bound: float, *, most: int = MOST_NODES
+        self, go: togo.ToGo, level: Level, *, sight: float = np.inf, most: int = MOST_NODES
     ) -> tuple[Array | None, Reason]:
-        car, nodes = self._car(level), self._nodes(level)
-        field, goal = self.field, self.goal
-        search.add(field, go, self.table, car, goal, nodes, greed, *self.start, 0.0, -1, search.LEAP, 0.0, bound)
+        car, nodes = self.planner.car(level), self._nodes(level)
+        field, goal, (x, y, yaw) = self.field, self.goal, self.start
+        greed, bound = self.config.greed, np.inf
+        search.add(field, go, self.table, car, goal, nodes, greed, x, y, yaw, 0.0, -1, search.LEAP, 0.0, bound)
         status = search.RUNNING
         while status == search.RUNNING and self.budget.left() > 0.0 and nodes.counts[search.EXPANDED] < most:
             before = int(nodes.counts[search.EXPANDED])
-            status = search.expand(field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, CHUNK)
+            status = search.expand(
+                field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, sight, CHUNK
+            )
             done = int(nodes.counts[search.EXPANDED]) - before
             self.budget.work += done
             self.statistics["expanded"] += done
@@ -199,7 +228,7 @@ class _Run:
         best = self._draft(rows)
         for shift in FINE:
             self._settle(best, 1e-4, shift)
-        return best.rows[: best.count[0]].copy()
+        return best.rows[: best.used[0]].copy()
 
     def _rounds(self, rows: Array, others: Iterator[Array], patience: int, reserve: float) -> Array:
         """Polish the best route and other drafts in turn until nothing gains or only the reserve is left."""
@@ -217,20 +246,20 @@ class _Run:
         """Shorten, face the better way everywhere, shorten again; given up early unless the cost gets ``promising``."""
         draft = self._draft(rows)
         self._settle(draft)
-        cost = self._cost(draft.rows[: draft.count[0]])
+        cost = self._cost(draft.rows[: draft.used[0]])
         if cost < promising and self.budget.left() > 0.0:
             other = self._draft(self._redrafted(draft))
-            if other.count[0]:
+            if other.used[0]:
                 self._settle(other)
-                if self._cost(other.rows[: other.count[0]]) < cost:
+                if self._cost(other.rows[: other.used[0]]) < cost:
                     draft = other
-        rows = draft.rows[: draft.count[0]].copy()
+        rows = draft.rows[: draft.used[0]].copy()
         return rows, self._cost(rows)
 
     def _settle(self, draft: Draft, gain: float = 1e-3, shift: float = 0.25) -> None:
         """Shorten until a batch of trials gains less than a share of the cost."""
         last = np.inf
-        while self.budget.left() > 0.0 and (cost := self._cost(draft.rows[: draft.count[0]])) < (1.0 - gain) * last:
+        while self.budget.left() > 0.0 and (cost := self._cost(draft.rows[: draft.used[0]])) < (1.0 - gain) * last:
             last = cost
             self._trials(draft, BATCH, shift)
 
@@ -238,12 +267,12 @@ class _Run:
         return float(search.rows_cost(self.field, self.layer, self.car, self.start, rows, len(rows), 0.0))
 
     def _redrafted(self, draft: Draft) -> Array:
-        path = MotionPath(self.start, draft.rows[: draft.count[0]])
+        path = MotionPath(self.start, draft.rows[: draft.used[0]])
         spacing = max(1.5 * self.vehicle.radius, path.length / 60) * self.random.uniform(0.7, 1.3)
         samples = path.sample(spacing)
         return redraft(
             self.field, self.body, self.layer, self.car, samples.poses, samples.travelled, 16.0 * self.vehicle.radius
-        )  # type: ignore[no-any-return]
+        )
 
     def _other_ways(self, go: togo.ToGo) -> Iterator[Array]:
         """First drafts along other ways, the shortest ways first."""
@@ -252,7 +281,6 @@ class _Run:
         back, back_step = togo.spread(self.toll, whole, *self._cell(self.start), -1, 1.0)
         known = np.zeros(self.toll.shape, np.bool_)
         width = APART * self.vehicle.radius / self.cell
-        brush_way(known, go.step, *self._cell(self.start), width)
         limit = int(DETOUR * go.cost[self._cell(self.start)])
         while (cell := cheapest_new(go.cost, back, known, limit)) >= 0:
             lane = np.zeros(self.toll.shape, np.bool_)
@@ -260,7 +288,9 @@ class _Run:
                 brush_way(lane, step, cell // columns, cell % columns, width)
                 brush_way(known, step, cell // columns, cell % columns, width)
             self.statistics["ways"] += 1
-            rows, _ = self._search(self._ways(lane, 1.3), LEVELS[0], self.config.greed, np.inf, most=CHUNK)
+            # From far off the goal is not tried directly: that motion would leave the lane.
+            near = 3.0 * self.vehicle.radius
+            rows, _ = self._search(self._ways(lane, 1.3), LEVELS[0], sight=near, most=CHUNK)
             yield EMPTY if rows is None else rows
 
     def _draft(self, rows: Array) -> Draft:

@@ -5,7 +5,7 @@ Beside the short moves a node tries the best obstacle-free motion to the goal an
 others, "Practical search techniques in path planning for autonomous driving", 2008.
 """
 
-from math import atan2, cos, floor, inf, pi, sin, sqrt
+from math import atan2, floor, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -74,12 +74,14 @@ USED, WAITING, EXPANDED, LAST = 0, 1, 2, 3
 
 
 @njit(cache=True)
-def estimate(field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: FloatArray, x: float, y: float, yaw: float) -> float:  # fmt: skip
+def estimate(
+    field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: FloatArray, x: float, y: float, yaw: float
+) -> float:
     """The greater of both heuristics, m; inf off the known ways."""
     row, column = cell_at(field, go.cell, x, y)
     if not (0 <= row < go.cost.shape[0] and 0 <= column < go.cost.shape[1]) or go.cost[row, column] >= FAR:
         return inf
-    return max(go.cost[row, column] * go.cell / UNIT, turning_bound(table, car.radius, x, y, yaw, goal))
+    return float(max(go.cost[row, column] * go.cell / UNIT, turning_bound(table, car.radius, x, y, yaw, goal)))
 
 
 @njit(cache=True)
@@ -128,7 +130,7 @@ def add(
         return
     row, column = cell_at(field, nodes.cell, x, y)
     headings = nodes.table.shape[2]
-    heading = int(floor(yaw / (2 * pi) * headings + 0.5)) % headings
+    heading = floor(yaw / (2 * pi) * headings + 0.5) % headings
     if not (0 <= row < nodes.table.shape[0] and 0 <= column < nodes.table.shape[1]):
         return
     other = nodes.table[row, column, heading] - 1
@@ -168,9 +170,23 @@ def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: f
 @njit(cache=True)
 def expand(
     field: FieldData, body: BodyData, layer: Layer, go: ToGo, table: NDArray[np.float32], car: Car,
-    goal: FloatArray, nodes: Nodes, greed: float, bound: float, count: int,
+    goal: FloatArray, nodes: Nodes, greed: float, bound: float, sight: float, count: int,
 ) -> int:  # fmt: skip
     """Expand up to ``count`` nodes.
+
+    Args:
+        field: the grid.
+        body: the footprint.
+        layer: prices.
+        go: ways to the goal.
+        table: see ``turning_table``.
+        car: what may be driven.
+        goal: shape (3,).
+        nodes: memory.
+        greed: factor on the heuristics.
+        bound: only cheaper solutions count, m.
+        sight: the goal is tried directly from this near, m.
+        count: see above.
 
     Returns:
         RUNNING, FOUND (the node ``counts[LAST]`` sees the goal, cheaper than ``bound``) or EXHAUSTED.
@@ -188,12 +204,15 @@ def expand(
         nodes.counts[EXPANDED] += 1
         pose, cost, sense = nodes.pose[n], nodes.cost[n], nodes.sense[n]
         away = sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2)
-        if away < 6.0 * car.radius or nodes.counts[EXPANDED] % 4 == 1:
+        if away < sight and (away < 6.0 * car.radius or nodes.counts[EXPANDED] % 4 == 1):
             many = connect(pose, goal, car.radius, car.crab, car.weights, rows, best, scratch)
-            if cost + best[COST] * car.radius < bound and rows_free(field, body, car, pose, rows, many):
-                if cost + rows_cost(field, layer, car, pose, rows, many, sense) < bound:
-                    nodes.counts[LAST] = n
-                    return FOUND
+            if (
+                cost + best[COST] * car.radius < bound
+                and cost + rows_cost(field, layer, car, pose, rows, many, sense) < bound
+                and rows_free(field, body, car, pose, rows, many)
+            ):
+                nodes.counts[LAST] = n
+                return FOUND
         for i in range(len(car.leaps)):
             if not _target(field, go, pose[0], pose[1], car.leaps[i], car.radius, target):
                 continue

@@ -47,24 +47,33 @@ def redraft(
     rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
     cost[0, 0] = 0.0
     for j in range(1, n):
-        for turned in range(1 if j == n - 1 else 2):
-            for i in range(j - 1, -1, -1):
-                if travelled[j] - travelled[i] > reach and i < j - 1:
-                    break
-                for k in range(2):
-                    limit = cost[j, turned] - cost[i, k]
-                    a, b = poses[i, k], poses[j, turned]
-                    if limit <= sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2):
-                        continue
-                    many = connect(a, b, car.radius, car.crab, car.weights, rows, best, scratch)
-                    if best[COST] * car.radius >= limit:
-                        continue
-                    price = rows_cost(field, layer, car, a, rows, many, sense[i, k])
-                    if price < limit and rows_free(field, body, car, a, rows, many):
-                        cost[j, turned], before[j, turned] = cost[i, k] + price, 2 * i + k
-                        sense[j, turned] = rows[many - 1, 0] if many > 0 else sense[i, k]
+        for i in range(j - 1, -1, -1):
+            if travelled[j] - travelled[i] > reach and i < j - 1:
+                break
+            for k in range(4):
+                # At the end the truck faces as it has to.
+                if j == n - 1 and k >= 2:
+                    continue
+                a, b, limit = poses[i, k & 1], poses[j, k >> 1], cost[j, k >> 1] - cost[i, k & 1]
+                if limit <= sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2):
+                    continue
+                many = connect(a, b, car.radius, car.crab, car.weights, rows, best, scratch)
+                if best[COST] * car.radius >= limit:
+                    continue
+                price = rows_cost(field, layer, car, a, rows, many, sense[i, k & 1])
+                if price < limit and rows_free(field, body, car, a, rows, many):
+                    cost[j, k >> 1], before[j, k >> 1] = cost[i, k & 1] + price, 2 * i + (k & 1)
+                    sense[j, k >> 1] = rows[many - 1, 0] if many > 0 else sense[i, k & 1]
+    return _spelled(car, poses, before)
+
+
+@njit(cache=True)
+def _spelled(car: Car, poses: FloatArray, before: NDArray[np.int64]) -> FloatArray:
+    """Rows of the chain that ends at the last place."""
+    n = len(poses)
     if before[n - 1, 0] < 0:
         return np.empty((0, 3))
+    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
     chain = np.empty(n, np.int64)
     chain[0] = 2 * (n - 1)
     depth = 1

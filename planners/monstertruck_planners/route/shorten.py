@@ -30,12 +30,12 @@ class Draft(NamedTuple):
     """A path under work."""
 
     rows: FloatArray
-    """Shape (n, 3), of which ``count[0]`` are in use."""
+    """Shape (n, 3), of which ``used[0]`` are in use."""
     poses: FloatArray
     """Shape (n + 1, 3), before each row and after the last."""
     travelled: FloatArray
     """Shape (n + 1,)."""
-    count: IntArray
+    used: IntArray
 
 
 @njit(cache=True)
@@ -43,7 +43,7 @@ def measure(draft: Draft, first: int) -> None:
     """Poses and lengths from row ``first`` on."""
     if first == 0:
         draft.travelled[0] = 0.0
-    for i in range(first, draft.count[0]):
+    for i in range(first, draft.used[0]):
         length = draft.rows[i, 0]
         x, y, yaw = advance(
             draft.poses[i, 0], draft.poses[i, 1], draft.poses[i, 2], length, draft.rows[i, 1], draft.rows[i, 2]
@@ -54,7 +54,7 @@ def measure(draft: Draft, first: int) -> None:
 
 @njit(cache=True)
 def _row_at(draft: Draft, s: float) -> int:
-    low, high = 0, draft.count[0] - 1
+    low, high = 0, draft.used[0] - 1
     while low < high:
         middle = (low + high) >> 1
         if draft.travelled[middle + 1] > s:
@@ -94,9 +94,9 @@ def _append(out: FloatArray, used: int, length: float, curvature: float, sidesli
 def tidy(draft: Draft) -> None:
     """Join rows that go on alike, and measure the whole."""
     used = 0
-    for k in range(draft.count[0]):
+    for k in range(draft.used[0]):
         used = _append(draft.rows, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
-    draft.count[0] = used
+    draft.used[0] = used
     measure(draft, 0)
 
 
@@ -116,7 +116,7 @@ def _splice(
         used = _append(spare, used, middle[k, 0], middle[k, 1], middle[k, 2])
     sign = 1.0 if draft.rows[j, 0] > 0.0 else -1.0
     used = _append(spare, used, sign * (draft.travelled[j + 1] - end), draft.rows[j, 1], draft.rows[j, 2])
-    for k in range(j + 1, draft.count[0]):
+    for k in range(j + 1, draft.used[0]):
         used = _append(spare, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
     if first + used > len(draft.rows):
         return
@@ -124,7 +124,7 @@ def _splice(
         draft.rows[first + k, 0] = spare[k, 0]
         draft.rows[first + k, 1] = spare[k, 1]
         draft.rows[first + k, 2] = spare[k, 2]
-    draft.count[0] = first + used
+    draft.used[0] = first + used
     measure(draft, first)
 
 
@@ -170,7 +170,7 @@ def shorten(
     a, b, q = np.empty(3), np.empty(3), np.empty(3)
     kept = 0
     for n in range(len(random)):
-        total = draft.travelled[draft.count[0]]
+        total = draft.travelled[draft.used[0]]
         if total < 1e-6:
             break
         # Short stretches are tried oftener than long ones.
@@ -187,7 +187,7 @@ def shorten(
             draft.rows[i, 0] if begin - draft.travelled[i] > LEAST_ROW else (draft.rows[i - 1, 0] if i > 0 else 0.0)
         )
         after = draft.rows[j, 0] if draft.travelled[j + 1] - end > LEAST_ROW else (
-            draft.rows[j + 1, 0] if j + 1 < draft.count[0] else 0.0
+            draft.rows[j + 1, 0] if j + 1 < draft.used[0] else 0.0
         )  # fmt: skip
         count = _stretch(draft, begin, i, end, j, old)
         present = rows_cost(field, layer, car, a, old, count, before)

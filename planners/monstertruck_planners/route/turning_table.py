@@ -1,6 +1,6 @@
 """The second heuristic: length of the best motion without obstacles, tabulated round the goal, compiled.
 
-Everything is in turning radii; one table serves every radius. The left and the right half are each other's mirror image.
+Everything is in turning radii; one table serves every radius. The left and the right half mirror each other.
 """
 
 from functools import lru_cache
@@ -54,5 +54,5 @@ def turning_bound(table: NDArray[np.float32], radius: float, x: float, y: float,
         return radius * sqrt(px * px + py * py)
     if py < 0.0:
         py, turn = -py, -turn
-    k = int(floor(turn / (2 * pi) * HEADINGS + 0.5)) % HEADINGS
+    k = floor(turn / (2 * pi) * HEADINGS + 0.5) % HEADINGS
     return radius * float(table[int((px + REACH) / SPACING + 0.5), int(py / SPACING + 0.5), k])

@@ -40,7 +40,7 @@ def brush_way(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, column:
 def cheapest_new(
     to_goal: NDArray[np.int32], from_start: NDArray[np.int32], known: NDArray[np.bool_], limit: int
 ) -> int:
-    """Flat index of the cell with the cheapest way over it among those not known; -1 if none costs at most ``limit``."""
+    """Flat index of the unknown cell with the cheapest way over it; -1 if none costs at most ``limit``."""
     best, where = limit + 1, -1
     rows, columns = known.shape
     for row in range(rows):

@@ -1,0 +1,142 @@
+"""Routes over waypoints, and routes that are kept while they are good. Compiled."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monstertruck_planners.route.api import Clock, RouteMap, RouteResult
+from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.motion import MotionPath, joined
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.reasons import Reason
+
+Array = NDArray[np.float64]
+
+SAME_GOAL = 1e-3
+"""Goals nearer than this are the same, m and rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """A place to pass; without a heading the truck takes that of the way there and on."""
+
+    x: float
+    y: float
+    yaw: float | None = None
+
+
+def plan_through(
+    planner: HybridPlanner,
+    ground: RouteMap,
+    start: ArrayLike,
+    waypoints: Sequence[Waypoint],
+    now: Clock | None = None,
+) -> RouteResult:
+    """Route over all waypoints in turn, the last one being the goal; the budget is shared by the legs.
+
+    Raises:
+        InputError: no waypoint.
+    """
+    if not waypoints:
+        raise InputError("route over waypoints: expected one at least")
+    share = 1.0 / len(waypoints)
+    config = planner.config
+    leg_config = config.model_copy(
+        update={"budget": config.budget * share, "effort": max(int(config.effort * share), 1)}
+    )
+    leg_planner = HybridPlanner(planner.vehicle, leg_config)
+    here = np.asarray(start, dtype=np.float64)
+    legs: list[MotionPath] = []
+    cost, statistics = 0.0, dict[str, float]()
+    for number, goal in enumerate(_with_headings(here, waypoints), start=1):
+        result = leg_planner.plan(ground, here, goal, now)
+        for name, value in result.statistics.items():
+            statistics[name] = statistics.get(name, 0.0) + value
+        if result.path is None:
+            return replace(result, text=f"waypoint {number} of {len(waypoints)}: {result.text}", statistics=statistics)
+        legs.append(result.path)
+        cost += result.cost
+        here = result.path.end
+    return RouteResult(Reason.OK, joined(legs), cost=cost, statistics=statistics)
+
+
+def _with_headings(start: Array, waypoints: Sequence[Waypoint]) -> list[Array]:
+    places = [(float(start[0]), float(start[1])), *((w.x, w.y) for w in waypoints)]
+    goals = []
+    for i, waypoint in enumerate(waypoints, start=1):
+        yaw = waypoint.yaw
+        if yaw is None:
+            (x0, y0), (x1, y1) = places[i - 1], places[min(i + 1, len(places) - 1)]
+            yaw = math.atan2(y1 - y0, x1 - x0)
+        goals.append(np.array([waypoint.x, waypoint.y, yaw]))
+    return goals
+
+
+@dataclass(frozen=True, slots=True)
+class KeepPolicy:
+    """When the route at hand is kept."""
+
+    reach: float = 0.5
+    """The truck may be this far from the route, m."""
+    gain: float = 0.1
+    """A new route has to cost less than the old one by this share of it."""
+
+
+def replan(
+    planner: HybridPlanner,
+    ground: RouteMap,
+    previous: MotionPath | None,
+    pose: ArrayLike,
+    goal: ArrayLike,
+    now: Clock | None = None,
+    policy: KeepPolicy | None = None,
+) -> RouteResult:
+    """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
+
+    So a truck before an obstacle does not waver between left and right. ``statistics["kept_route"]`` tells which it is.
+    """
+    policy = policy or KeepPolicy()
+    kept = None if previous is None else rest_of(planner, ground, previous, pose, goal, policy.reach)
+    fresh = planner.plan(ground, pose, goal, now)
+    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * planner.cost(ground, kept)):
+        return replace(fresh, statistics={**fresh.statistics, "kept_route": 0.0})
+    return RouteResult(
+        Reason.OK, kept, cost=planner.cost(ground, kept), statistics={**fresh.statistics, "kept_route": 1.0}
+    )
+
+
+def rest_of(
+    planner: HybridPlanner, ground: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float
+) -> MotionPath | None:
+    """A free way from the pose back onto the path and along it to its end, or None.
+
+    Args:
+        planner: of the path.
+        ground: the map as it is now.
+        path: the route so far.
+        pose: of the reference point now.
+        goal: where the path has to end.
+        reach: greatest distance of the pose from the path, m.
+    """
+    here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+    if not np.isfinite(here).all() or not len(path.rows) or _apart(path.end, there) > planner.tolerance + SAME_GOAL:
+        return None
+    samples = path.sample(0.05)
+    away = np.hypot(samples.poses[:, 0] - here[0], samples.poses[:, 1] - here[1])
+    turned = np.abs(np.remainder(samples.poses[:, 2] - here[2] + math.pi, math.tau) - math.pi)
+    nearest = int(np.argmin(away + planner.vehicle.radius * turned))
+    if away[nearest] > reach:
+        return None
+    begin = float(samples.travelled[nearest])
+    steer = planner.vehicle.steer(planner.config)
+    rests = [path.part(begin + ahead * planner.vehicle.radius, math.inf) for ahead in (0.0, 0.5, 1.0, 2.0, 4.0)]
+    ways = [steer.path(here, rest.start).then(rest) for rest in rests]
+    ways = [way for way in ways if planner.free(ground, way)]
+    return min(ways, key=lambda way: planner.cost(ground, way), default=None)
+
+
+def _apart(a: Array, b: Array) -> float:
+    return float(max(math.hypot(a[0] - b[0], a[1] - b[1]), abs(math.remainder(a[2] - b[2], math.tau))))
