@@ -11,7 +11,7 @@ from monstertruck_drivers.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_drivers.world.config import SinusoidTilt, TiltConfig, WorldConfig
 from monstertruck_drivers.world.maps import FREE, OCCUPIED, load_map
 from monstertruck_drivers.world.obstacles import Box, Obstacle, discs_and_segments, penetration
-from monstertruck_drivers.world.raycast import cast_rays, grid_penetration
+from monstertruck_drivers.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_drivers.world.sensors import (
     SimulatedCompass,
     SimulatedLidar,
@@ -56,6 +56,7 @@ class World:
         if self._overlap(place.map.cells != FREE, start) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
         self._occupied = place.map.cells == OCCUPIED
+        self._clear = clearance(self._occupied)
         self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiled now rather than within somebody's deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
         self._lidar = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
@@ -159,7 +160,7 @@ class World:
         self, xs: NDArray[np.float64], ys: NDArray[np.float64], angles: NDArray[np.float64], reach: float
     ) -> NDArray[np.float64]:
         ranges: NDArray[np.float64] = cast_rays(
-            self._occupied, self.map.resolution, *self.map.origin, xs, ys, angles, reach, self._discs, self._segments
+            self._clear, self.map.resolution, *self.map.origin, xs, ys, angles, reach, self._discs, self._segments
         )
         return ranges
 

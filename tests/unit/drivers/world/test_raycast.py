@@ -6,7 +6,7 @@ from timeit import timeit
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.raycast import cast_rays, grid_penetration
+from monstertruck_drivers.world.raycast import cast_rays, clearance, grid_penetration
 
 NO_DISCS, NO_SEGMENTS = np.zeros((0, 3)), np.zeros((0, 4))
 
@@ -32,10 +32,20 @@ def test_every_range_is_exact(seed):
     xs = rng.uniform(-2, 3.5, 250)  # some outside the grid, some inside walls
     ys = rng.uniform(0, 4.5, 250)
     angles = rng.uniform(-10, 10, 250)
-    got = cast_rays(occupied, resolution, *origin, xs, ys, angles, reach, NO_DISCS, NO_SEGMENTS)
+    got = cast_rays(clearance(occupied), resolution, *origin, xs, ys, angles, reach, NO_DISCS, NO_SEGMENTS)
     want = [slab_reference(occupied, resolution, origin, *ray, reach) for ray in zip(xs, ys, angles, strict=True)]
     np.testing.assert_allclose(got, want, atol=1e-9)
     assert 0 < np.isinf(got).sum() < 250
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3])
+def test_clearance_is_the_distance_to_the_nearest_occupied_cell(share):
+    occupied = np.random.default_rng(1).random((40, 300)) < share
+    rows, columns = np.nonzero(occupied)
+    got = clearance(occupied)
+    for row, column in np.ndindex(occupied.shape):
+        want = np.maximum(abs(rows - row), abs(columns - column)).min(initial=255)
+        assert got[row, column] == want
 
 
 @pytest.mark.parametrize(("angle", "want"), [(0.0, 0.475), (pi / 2, inf), (pi, inf), (-pi / 2, inf)])
@@ -43,7 +53,16 @@ def test_axis_parallel_rays(angle, want):
     occupied = np.zeros((20, 20), bool)
     occupied[:, 10] = True
     got = cast_rays(
-        occupied, 0.1, 0.0, 0.0, np.array([0.525]), np.array([0.5]), np.array([angle]), 9.0, NO_DISCS, NO_SEGMENTS
+        clearance(occupied),
+        0.1,
+        0.0,
+        0.0,
+        np.array([0.525]),
+        np.array([0.5]),
+        np.array([angle]),
+        9.0,
+        NO_DISCS,
+        NO_SEGMENTS,
     )
     assert got[0] == pytest.approx(want)
 
@@ -54,14 +73,14 @@ def test_discs_and_segments_hide_the_map():
     segments = np.array([[-1.0, -1.0, -1.0, 1.0]])
     angles = np.array([0.0, pi, 0.2, 1.0])
     zeros = np.zeros(4)
-    got = cast_rays(occupied, 0.1, 5.0, 5.0, zeros, zeros, angles, 5.0, discs, segments)
+    got = cast_rays(clearance(occupied), 0.1, 5.0, 5.0, zeros, zeros, angles, 5.0, discs, segments)
     grazing = 2 * cos(0.2) - np.sqrt(0.25 - (2 * sin(0.2)) ** 2)
     np.testing.assert_allclose(got, [1.5, 1.0, grazing, inf])
 
 
 def test_ray_from_inside_a_disc_is_zero_long():
     got = cast_rays(
-        np.zeros((1, 1), bool), 1.0, 0.0, 0.0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0,
+        clearance(np.zeros((1, 1), bool)), 1.0, 0.0, 0.0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0,
         np.array([[0.1, 0.0, 0.3]]), NO_SEGMENTS,
     )  # fmt: skip
     assert got[0] == 0
@@ -72,7 +91,7 @@ def test_a_scan_is_fast():
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     angles = np.linspace(-2.1, 2.1, 682)
     xs = np.full(682, 6.0)
-    args = (occupied, 0.05, 0.0, 0.0, xs, xs, angles, 5.6, NO_DISCS, NO_SEGMENTS)
+    args = (clearance(occupied), 0.05, 0.0, 0.0, xs, xs, angles, 5.6, NO_DISCS, NO_SEGMENTS)
     cast_rays(*args)
     seconds = min(timeit(lambda: cast_rays(*args), number=1) for _ in range(20))
     print(f"682 beams to 5.6 m: {seconds * 1e6:.0f} us")
