@@ -93,6 +93,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             path=bus.subscribe(topics.PATH, latest()),
             gate=bus.subscribe(topics.GATE, latest()),
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
+            attitude=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
             drive=bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER),
             tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
             events=bus.event_sink(),

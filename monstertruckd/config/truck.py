@@ -21,7 +21,7 @@ from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_kinematics.chassis import Chassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
-from monstertruck_planners.track.pure_pursuit import STEERING_MODES, PurePursuitConfig
+from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import BodyConfig, TruckBody
@@ -214,7 +214,7 @@ class TruckConfig(Schema):
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
     odometry: OdometryConfig = OdometryConfig()
-    tracker: PurePursuitConfig | None = None
+    tracker: AnyTracker | None = None
     path: PathSource | None = None
     map: MapRender | None = None
     recorder: RecorderConfig | None = None

@@ -1,11 +1,14 @@
 """Messages of the ``plan`` group: paths, tracker progress, and the planners' wishes to the gate."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import Float64Array, Message
 from monstertruck_schemas.reasons import Reason
+
+Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
+"""Which axles steer: one alone, both by opposite or by equal angles, or both freely."""
 
 
 class Path(Message):
@@ -15,6 +18,9 @@ class Path(Message):
     """Shape (3 n,), row-major (x, y, yaw) rows: m, m, rad."""
     directions: Float64Array
     """Shape (n,): +1 where the truck arrives forward, -1 backward; empty = all forward."""
+    steering: tuple[Steering, ...] = ()
+    """n of them: how the axles steer where the truck arrives; empty = as the tracker is configured. Only where it is
+    crab or hybrid is the poses' yaw meant; else it follows from the path."""
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
     name: str = ""

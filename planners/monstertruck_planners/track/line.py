@@ -6,13 +6,13 @@ Progress along it only grows and is looked for near the present one, so a path m
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import Path, Steering
 
 Array = NDArray[np.float64]
 
@@ -55,6 +55,19 @@ class Foot:
     """Direction of travel there, rad."""
 
 
+class Steps(NamedTuple):
+    """A path without repeated points."""
+
+    points: Array
+    """Shape (n, 2), m."""
+    yaws: Array
+    """Shape (n,), rad."""
+    directions: Array
+    """Shape (n - 1,): of each step."""
+    steering: tuple[Steering, ...]
+    """Of each step, or empty."""
+
+
 class Run:
     """Part of a path driven in one direction, with a straight or given way on beyond its end.
 
@@ -63,9 +76,22 @@ class Run:
         last: index of the run's own last point.
         direction: +1 forward, -1 backward.
         before: metres of the runs before this one.
+        yaws: of the own points, shape (last + 1,), rad.
+        steering: of each own step, or empty.
+        lap: the way beyond is the path's own beginning.
     """
 
-    def __init__(self, points: Array, last: int, direction: float, before: float) -> None:
+    def __init__(
+        self,
+        points: Array,
+        last: int,
+        direction: float,
+        before: float,
+        yaws: Array | None = None,
+        steering: tuple[Steering, ...] = (),
+        *,
+        lap: bool = False,
+    ) -> None:
         steps = np.diff(points, axis=0)
         self._points = points
         self._lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -74,6 +100,20 @@ class Run:
         self.direction = direction
         self.before = before
         self.length = float(self._s[last])
+        self.end = float(self._s[-1]) if lap else self.length
+        """Up to here the way is part of the path, m."""
+        self.yaws = np.zeros(last + 1) if yaws is None else yaws
+        self.steering = steering
+
+    @property
+    def vertices(self) -> Array:
+        """Metres from the beginning to each own point."""
+        return self._s[: len(self.yaws)]
+
+    def points(self, s: Array) -> Array:
+        """Points at ``s`` metres, shape (m, 2)."""
+        x, y = self._points.T
+        return np.column_stack((np.interp(s, self._s, x), np.interp(s, self._s, y)))
 
     def at(self, s: float) -> Foot:
         """Point at ``s`` metres."""
@@ -123,18 +163,17 @@ class Line:
     """
 
     def __init__(self, path: Path, start: tuple[float, float, float], beyond: float) -> None:
-        points, directions = _steps(path)
-        first = _nearest(points, directions, start, closed=path.closed)
+        steps = _steps(path)
+        first = _nearest(steps.points, steps.directions, start, closed=path.closed)
         if path.closed:
-            points = np.concatenate((points[first:-1], points[: first + 1]))
-            directions = np.roll(directions, -first)
+            steps = _rolled(steps, first)
             first = 0
         self.name = path.name
         self.frame = path.frame
         self.closed = path.closed
-        self.runs = _runs(points, directions, beyond, closed=path.closed)
+        self.runs = _runs(steps, beyond, closed=path.closed)
         self.length = sum(run.length for run in self.runs)
-        self.start = self._progress_of(points, first)
+        self.start = self._progress_of(steps.points, first)
 
     def along(self, progress: Progress) -> float:
         """Metres from the line's beginning."""
@@ -163,6 +202,8 @@ def check_path(path: Path) -> None:
     count = len(poses)
     if len(path.directions) not in (0, count) or not (np.abs(path.directions) == 1.0).all():
         _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
+    if len(path.steering) not in (0, count):
+        _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
     if np.count_nonzero(np.diff(path.directions)) >= MAX_RUNS:
         _refuse(path, f"direction changes too often: expected at most {MAX_RUNS} runs forward and backward")
     if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
@@ -179,18 +220,29 @@ def _refuse(path: Path, text: str) -> NoReturn:
     raise InputError(f"path {path.name[:MAX_NAME]!r}: {text}")
 
 
-def _steps(path: Path) -> tuple[Array, Array]:
-    """Distinct points (n, 2) and the direction of each of the n - 1 steps; a closed path ends on its beginning."""
+def _steps(path: Path) -> Steps:
+    """What the path says of each step; a closed path ends on its beginning."""
     check_path(path)
-    points = path.poses.reshape(-1, 3)[:, :2]
+    points, yaws = path.poses.reshape(-1, 3)[:, :2], path.poses[2::3]
     directions = path.directions if len(path.directions) else np.ones(len(points))
-    arriving = directions[1:]
+    arriving, steering = directions[1:], path.steering[1:]
     if path.closed:
-        points = np.concatenate((points, points[:1]))
-        arriving = np.concatenate((arriving, directions[:1]))
+        points, yaws = np.concatenate((points, points[:1])), np.concatenate((yaws, yaws[:1]))
+        arriving, steering = np.concatenate((arriving, directions[:1])), steering + path.steering[:1]
     step = np.diff(points, axis=0)
     real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
-    return np.concatenate((points[:1], points[1:][real])), arriving[real]
+    kept = np.concatenate(([True], real))
+    if steering:
+        steering = tuple(mode for mode, is_real in zip(steering, real.tolist(), strict=True) if is_real)
+    return Steps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering)
+
+
+def _rolled(steps: Steps, first: int) -> Steps:
+    """A closed path from another vertex on."""
+    points = np.concatenate((steps.points[first:-1], steps.points[: first + 1]))
+    yaws = np.unwrap(np.concatenate((steps.yaws[first:-1], steps.yaws[: first + 1])))
+    steering = steps.steering[first:] + steps.steering[:first]
+    return Steps(points, yaws, np.roll(steps.directions, -first), steering)
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
@@ -208,18 +260,27 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
     return int(groups[0][np.argmin(distance[groups[0]])])
 
 
-def _runs(points: Array, directions: Array, beyond: float, *, closed: bool) -> tuple[Run, ...]:
-    cuts = [0, *(np.flatnonzero(np.diff(directions)) + 1).tolist(), len(directions)]
+def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
+    cuts = [0, *(np.flatnonzero(np.diff(steps.directions)) + 1).tolist(), len(steps.directions)]
+    lap = closed and len(cuts) == 2
     runs: list[Run] = []
     before = 0.0
     for begin, end in pairwise(cuts):
-        own = points[begin : end + 1]
-        if closed and len(cuts) == 2:
-            extension = points[1 : 1 + _reach(points, beyond)]
+        own = steps.points[begin : end + 1]
+        if lap:
+            extension = own[1 : 1 + _reach(own, beyond)]
         else:
             way = own[-1] - own[-2]
             extension = own[-1:] + beyond * way / np.hypot(*way)
-        run = Run(np.concatenate((own, extension)), end - begin, float(directions[begin]), before)
+        run = Run(
+            np.concatenate((own, extension)),
+            end - begin,
+            float(steps.directions[begin]),
+            before,
+            steps.yaws[begin : end + 1],
+            steps.steering[begin:end],
+            lap=lap,
+        )
         runs.append(run)
         before += run.length
     return tuple(runs)

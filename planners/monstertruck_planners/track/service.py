@@ -8,8 +8,11 @@ import numpy as np
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, clearance_to_points, points_near, scan_points
+from monstertruck_planners.track.api import Command, TruckState
+from monstertruck_planners.track.catalog import build_tracker
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.ground import Ground
 from monstertruck_planners.track.line import Line, Progress
-from monstertruck_planners.track.pure_pursuit import Command, PurePursuit, PurePursuitConfig, TruckState
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -18,9 +21,9 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
-from monstertruck_schemas.topics import ODOMETRY, SCAN
+from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 """Modes of the gate in which the tracker asks for motion."""
@@ -33,7 +36,7 @@ AT_REST: Final = 0.01
 
 
 class TrackerService:
-    """Follows ``plan/path`` by pure pursuit.
+    """Follows ``plan/path`` by the configured tracker.
 
     Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
     Once the path has ended or is lost it asks for standstill, then falls silent.
@@ -48,6 +51,7 @@ class TrackerService:
         path: what to follow.
         gate: state of the gate, with the nonce.
         scan: slows down in narrow places; None = does not.
+        attitude: slows down on slopes and rough ground; None = does not.
         drive: ``plan/drive``.
         tracker: ``plan/tracker``.
         events: where events go.
@@ -57,7 +61,7 @@ class TrackerService:
 
     def __init__(
         self,
-        config: PurePursuitConfig,
+        config: TrackerConfig,
         clock: Clock,
         *,
         steering: FourWheelSteering,
@@ -67,19 +71,22 @@ class TrackerService:
         path: Subscription[Path],
         gate: Subscription[GateState],
         scan: Subscription[LaserScan] | None,
+        attitude: Subscription[Attitude] | None = None,
         drive: Publisher[DriveRequest],
         tracker: Publisher[TrackerState],
         events: EventSink,
     ) -> None:
         self._config = config
         self._clock = clock
-        self._law = PurePursuit(config, steering)
+        self._law = build_tracker(config, steering)
         self._footprint = footprint
         self._lidar = lidar
         self._pose = pose
         self._path = path
         self._gate = gate
         self._scan = scan
+        self._attitude = attitude
+        self._ground = Ground()
         self._drive = drive
         self._tracker = tracker
         self._events = events
@@ -106,9 +113,10 @@ class TrackerService:
         self._choose_line(path, pose, armed=gate.mode in ACTIVE)
         if self._line is None:
             return
-        state = TruckState((pose.pose.x, pose.pose.y, pose.pose.yaw), pose.twist.vx, self._clearance(pose, now))
+        at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        state = TruckState(at, pose.twist.vx, self._clearance(pose, now), *self._feel(now))
         try:
-            command = self._law.control(state, self._line, self._progress)
+            command = self._law.control(state, self._line, self._progress, now / SECOND)
         except KinematicsError as error:
             self._line = None
             text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
@@ -123,6 +131,8 @@ class TrackerService:
     def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
         """Take a new path, or start the present one over: until armed it may still begin anywhere."""
         restart = not self._active and (self._outcome is not Reason.DRIVING or self._at_start())
+        if armed and not self._active:
+            self._law.reset()
         self._active = armed
         if path is self._followed and not (restart and self._line is not None):
             return
@@ -132,7 +142,8 @@ class TrackerService:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
                 raise InputError(msg)
             start = (pose.pose.x, pose.pose.y, pose.pose.yaw)
-            self._line = Line(path, start, beyond=2 * self._config.lookahead)
+            self._line = Line(path, start, self._config.beyond)
+            self._law.reset()
             self._progress = self._line.start
         except InputError as error:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
@@ -145,7 +156,7 @@ class TrackerService:
         scan = None if self._scan is None else self._scan.latest
         if scan is None or self._line is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return math.inf
-        ahead = self._line.ahead(self._progress, self._config.lookahead, LOOKS)
+        ahead = self._line.ahead(self._progress, self._config.reach, LOOKS)
         c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
         dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
         poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
@@ -153,6 +164,15 @@ class TrackerService:
             self._scanned, self._points = scan, scan_points(scan, self._lidar)
         near = points_near(self._points, poses, self._footprint.circumscribed_radius + self._config.slow_clearance)
         return float(clearance_to_points(self._footprint, poses, near).min())
+
+    def _feel(self, now: int) -> tuple[float, float]:
+        """Tilt and roughness, rad; 0 if nobody measures them now."""
+        attitude = None if self._attitude is None else self._attitude.latest
+        if attitude is None or now - attitude.received > COMPASS.fresh_for() * SECOND:
+            return 0.0, 0.0
+        if attitude.tilt_valid:
+            self._ground.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
+        return self._ground.tilt, self._ground.roughness
 
     def _ask(self, command: Command, gate: GateState, now: int) -> None:
         self._drive.put(

@@ -5,8 +5,10 @@ import math
 import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.api import TruckState
+from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.line import Line
-from monstertruck_planners.track.pure_pursuit import PurePursuit, PurePursuitConfig, TruckState
+from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 
@@ -51,14 +53,16 @@ class Follower:
         self.law = PurePursuit(self.config, STEERING)
         self.pose = pose
         self.speed, self.front, self.rear = 0.0, 0.0, 0.0
-        self.line = Line(route, pose, 2 * self.config.lookahead)
+        self.line = Line(route, pose, self.config.beyond)
+        self.t = 0.0
         self.progress = self.line.start
         self.log = []
         self.clearance = math.inf
 
     def step(self):
         twist = STEERING.body_twist(self.speed, self.front, self.rear)
-        command = self.law.control(TruckState(self.pose, twist[0], self.clearance), self.line, self.progress)
+        command = self.law.control(TruckState(self.pose, twist[0], self.clearance), self.line, self.progress, self.t)
+        self.t += 0.05
         self.progress = command.progress
         self.log.append(command)
         for _ in range(5):

@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_planners.track.api import TruckState
+from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.line import Progress
-from monstertruck_planners.track.pure_pursuit import PurePursuitConfig, TruckState
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.kit import STEERING, Follower, circle, figure_eight, path, straight
 
@@ -73,7 +74,7 @@ def test_the_direction_changes_at_standstill():
 
 def test_a_truck_still_rolling_the_other_way_is_stopped_first():
     truck = Follower(path(straight(2.0)))
-    assert truck.law.control(TruckState((0.5, 0.0, 0.0), -0.1), truck.line, truck.progress).speed == 0.0
+    assert truck.law.control(TruckState((0.5, 0.0, 0.0), -0.1), truck.line, truck.progress, 0.0).speed == 0.0
 
 
 def test_only_the_front_axle_steers_in_front_mode():
@@ -103,25 +104,25 @@ def test_the_arc_passes_through_its_goal(mode, direction):
 
 def test_errors_are_signed():
     truck = Follower(path(straight(2.0)))
-    left = truck.law.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.line, Progress(0, 0.9))
+    left = truck.law.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.line, Progress(0, 0.9), 0.0)
     assert left.cross_track == pytest.approx(0.1)
     assert left.heading_error == pytest.approx(0.2)
     assert left.front < 0 < left.rear
     back = Follower(path(straight(2.0), [-1] * 41), pose=(0.0, 0.0, math.pi))
-    wrong = back.law.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.line, Progress(0, 0.9))
+    wrong = back.law.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.line, Progress(0, 0.9), 0.0)
     assert wrong.cross_track == pytest.approx(0.1)
     assert wrong.heading_error == pytest.approx(-0.2)
 
 
 def test_progress_never_goes_back():
     truck = Follower(path(straight(2.0)))
-    command = truck.law.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.line, Progress(0, 0.8))
+    command = truck.law.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.line, Progress(0, 0.8), 0.0)
     assert command.progress.s == pytest.approx(0.8)
 
 
 def test_a_truck_far_off_is_lost():
     truck = Follower(path(straight(2.0)))
-    command = truck.law.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.line, Progress(0, 0.9))
+    command = truck.law.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.line, Progress(0, 0.9), 0.0)
     assert (command.outcome, command.speed) == (Reason.PATH_LOST, 0.0)
 
 
@@ -148,7 +149,7 @@ def test_angles_stay_within_the_limit():
     assert max(max(abs(c.front), abs(c.rear)) for c in truck.log) <= 0.25 + 1e-9
 
 
-@pytest.mark.parametrize("bad", [{"min_speed": 0.2}, {"goal_tolerance": 0.5}, {"steering": "rear"}])
+@pytest.mark.parametrize("bad", [{"min_speed": 0.2}, {"goal_tolerance": 0.5}, {"steering": "sideways"}])
 def test_contradictory_configs_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         PurePursuitConfig(**bad)

@@ -7,7 +7,8 @@ import pytest
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.track.pure_pursuit import PurePursuit, PurePursuitConfig
+from monstertruck_planners.track.config import PurePursuitConfig
+from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D

@@ -1,0 +1,189 @@
+"""What all trackers have in common: progress, cusps, speed, prediction over the dead time, limits.
+
+A run ends for good: its successor, with the direction and the steering it asks for, begins when the truck has come to
+rest at the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Generic, TypeVar
+
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.actuator import Angles, Axles, Pose
+from monstertruck_planners.track.api import Command, TruckState
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.course import Course, Reference
+from monstertruck_planners.track.line import Foot, Line, Progress, Run
+from monstertruck_planners.track.speed import wanted_speed
+from monstertruck_schemas.plan import Steering
+from monstertruck_schemas.reasons import Reason
+
+C = TypeVar("C", bound=TrackerConfig)
+
+REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+TURNED: Final = 0.03
+"""Axles this near to what is asked count as turned, rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Here:
+    """Where the truck will be when what is asked now begins to act."""
+
+    pose: Pose
+    """x, y (m), yaw (rad)."""
+    angles: Angles
+    """Of the axles, rad."""
+    speed: float
+    """Forward, m/s; at least ``min_speed`` in size."""
+    run: Run
+    course: Course
+    s: float
+    """Metres from the run's beginning."""
+    steering: Steering
+    offset: float
+    """Distance left of the reference, seen along ``reference.heading``, m."""
+    reference: Reference
+    turned: float
+    """Yaw less the reference's, rad."""
+
+
+class Law(Generic[C]):
+    """Base of the trackers: subclasses steer.
+
+    Args:
+        config: speeds, distances, the axles' behaviour.
+        geometry: the truck's.
+    """
+
+    def __init__(self, config: C, geometry: FourWheelSteering) -> None:
+        self.config = config
+        self.geometry = geometry
+        self.axles = Axles(config.dead_time, config.lag, config.steering_rate)
+        self.period = 1.0 / config.rate
+        self.lead = config.dead_time
+        """Seconds ahead for which ``steer`` is asked."""
+        self._courses: dict[int, tuple[Run, Course]] = {}
+
+    def reset(self) -> None:
+        """See ``Tracker``."""
+        self.axles.reset()
+        self._courses.clear()
+
+    def steer(self, here: Here) -> Angles:
+        """Wanted angles of front and rear axle, rad, not yet limited."""
+        raise NotImplementedError
+
+    def control(self, state: TruckState, line: Line, progress: Progress, t: float) -> Command:
+        """See ``Tracker``."""
+        self.axles.advance(t)
+        if not all(map(math.isfinite, (*state.pose, state.speed))):
+            return Command(0.0, *self.axles.asked, progress, 0.0, 0.0, Reason.NOT_FINITE)
+        config = self.config
+        run, foot = line.runs[progress.run], self._foot(state, line.runs[progress.run], progress.s)
+        ended = run.length - foot.s <= config.goal_tolerance
+        last = progress.run + 1 == len(line.runs)
+        if ended and not last and abs(state.speed) <= REST:
+            progress = Progress(progress.run + 1)
+            run = line.runs[progress.run]
+            foot, ended = self._foot(state, run, 0.0), False
+            last = progress.run + 1 == len(line.runs)
+        here = self._here(state, run, foot.s)
+        outcome = Reason.DRIVING
+        if math.hypot(state.pose[0] - foot.point[0], state.pose[1] - foot.point[1]) > config.lost_distance:
+            outcome = Reason.PATH_LOST
+        elif ended and last:
+            outcome = Reason.GOAL_REACHED
+        angles = self.limited(here.steering, *self.steer(here))
+        if ended and not last:
+            angles = self.axles.asked  # coming to rest at a cusp
+        speed = 0.0
+        if outcome is Reason.DRIVING and not ended and not self._turning_at_rest(state, angles):
+            speed = self.speed(state, here, foot)
+        self.axles.ask(t, angles)
+        return self._command(state, run, foot, here, speed, angles, Progress(progress.run, foot.s), outcome)
+
+    def speed(self, state: TruckState, here: Here, foot: Foot) -> float:
+        """Wanted speed, m/s."""
+        return wanted_speed(self.config, state, here.run, here.course, foot.s)
+
+    def limited(self, steering: Steering, front: float, rear: float) -> Angles:
+        """Angles within the limits of a way of steering."""
+        angle = self.config.angle
+        if steering == "crab":
+            front = rear = min(max(0.5 * (front + rear), -angle), angle)
+            return front, rear
+        ahead, behind = (0.0 if steering == "rear" else angle), (0.0 if steering == "front" else angle)
+        if ahead == 0.0:
+            return 0.0, min(max(rear, -angle), angle)
+        front, rear = self.geometry.limit_keeping_curvature(front, rear, ahead, behind)
+        return float(front), float(rear)
+
+    def course(self, run: Run) -> Course:
+        """Reference of a run, computed once."""
+        known = self._courses.get(id(run))
+        if known is None or known[0] is not run:
+            known = self._courses[id(run)] = (run, Course(run, self.geometry, self.config.steering))
+        return known[1]
+
+    def _foot(self, state: TruckState, run: Run, s: float) -> Foot:
+        low = min(s, run.length)
+        return run.project(state.pose[0], state.pose[1], low, min(low + self.config.reach, run.length))
+
+    def _here(self, state: TruckState, run: Run, s: float) -> Here:
+        course = self.course(run)
+        speed = state.speed if state.speed * run.direction > self.config.min_speed else 0.0
+        pose, angles = (
+            self.axles.ahead(state.pose, speed, self.geometry, self.lead)
+            if self.lead
+            else (
+                state.pose,
+                self.axles.angles,
+            )
+        )
+        foot = run.project(pose[0], pose[1], s, s + self.config.reach)
+        reference = course.at(foot.s)
+        normal = float(reference.heading)
+        dx, dy = pose[0] - foot.point[0], pose[1] - foot.point[1]
+        return Here(
+            pose=pose,
+            angles=angles,
+            speed=speed or run.direction * self.config.min_speed,
+            run=run,
+            course=course,
+            s=foot.s,
+            steering=course.steering(foot.s),
+            offset=math.cos(normal) * dy - math.sin(normal) * dx,
+            reference=reference,
+            turned=wrap_angle(pose[2] - float(reference.yaw)),
+        )
+
+    def _turning_at_rest(self, state: TruckState, angles: Angles) -> bool:
+        """Whether the truck stands with its wheels still turning to where they are wanted."""
+        if abs(state.speed) > REST or self.axles.lag + self.axles.dead_time == 0.0:
+            return False
+        now = self.axles.angles
+        return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > TURNED
+
+    def _command(
+        self,
+        state: TruckState,
+        run: Run,
+        foot: Foot,
+        here: Here,
+        speed: float,
+        angles: Angles,
+        progress: Progress,
+        outcome: Reason,
+    ) -> Command:
+        dx, dy = state.pose[0] - foot.point[0], state.pose[1] - foot.point[1]
+        return Command(
+            speed=speed,
+            front=angles[0],
+            rear=angles[1],
+            progress=progress,
+            cross_track=math.cos(foot.tangent) * dy - math.sin(foot.tangent) * dx,
+            heading_error=wrap_angle(state.pose[2] - float(here.course.at(foot.s).yaw)),
+            outcome=outcome,
+        )
