@@ -117,3 +117,5 @@ class Reason(StrEnum):
     GOAL_OUTSIDE = "goal_outside", 32, "the goal is off the map"
     GOAL_UNREACHABLE = "goal_unreachable", 33, "no way leads to the goal"
     ROUTE_TIMEOUT = "route_timeout", 34, "no route found in the time allowed"
+    PATH_BLOCKED = "path_blocked", 35, "something stands on the route and there is no way round it nearby"
+    PATH_PARTIAL = "path_partial", 0, "only the beginning of the path is free"

@@ -1,0 +1,195 @@
+"""What all deformers do in each cycle: cut the route to the window, keep what is still good, search where it is not.
+
+Compiled.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.collision import DistanceField
+from monstertruck_planners.deform.api import DeformResult, Guide, Memory, apart
+from monstertruck_planners.deform.band import cover_of
+from monstertruck_planners.deform.config import DeformConfig
+from monstertruck_planners.route.api import RouteMap, Vehicle
+from monstertruck_planners.route.config import HybridConfig
+from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.motion import MotionPath
+from monstertruck_schemas.reasons import Reason
+
+Array = NDArray[np.float64]
+
+CUSP_REACHED = 0.1
+"""Nearer than this to a cusp of its band the truck goes on with what follows, m."""
+
+RUN_ENDED = 0.02
+"""The same on its path, m."""
+
+LOOK_BACK = 0.05
+"""Sampling of a path where the truck looks for its place on it, m."""
+
+
+@dataclass(frozen=True)
+class Local:
+    """The route in the window."""
+
+    band: Guide
+    """From near the truck to the last pose that may be taken."""
+    entered: int
+    """Poses of the guide in the band, or behind."""
+    final: bool
+    """Whether the band ends where the guide does."""
+
+
+class Surveyor:
+    """Shared by the deformers of one vehicle.
+
+    Args:
+        vehicle: what is driven.
+        config: of the deformer.
+        search: costs of the local search; margin and effort are those of ``config``.
+    """
+
+    def __init__(self, vehicle: Vehicle, config: DeformConfig, search: HybridConfig | None = None) -> None:
+        self.vehicle, self.config = vehicle, config
+        self.cover = cover_of(vehicle.footprint)
+        search = (search or HybridConfig()).model_copy(update={"effort": config.effort})
+        margins = dict.fromkeys((config.margin, 0.0))
+        self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
+
+    def cut(self, guide: Guide, surroundings: DistanceField, pose: Array, memory: Memory) -> Local | None:
+        """The band of the cycle before from the truck on, and poses of the guide that came into the window since.
+
+        Returns:
+            None: no pose of the route in the window may be taken.
+        """
+        band, entered = memory.band, memory.entered
+        if band is None:
+            entered = int(np.argmin(apart(guide.poses, pose)))
+            near = None
+        else:
+            near = band.part(passed(band, pose), len(band.poses))
+        ahead = guide.part(entered, len(guide.poses)) if entered < len(guide.poses) else None
+        count = 0 if ahead is None else self._seen(ahead, near, surroundings, pose)
+        if ahead is not None and count:
+            fresh = ahead.part(0, count)
+            near = fresh if near is None else near.then(fresh)
+            entered += count
+        if near is None:
+            return None
+        return Local(near, entered, entered == len(guide.poses))
+
+    def _seen(self, ahead: Guide, near: Guide | None, surroundings: DistanceField, pose: Array) -> int:
+        """Number of guide poses that come into the band: up to the last free one that is in the window and in reach."""
+        begin = 0.0 if near is None else near.travelled[-1]
+        data = surroundings.data()
+        rows, columns = (n - 2 for n in data.occupied.shape)
+        size = np.array([columns, rows]) * surroundings.resolution
+        x, y, yaw = surroundings.origin
+        dx, dy = ahead.poses[:, 0] - x, ahead.poses[:, 1] - y
+        c, s = math.cos(yaw), math.sin(yaw)
+        places = np.column_stack((dx * c + dy * s, dy * c - dx * s))
+        inset = self.config.inset + self.vehicle.footprint.circumscribed_radius
+        inside = ((places > inset) & (places < size - inset)).all(axis=1)
+        inside &= begin + ahead.travelled <= self.config.reach
+        stop = int(np.argmin(inside)) if not inside.all() else len(inside)
+        free = surroundings.free(self.vehicle.footprint, ahead.poses[:stop], self.config.margin)
+        return int(np.flatnonzero(free)[-1]) + 1 if free.any() else 0
+
+    def free(self, surroundings: DistanceField, path: MotionPath) -> bool:
+        """Whether a path keeps the margin all the way."""
+        return self._planners[0].free(RouteMap(surroundings), path)
+
+    def free_length(self, surroundings: DistanceField, path: MotionPath) -> float:
+        """Metres of a path before the first pose that does not keep the margin."""
+        samples = path.sample(0.02)
+        free = surroundings.free(self.vehicle.footprint, samples.poses, self.config.margin)
+        if free.all():
+            return path.length
+        return float(samples.travelled[max(int(np.argmin(free)) - 1, 0)])
+
+    def search(self, surroundings: DistanceField, pose: Array, goal: Array) -> tuple[MotionPath | None, Reason]:
+        """Way to a pose by a small search, with the margin or at least without contact."""
+        reason = Reason.PATH_BLOCKED
+        for planner in self._planners:
+            result = planner.plan(RouteMap(surroundings), pose, goal)
+            if result.path is not None and len(result.path.rows):
+                return result.path, Reason.OK
+            reason = result.reason
+            if reason is not Reason.START_BLOCKED and reason is not Reason.GOAL_BLOCKED:
+                break
+        return None, reason
+
+    def cost(self, surroundings: DistanceField, path: MotionPath) -> float:
+        """What a path costs, m."""
+        return self._planners[0].cost(RouteMap(surroundings), path)
+
+    def partial(
+        self, memory: Memory, surroundings: DistanceField, rest: MotionPath | None, why: Reason, text: str
+    ) -> DeformResult:
+        """The free beginning of the path so far, or failure with its reason."""
+        if rest is not None:
+            length = self.free_length(surroundings, rest)
+            length -= self.config.shortest if length < rest.length else 0.0
+            if length >= self.config.shortest:
+                part = rest.part(0.0, length)
+                return DeformResult(Reason.PATH_PARTIAL, replace(memory, path=rest), part, text=text)
+        return DeformResult(why, replace(memory, path=None), text=text)
+
+
+def passed(band: Guide, pose: Array) -> int:
+    """Index of the band's pose nearest to the truck, not beyond a cusp that the truck has not reached."""
+    for begin, end in runs(band.directions):
+        at = begin + int(np.argmin(apart(band.poses[begin:end], pose)))
+        last = band.poses[end - 1]
+        if end == len(band.poses) or math.hypot(last[0] - pose[0], last[1] - pose[1]) > CUSP_REACHED:
+            return at
+    return 0
+
+
+def runs(directions: Array) -> Iterator[tuple[int, int]]:
+    """Runs of one direction as index ranges; the pose at a cusp, which ends one, also begins the next one."""
+    cuts = [*np.flatnonzero(np.diff(directions)).tolist(), len(directions) - 1]
+    begin = 0
+    for cut in cuts:
+        yield begin, cut + 1
+        begin = cut
+
+
+def rest_of(path: MotionPath, pose: Array) -> tuple[MotionPath, float]:
+    """A path from the place nearest to the truck on, and how far (m, plus 0.3 m a radian) the truck is from it."""
+    samples = path.sample(LOOK_BACK)
+    best, begin, far = math.inf, 0.0, math.inf
+    first = 0
+    for cut in [*np.flatnonzero(np.diff(samples.direction)).tolist(), len(samples.travelled) - 1]:
+        s, away = _place(path, samples.poses, samples.travelled, first, cut, pose)
+        if away < best:
+            best, begin, far = away, s, away
+        if samples.travelled[cut] - begin > RUN_ENDED:
+            break
+        first = cut
+    return path.part(begin, math.inf), far
+
+
+def _place(path: MotionPath, poses: Array, travelled: Array, first: int, last: int, pose: Array) -> tuple[float, float]:
+    """Metres along the path to the pose nearest to the truck among two samples and all between, and how far it is."""
+    near = first + int(np.argmin(apart(poses[first : last + 1], pose)))
+    low, high = travelled[max(near - 1, first)], travelled[min(near + 1, last)]
+    x, y, _ = poses[near]
+    course = poses[min(near + 1, last), :2] - poses[max(near - 1, first), :2]
+    long = math.hypot(*course)
+    ahead = 0.0 if long < 1e-9 else float(((pose[0] - x) * course[0] + (pose[1] - y) * course[1]) / long)
+    s = min(max(float(travelled[near]) + ahead, float(low)), float(high))
+    foot = path.part(s, s + 1e-3).start
+    return s, float(apart(foot, pose))
+
+
+def ways(vehicle: Vehicle, rows: Array) -> tuple[str, ...]:
+    """How each row's wheels are set."""
+    names = []
+    for _, turn, slip in rows.tolist():
+        names.append(vehicle.steering if slip == 0.0 else "hybrid" if turn else "crab")
+    return tuple(names)

@@ -1,0 +1,128 @@
+"""A grid window that moves with the truck and remembers what the lidar saw. Compiled."""
+
+import math
+from typing import Annotated
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from monstertruck_planners.collision import DistanceField
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Schema
+
+Array = NDArray[np.float64]
+
+
+class WindowConfig(Schema):
+    """The window."""
+
+    size: Annotated[float, Field(gt=0)] = 4.0
+    """Side, m."""
+    resolution: Annotated[float, Field(gt=0)] = 0.04
+    """Metres per cell."""
+    mark: Annotated[float, Field(gt=0)] = 3.0
+    """Returns up to this distance are obstacles, m."""
+    clear: Annotated[float, Field(gt=0)] = 4.0
+    """Beams clear up to this distance, m."""
+
+
+class Window:
+    """Obstacles round the truck, in a grid whose axes are those of the frame.
+
+    Cells nobody has seen are free; what is out of sight stays as it was seen last.
+
+    Args:
+        config: size and resolution.
+    """
+
+    def __init__(self, config: WindowConfig | None = None) -> None:
+        self.config = config or WindowConfig()
+        count = round(self.config.size / self.config.resolution)
+        self.cells: NDArray[np.bool_] = np.zeros((count, count), np.bool_)
+        self._corner: tuple[int, int] | None = None
+
+    def add_scan(
+        self, sensor: tuple[float, float], base: tuple[float, float], ends: Array, hit: NDArray[np.bool_]
+    ) -> None:
+        """Take in a scan.
+
+        Args:
+            sensor: x, y of the lidar, m.
+            base: x, y of the truck, the new middle of the window, m.
+            ends: shape (n, 2): where each beam ended, m.
+            hit: shape (n,): whether it met something there.
+
+        Raises:
+            InputError: shapes that do not fit.
+        """
+        if ends.ndim != 2 or ends.shape[1] != 2 or hit.shape != (len(ends),):
+            raise InputError(f"scan of {ends.shape} ends, {hit.shape} hits: expected (n, 2) and (n,)")
+        self._move(base)
+        res = self.config.resolution
+        corner = np.array(self.corner)
+        start = (np.array(sensor) - corner) / res
+        _mark(self.cells, start, (ends - corner) / res, hit, self.config.mark / res, self.config.clear / res)
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """Of cell (0, 0), m."""
+        column, row = self._corner or (0, 0)
+        return column * self.config.resolution, row * self.config.resolution
+
+    def field(self, known: DistanceField | None = None) -> DistanceField:
+        """Distances in the window.
+
+        Args:
+            known: obstacles of the map, which count beside those seen; its cells outside the map do not.
+        """
+        x, y = self.corner
+        res = self.config.resolution
+        occupied = self.cells
+        if known is not None:
+            rows, columns = occupied.shape
+            px, py = np.meshgrid(x + (np.arange(columns) + 0.5) * res, y + (np.arange(rows) + 0.5) * res)
+            middles = np.stack((px, py), axis=-1)
+            near = known.lookup(middles) < 0.5 * max(res, known.resolution)
+            occupied = occupied | (near & known.inside(middles))
+        return DistanceField(occupied, res, (x, y, 0.0))
+
+    def _move(self, base: tuple[float, float]) -> None:
+        count = len(self.cells)
+        corner = tuple(math.floor(v / self.config.resolution) - count // 2 for v in base)
+        if self._corner is not None and corner != self._corner:
+            columns, rows = corner[0] - self._corner[0], corner[1] - self._corner[1]
+            fresh = np.zeros_like(self.cells)
+            if abs(columns) < count and abs(rows) < count:
+                old = self.cells[max(rows, 0) : count + min(rows, 0), max(columns, 0) : count + min(columns, 0)]
+                r, c = max(-rows, 0), max(-columns, 0)
+                fresh[r : r + old.shape[0], c : c + old.shape[1]] = old
+            self.cells = fresh
+        self._corner = (corner[0], corner[1])
+
+
+@njit(cache=True)
+def _mark(
+    cells: NDArray[np.bool_], start: Array, ends: Array, hit: NDArray[np.bool_], mark: float, clear: float
+) -> None:
+    """Clear the cells along all beams, then mark where they met something; all in cells."""
+    rows, columns = cells.shape
+    for i in range(len(ends)):
+        dx, dy = ends[i, 0] - start[0], ends[i, 1] - start[1]
+        length = math.sqrt(dx * dx + dy * dy)
+        if length < 1e-9:
+            continue
+        far = min(length - (1.0 if hit[i] else 0.0), clear)
+        steps = int(2.0 * far)
+        for k in range(steps):
+            share = 0.5 * k / length
+            c, r = math.floor(start[0] + dx * share), math.floor(start[1] + dy * share)
+            if not (0 <= r < rows and 0 <= c < columns):
+                break
+            cells[r, c] = False
+    for i in range(len(ends)):
+        c, r = math.floor(ends[i, 0]), math.floor(ends[i, 1])
+        near = (ends[i, 0] - start[0]) ** 2 + (ends[i, 1] - start[1]) ** 2 <= mark * mark
+        if hit[i] and near and 0 <= r < rows and 0 <= c < columns:
+            cells[r, c] = True
