@@ -192,7 +192,6 @@ class RoutePlanner(Protocol):
 
     def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Route between two poses of the vehicle's reference point."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -238,3 +237,10 @@ def _tolerated(position: float, yaw: float) -> list[Array]:
 
 def _said(pose: Array) -> str:
     return f"({pose[0]:g}, {pose[1]:g}, {pose[2]:g})"
+
+
+def warm_up(planner: RoutePlanner) -> None:
+    """Plan once on a small empty map, so that everything is compiled (or read from the cache) before it matters."""
+    cells = np.zeros((80, 80), np.int8)
+    cells[38:42, 36:44] = 100
+    planner.plan(RouteMap.from_cells(cells, 0.1), (2.0, 4.0, 0.0), (6.0, 4.0, 1.0))

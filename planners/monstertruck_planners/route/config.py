@@ -61,3 +61,35 @@ class HybridConfig(DriveCosts):
     """Factor on the heuristics: more finds a first route sooner."""
     improve: bool = True
     """Shorten the route and look for other ways while there is time."""
+
+
+class LatticeConfig(DriveCosts):
+    """State lattice with moves of exact radius, made for the way of steering; costs as the author's."""
+
+    kind: Literal["lattice"] = "lattice"
+    cell: Positive = 0.05
+    """Size of a cell, m."""
+    turn_factor: AtLeastOne = 2.0
+    """On the cost of a turn forward."""
+    reverse_factor: AtLeastOne = 3.0
+    """On the cost of a metre backward."""
+    reverse_turn_factor: AtLeastOne = 5.0
+    """On the cost of a turn or translation backward."""
+    greed: AtLeastOne = 2.0
+    """Factor on the heuristic of the first search; it falls to 1 while there is time."""
+
+
+class GridAstarConfig(GoalConfig):
+    """The author's first planner; its ways are no drivable motions."""
+
+    kind: Literal["grid_astar"] = "grid_astar"
+    neutral: Positive = 50.0
+    """Cost of a free cell."""
+    cost_factor: NotNegative = 3.0
+    """On the costmap's value of a cell, 0 to 252."""
+    lethal: Positive = 200.0
+    """From this value on a cell is closed."""
+    inflation: NotNegative = 0.3
+    """Reach of the costs round obstacles beyond the inscribed circle, m."""
+    decay: Positive = 10.0
+    """Of the costs with distance, 1/m."""

@@ -71,7 +71,7 @@ def tolls(
                 continue
             toll = 4.0
             if best >= side:
-                toll = 1.0 + 0.5 * max(wide - best, 0.0) / (wide - side)
+                toll = 1.0 + 0.5 * max(wide - float(best), 0.0) / (wide - side)
             if price.size > 0:
                 toll *= 1.0 + extra
             result[row, column] = int(UNIT * min(toll, DEAREST))
@@ -162,3 +162,18 @@ def walk(step: NDArray[np.int8], row: int, column: int, length: float) -> tuple[
         column += STEPS[k, 0]
         length -= 1.4142135623730951 if k & 1 else 1.0
     return row, column
+
+
+@njit(cache=True)
+def cells_on_way(step: NDArray[np.int8], row: int, column: int) -> NDArray[np.int64]:
+    """All cells (row, column) from one to the goal, shape (n, 2)."""
+    cells = np.empty((step.size, 2), np.int64)
+    used = 0
+    while True:
+        cells[used, 0], cells[used, 1] = row, column
+        used += 1
+        k = step[row, column]
+        if k < 0 or used == len(cells):
+            return cells[:used].copy()
+        row += STEPS[k, 1]
+        column += STEPS[k, 0]
