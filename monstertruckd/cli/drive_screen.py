@@ -14,7 +14,7 @@ from monstertruckd.cli import screen
 from monstertruckd.cli.screen import ScreenState
 from monstertruckd.cli.teleop import MODE_KEYS, STEPS, SteeringMode, Teleop, Wish
 
-HELP = "Enter arm  WASD/arrows drive  space stop  e E-STOP  r reset  x straight  q end"
+HELP = "Enter arm  WASD drive  space stop  e E-STOP  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}
 HINTS = {
     None: "no state of the gate yet",

@@ -25,6 +25,8 @@ RATE: Final = 20.0
 """Drive requests per second."""
 LEASE: Final = 0.25
 """Seconds a request stands."""
+TAKE_HOLD: Final = 0.15
+"""Seconds of neutral requests before an order to arm: a live one is what keeps a tracker from driving off."""
 STALLED: Final = 0.3
 """After a longer pause of this program, s, keys read late may have been let go long ago."""
 PING: Final = 1.0
@@ -50,6 +52,7 @@ class DriveSession:
         self._commands: asyncio.Queue[Command] = asyncio.Queue()
         self._stream = Stream()
         self._sending = asyncio.Lock()
+        self._arming: asyncio.TimerHandle | None = None
 
     async def run(self, robot: str, endpoint: str) -> None:
         """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck told to stop.
@@ -95,15 +98,28 @@ class DriveSession:
     def _press(self, keys: list[str]) -> None:
         for key in keys:
             command = self._teleop.press(key, self._clock.now())
-            if command is not None:
+            if command is Order.ARM:
+                if self._arming is None:
+                    self._arming = asyncio.get_running_loop().call_later(TAKE_HOLD, self._arm)
+            elif command is not None:
+                self._hold_arming()
                 self._commands.put_nowait(command)
+            elif key == "focus out":
+                self._hold_arming()
+
+    def _arm(self) -> None:
+        self._arming = None
+        self._commands.put_nowait(Order.ARM)
+
+    def _hold_arming(self) -> None:
+        """Forget an order to arm that was not sent yet."""
+        if self._arming is not None:
+            self._arming.cancel()
+            self._arming = None
 
     async def _obey(self, client: TruckClient) -> None:
         """Carry out orders as they come; returns at the end."""
         while (command := await self._commands.get()) != "end":
-            if command is Order.ARM:
-                # A live request of the keyboard is what keeps a tracker from driving off.
-                await self._request(client, self._teleop.wish(self._clock.now()))
             await self._send(client.order(command))
 
     async def _ask(self, client: TruckClient) -> None:
@@ -136,6 +152,7 @@ class DriveSession:
     def _forget(self) -> None:
         forget_input(self._keyboard)
         self._reader.clear()
+        self._hold_arming()
         self._teleop.release()
 
     async def _ping(self, client: TruckClient) -> None:

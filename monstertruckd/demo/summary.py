@@ -76,7 +76,7 @@ class Summary:
             *self._closing_row(),
             ("tick lateness p99", f"{self.lateness_p99 * 1e3:.2f} ms (max {self.lateness_max * 1e3:.2f} ms)"),
             ("messages", f"{sum(self.messages.values())} in {len(self.messages)} topics"),
-            ("log size", f"{self.log_bytes / 1e6:.2f} MB"),
+            ("log size", f"{self.log_bytes / 1e6:.2f} MB, compressed"),
         ]
         if self.speedup is not None:
             rows.append(("speed", f"{self.speedup:.1f} x real time"))

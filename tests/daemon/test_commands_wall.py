@@ -4,7 +4,6 @@ import asyncio
 import csv
 import itertools
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,22 +13,9 @@ import yaml
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruckd.demo.wall import free_endpoint
-from tests.daemon.wall_kit import DEMO, ROOT, Robot, end
+from tests.daemon.wall_kit import DEMO, ROOT, Robot, command, end
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
-
-
-async def command(*arguments: str, timeout: float = 60) -> subprocess.CompletedProcess[str]:
-    return await asyncio.to_thread(
-        subprocess.run,
-        [sys.executable, "-m", "monstertruckd", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
 
 
 @pytest.mark.parametrize(
@@ -121,11 +107,11 @@ async def _replay(log: Path, folder: Path, scans: int) -> None:
     endpoint = free_endpoint()
     robot = Robot(folder, endpoint, log)
     chosen = [word for topic in ("sensor/scan", "state/gate", "health/services") for word in ("--topic", topic)]
-    player = await robot.spawn("replay", str(log), "--endpoint", endpoint, "--speed", "2", *chosen)
+    player = await robot.spawn("replay", str(log), "--endpoint", endpoint, "--speed", "0.5", *chosen)
     try:
         async with robot.client() as client:
             with client.subscribe(topics.SCAN, fifo(1000)) as received:
-                seen = [await received.next() for _ in range(scans // 3)]
+                seen = [await received.next() for _ in range(scans // 6)]
             assert all(later.seq == earlier.seq + 1 for earlier, later in itertools.pairwise(seen))
             said = await command("echo", "state/gate", "--endpoint", endpoint, "--count", "2")
             assert [json.loads(line)["mode"] for line in said.stdout.splitlines()]

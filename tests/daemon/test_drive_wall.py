@@ -15,9 +15,10 @@ import pytest
 
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode, GateState, Odometry
-from tests.daemon.wall_kit import ROOT, Robot, end, robot
+from tests.daemon.wall_kit import ROOT, Robot, command, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
@@ -109,6 +110,31 @@ async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path
                 terminal.close()
                 await _stopped_and_disarmed(gate, odometry)
                 assert await end(terminal.process, 0) == 0, "a terminal that is gone is an ordinary end"
+            await _orders(made.endpoint)
+
+
+async def _orders(endpoint: str) -> None:
+    """Every order answered by the gate; asked again where a busy machine made a sample stale."""
+    for order, code, words in (
+        ("disarm", 0, "disarmed"),
+        ("arm", 0, "armed"),
+        ("estop", 0, "estopped"),
+        ("arm", Reason.ESTOPPED.exit_code, ""),
+        ("reset", 0, "disarmed"),
+    ):
+        answers = []
+        while (code, words) not in answers:
+            done = await command(order, "--endpoint", endpoint)
+            answers.append((done.returncode, done.stdout.strip()))
+            assert len(answers) < 5, f"{order}: {answers}, {done.stderr}"
+    done = await command("arm", "--robot", "nobody", "--endpoint", endpoint)
+    assert done.returncode == Reason.TIMEOUT.exit_code
+    silent = await command("echo", "sensor/drive_4", "--timeout", "3", "--endpoint", endpoint)
+    assert silent.returncode == Reason.TIMEOUT.exit_code
+    assert silent.stderr.splitlines() == [
+        "robot 'truck' is there but publishes no sensor/drive_4 yet; waiting",
+        "no message of sensor/drive_4 within 3 s",
+    ]
 
 
 async def _drive_off(terminal: Terminal, gate: Mailbox[GateState], odometry: Mailbox[Odometry]) -> None:

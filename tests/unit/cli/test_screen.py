@@ -101,6 +101,16 @@ def test_it_shows_what_matters():
     assert any(0x2800 < ord(sign) < 0x2900 for sign in text), "the scan is drawn"
 
 
+def test_a_path_driven_to_its_end_is_whole_though_the_next_lap_begins_at_nought():
+    state = full()
+    state.take(
+        TrackerState(**HEADER, cross_track=0.0, heading_error=0.0, along=0.0, length=10.0, outcome=Reason.GOAL_REACHED)
+    )
+    console = Console(width=140, height=40, record=True)
+    console.print(draw(state, 140), height=40)
+    assert "100%" in console.export_text()
+
+
 def test_plain_words_for_pipes():
     text = "\n".join(plain(full()))
     assert "driving, driver tracker, why tilt_slow" in text
