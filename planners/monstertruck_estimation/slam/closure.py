@@ -207,7 +207,7 @@ class LoopCloser:
         _, squares = residuals(before, edges)
         held = trust(squares, edges.loop) > 0.5
         for hit in hits:
-            mapper.edges.add(hit.origin, hit.target, hit.measured, hit.information, (0.03**2, 0.01**2), True)
+            mapper.edges.add(hit.origin, hit.target, hit.measured, hit.information, (0.03**2, 0.01**2), loop=True)
         edges = mapper.edges.edges()
         poses = optimise(before, edges)
         _, squares = residuals(poses, edges)

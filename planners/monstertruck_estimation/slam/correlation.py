@@ -18,7 +18,7 @@ RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
 SMEAR: Final = 0.08
 """Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search."""
-DOUBT: Final = 0.01
+DOUBT: Final = 0.002
 """What a squared standard deviation from the guess costs, as share of the score."""
 WORK: Final = 400_000
 """Blocks looked at before the search ends with what it has."""

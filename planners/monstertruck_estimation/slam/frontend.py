@@ -23,6 +23,8 @@ LEAST_SCORE: Final = 0.2
 """Mean likelihood under which the coarse search found nothing."""
 WINDOW: Final = 3.0
 """Half width of the coarse search in standard deviations of the guess."""
+MARGIN: Final = 0.15
+"""What is added to that, m: stamps of wheels and scans disagree."""
 WIDEST: Final = (2.0, 1.6)
 """Most of that, m and rad."""
 CREDIBLE: Final = 6.0
@@ -110,15 +112,16 @@ class Planar:
 
     def _locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
         deviation = deviations(covariance)
-        window = min(WINDOW * deviation[0], WIDEST[0]), min(WINDOW * deviation[1], WIDEST[1])
-        start = guess
-        reach = float(np.percentile(np.hypot(scan.points[:, 0], scan.points[:, 1]), 80))
-        if window[0] > 2 * RESOLUTION or window[1] * reach > 4 * RESOLUTION:
-            points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), COARSE_POINTS)).astype(np.intp)]
-            peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, LEAST_SCORE)
-            if peak is not None:
-                start = peak.pose
-        return judge(register(scan, submap.cloud, guess, np.linalg.inv(covariance), start=start), guess, covariance)
+        window = min(WINDOW * deviation[0] + MARGIN, WIDEST[0]), min(WINDOW * deviation[1], WIDEST[1])
+        prior = np.linalg.inv(covariance)
+        points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), COARSE_POINTS)).astype(np.intp)]
+        peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, LEAST_SCORE)
+        fit = register(scan, submap.cloud, guess, prior)
+        if peak is not None:
+            other = register(scan, submap.cloud, guess, prior, start=peak.pose)
+            if other.cost < fit.cost:
+                fit = other
+        return judge(fit, guess, covariance)
 
 
 def judge(fit: Fit, guess: Array, covariance: Array) -> Match:

@@ -9,13 +9,25 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.frontend import DOUBTFUL, LEAST_PAIRS, FrontEnd, Match, Planar, Verdict, deviations, rejected
+from monstertruck_estimation.slam.frontend import (
+    DOUBTFUL,
+    LEAST_PAIRS,
+    FrontEnd,
+    Match,
+    Planar,
+    Verdict,
+    deviations,
+    rejected,
+)
 from monstertruck_estimation.slam.graph import drift, optimise
+from monstertruck_estimation.slam.motion import MotionModel
+from monstertruck_estimation.slam.refinement import refine
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.store import EdgeStore, Key, Rows
 from monstertruck_estimation.slam.submap import Submap, merged
+from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
 
@@ -71,14 +83,12 @@ class Mapper:
         self._trail = _Trail()
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
-        self._odom: Array | None = None
+        self._motion = MotionModel(self.config)
         self._submap: Submap | None = None
         self._local: NDArray[np.intp] = np.zeros(0, np.intp)
         self._since = np.zeros(3)
         self._since_covariance = np.zeros((3, 3))
         self._stamp: int | None = None
-        self._delta = np.zeros(3)
-        self._dt = 0.0
         self._doubts = 0
         self._closer = LoopCloser(self.config)
 
@@ -92,7 +102,8 @@ class Mapper:
         """
         if self._stamp is not None and stamp <= self._stamp:
             return None
-        delta, noise = self._predict(stamp, odom)
+        dt = 0.0 if self._stamp is None else (stamp - self._stamp) / SECOND
+        delta, noise = self._motion.predict(dt, odom)
         guess = compose(self._pose, delta)
         by_pose, by_delta = compose_jacobians(self._pose, delta)
         covariance = by_pose @ self._covariance @ by_pose.T + by_delta @ noise @ by_delta.T
@@ -103,41 +114,18 @@ class Mapper:
             match = self._front.locate(scan, guess, covariance, self._submap)
         doubtful = not match.accepted or match.overlap < DOUBTFUL
         self._doubts = self._doubts + 1 if doubtful else 0
-        self._dt = 0.0 if self._stamp is None else (stamp - self._stamp) / 1e9
-        self._delta = between(self._pose, match.pose)
+        self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
-        if odom is not None:
-            self._odom = np.array(odom, dtype=float)
         events = self._extend(scan, stamp, match)
         self._record(stamp)
-        correction = None if self._odom is None else compose(self._pose, inverse(self._odom))
+        odom_now = self._motion.odom
+        correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
         return Step(stamp, self._pose.copy(), self._covariance.copy(), match, correction, events)
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,) and poses (n, 3) of all scans, as the graph has them now."""
         keys = self._trail.keys.view
         return self._trail.stamps.view.copy(), compose(self.poses[keys], self._trail.relative.view)
-
-    def _predict(self, stamp: int, odom: Array | None) -> tuple[Array, Array]:
-        """Motion since the last scan with its covariance, in base."""
-        config = self.config
-        if self._stamp is None:
-            return np.zeros(3), np.zeros((3, 3))
-        dt = (stamp - self._stamp) / 1e9
-        if odom is not None and self._odom is not None and np.isfinite(odom).all():
-            delta = between(self._odom, np.asarray(odom, dtype=float))
-            way = math.hypot(delta[0], delta[1])
-            place = math.hypot(config.odometry_floor[0], config.odometry_distance * way)
-            turn = math.sqrt(
-                config.odometry_floor[1] ** 2
-                + (config.odometry_turn[0] * delta[2]) ** 2
-                + (config.odometry_turn[1] * way) ** 2
-            )
-        else:
-            delta = self._delta * (min(dt / self._dt, 3.0) if self._dt > 0 else 0.0)
-            place = config.odometry_floor[0] + config.blind_speed[0] * dt
-            turn = config.odometry_floor[1] + config.blind_speed[1] * dt
-        return delta, np.diag((place**2, place**2, turn**2))
 
     def _accumulate(self, delta: Array, noise: Array) -> None:
         by_before, by_delta = compose_jacobians(self._since, delta)
@@ -172,7 +160,7 @@ class Mapper:
         new = len(self.keys) - 1
         place, turn = deviations(self._since_covariance)
         information = np.linalg.inv(self._since_covariance + np.diag((1e-6, 1e-6, 1e-6)))
-        self.edges.add(new - 1, new, self._since, information, (place**2, turn**2), False)
+        self.edges.add(new - 1, new, self._since, information, (place**2, turn**2), odometry=True)
         if not match.accepted:
             return
         linked = 0
@@ -197,7 +185,7 @@ class Mapper:
         covariance = np.linalg.inv(fit.information + np.diag((1.0, 1.0, 1.0)))
         weakest, _ = deviations(covariance)
         covariance += np.diag((0.005**2, 0.005**2, 0.002**2))
-        self.edges.add(origin, target, fit.pose, np.linalg.inv(covariance), (place**2 + weakest**2, turn**2), loop)
+        self.edges.add(origin, target, fit.pose, np.linalg.inv(covariance), (place**2 + weakest**2, turn**2), loop=loop)
         return True
 
     def _closeness(self, numbers: NDArray[np.intp], pose: Array) -> Array:
@@ -227,6 +215,10 @@ class Mapper:
     def optimise(self) -> None:
         """Fit all poses to all relations; the newest key scan keeps its place in odom by ``map_from_odom``."""
         self.poses = optimise(self.poses, self.edges.edges())
+
+    def finish(self) -> None:
+        """Register all key scans jointly (seconds of work): for the end of a run, or a standing robot."""
+        self.poses = refine(self.keys, self.poses, self.edges.odometry())
 
     def _record(self, stamp: int) -> None:
         if not self.keys:

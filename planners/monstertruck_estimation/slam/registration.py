@@ -1,7 +1,7 @@
 """Iterated fine registration of a scan to a cloud of surface elements (generalised ICP in the plane).
 
 Residual of a pair: the vector d from the moved scan point to its nearest map point, weighted by the inverse of the sum of
-both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional Gaussian prior.
+both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional prior that has heavy (Cauchy) tails.
 """
 
 import math
@@ -21,8 +21,11 @@ CELL: Final = 0.3
 """Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
 KERNEL: Final = 3.0
 """Mahalanobis distance at which a pair's influence is a quarter."""
-CORRELATION: Final = 0.1
+CORRELATION: Final = 0.2
 """Share of independent pairs: neighbouring beams err alike, so the information is scaled by this."""
+
+TAILS: Final = 4.0
+"""Squared Mahalanobis distance at which the prior pulls half as much: wheels slip further than any covariance says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,8 @@ class Fit:
     """Root mean square distance across the surface of those, m."""
     pairs: int
     """Their number."""
+    cost: float
+    """Twice the negative logarithm of the posterior: what the pairs and the prior leave."""
 
 
 NO_PRIOR: Final = np.zeros((3, 3))
@@ -105,7 +110,24 @@ def register(
     )
     pairs = int(stats[0])
     total = max(len(scan), 1)
-    return Fit(pose, information, pairs / total, math.sqrt(stats[1] / max(pairs, 1)), pairs)
+    return Fit(pose, information, pairs / total, math.sqrt(stats[1] / max(pairs, 1)), pairs, float(stats[2]))
+
+
+def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL) -> tuple[Array, Array, int]:
+    """Information (3, 3) and gradient (3,) of a registration at ``pose``, and the number of fitting pairs."""
+    h, g, stats = accumulate(
+        np.ascontiguousarray(pose),
+        scan.points,
+        scan.normals,
+        scan.variances,
+        cloud.points,
+        cloud.normals,
+        cloud.variances,
+        cloud.starts,
+        cloud.order,
+        min(reach, CELL),
+    )
+    return h, g, int(stats[0])
 
 
 @njit(cache=True)
@@ -170,10 +192,10 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
     order,  # noqa: ANN001
     reach,  # noqa: ANN001
 ):
-    """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across)."""
+    """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across, cost)."""
     h = np.zeros((3, 3))
     g = np.zeros(3)
-    stats = np.zeros(2)
+    stats = np.zeros(3)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(points.shape[0]):
         rx = c * points[i, 0] - s * points[i, 1]
@@ -183,6 +205,7 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
         x, y = rx + pose[0], ry + pose[1]
         j = _nearest(x, y, nx, ny, map_points, map_normals, starts, order, reach)
         if j < 0:
+            stats[2] += KERNEL * KERNEL
             continue
         mx, my = map_normals[j, 0], map_normals[j, 1]
         across, along = variances[i, 0], variances[i, 1]
@@ -196,6 +219,7 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
         vx, vy = ixx * ex + ixy * ey, ixy * ex + iyy * ey
         m = ex * vx + ey * vy
         w = KERNEL * KERNEL / (KERNEL * KERNEL + m)
+        stats[2] += w * m
         w = w * w
         jx, jy = -ry, rx
         qx, qy = ixx * jx + ixy * jy, ixy * jx + iyy * jy
@@ -212,6 +236,7 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
             stats[0] += 1.0
             stats[1] += (ex * mx + ey * my) ** 2
     h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
+    stats[2] *= CORRELATION
     return h * CORRELATION, g * CORRELATION, stats
 
 
@@ -265,15 +290,20 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
     for _ in range(iterations):
         off = pose - guess
         off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
-        total = h + prior
+        m = off @ prior @ off
+        w = TAILS / (TAILS + m)
+        total = h + w * prior
         for k in range(3):
             total[k, k] += 1e-6 + 1e-9 * total[k, k]
-        step = solve3(total, -(g + prior @ off))
+        step = solve3(total, -(g + w * (prior @ off)))
         pose = pose + step
         h, g, stats = accumulate(
             pose, points, normals, variances, map_points, map_normals, map_variances, starts, order, reach
         )
         if math.hypot(step[0], step[1]) < 1e-4 and abs(step[2]) < 2e-5:
             break
+    off = pose - guess
+    off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
+    stats[2] += TAILS * math.log(1.0 + (off @ prior @ off) / TAILS)
     pose[2] = (pose[2] + math.pi) % (2 * math.pi) - math.pi
     return pose, h, stats

@@ -68,7 +68,10 @@ class Scan:
 
 
 def prepare(
-    ranges: Array, geometry: ScanGeometry, twist: tuple[float, float, float] = (0.0, 0.0, 0.0), longest: float = math.inf
+    ranges: Array,
+    geometry: ScanGeometry,
+    twist: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    longest: float = math.inf,
 ) -> Scan:
     """Points with normals; no-returns, NaN and what is out of range are left out.
 

@@ -66,9 +66,18 @@ class EdgeStore:
         self._information = Rows(3, 3)
         self._spread = Rows(2)
         self._loop = Rows(dtype=bool)
+        self._odometry = Rows(dtype=bool)
 
     def add(
-        self, origin: int, target: int, measured: Array, information: Array, spread: tuple[float, float], loop: bool
+        self,
+        origin: int,
+        target: int,
+        measured: Array,
+        information: Array,
+        spread: tuple[float, float],
+        *,
+        loop: bool = False,
+        odometry: bool = False,
     ) -> None:
         """One relation; ``spread`` are the variances (m^2, rad^2) with which it takes part in drift bounds."""
         self._ends.append((origin, target))
@@ -76,16 +85,24 @@ class EdgeStore:
         self._information.append(information)
         self._spread.append(spread)
         self._loop.append(loop)
+        self._odometry.append(odometry)
 
     def drop(self, dropped: NDArray[np.bool_]) -> None:
         """Forget the marked relations."""
-        for rows in (self._ends, self._measured, self._information, self._spread, self._loop):
+        for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
             rows.keep(~dropped)
 
     def edges(self) -> Edges:
         """Views of all relations."""
         ends = self._ends.view
         return Edges(ends[:, 0], ends[:, 1], self._measured.view, self._information.view, self._loop.view)
+
+    def odometry(self) -> Edges:
+        """The relations that odometry gave."""
+        kept, every = self._odometry.view, self.edges()
+        return Edges(
+            every.origin[kept], every.target[kept], every.measured[kept], every.information[kept], every.loop[kept]
+        )
 
     @property
     def spread(self) -> Array:

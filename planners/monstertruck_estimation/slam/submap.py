@@ -48,7 +48,9 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
     facing = np.floor(np.arctan2(every[1][:, 1], every[1][:, 0]) / (np.pi / 4) + 0.5).astype(np.int64) % 8
     lone = (every[2][:, 0] == every[2][:, 1]).astype(np.int64)
     cells -= cells.min(axis=0) if len(cells) else 0
-    keys = ((cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]) * 8 + facing) * 2 + lone if len(cells) else cells[:, 0]
+    keys = (
+        ((cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]) * 8 + facing) * 2 + lone if len(cells) else cells[:, 0]
+    )
     order = np.argsort(keys, kind="stable")
     return Scan(*_average(*every, keys[order], order))
 
