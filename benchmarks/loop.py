@@ -1,0 +1,200 @@
+"""How punctual the control tick is beside everything else the daemon does, and what the daemon costs.
+
+    python benchmarks/loop.py [--rounds N] [--seconds S]
+
+The whole truck drives laps: the daemon with every device at full rate, recording to disk, in one process; world and
+emulated devices behind ptys in another; a third subscribes to all it publishes. Rounds alternate with an empty
+event loop that only ticks at the same rate, while world and emulators go on: that is the floor. Lateness is that of
+the gate's 50 Hz tick; the figure is the median of the rounds. Callbacks of the daemon's event loop are measured in
+processor time of its thread, from ``WARM_UP`` seconds after the truck is armed. Processor time and memory are those
+of the daemon's process alone, without its workers. The last line is JSON.
+"""
+
+import argparse
+import asyncio
+import json
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import Order
+from monstertruckd.demo.operator import MOVING
+from monstertruckd.demo.wall import connect, free_endpoint, program, write_overlay
+
+HERE = Path(__file__).resolve().parent
+FULL = HERE.parent / "configs" / "full.yaml"
+WARM_UP = 5.0
+PATIENCE = 60.0
+GOALS = {
+    "late_p99_over_floor_ms": 1.5,
+    "callbacks_over_2ms": 0,
+    "longest_callback_ms": 10.0,
+    "cpu_percent": 15.0,
+    "rss_mb": 150.0,
+}
+EXPLAINED: dict[str, str] = {}
+"""Callbacks that may take more than 2 ms, with the reason."""
+
+SUBSCRIBER = """
+import sys, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", f'["{sys.argv[1]}"]')
+config.insert_json5("scouting/multicast/enabled", "false")
+count = 0
+with zenoh.open(config) as session:
+    def take(sample):
+        global count
+        count += len(sample.payload) > 0
+    session.declare_subscriber("mt/truck/**", take)
+    print("subscribed", flush=True)
+    sys.stdin.read()
+print(count)
+"""
+
+
+@asynccontextmanager
+async def process(*arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A Python process while the context lasts; SIGTERM ends it."""
+    pipe = asyncio.subprocess.PIPE
+    running = await asyncio.create_subprocess_exec(
+        sys.executable, *arguments, stdin=pipe, stdout=pipe, stderr=asyncio.subprocess.DEVNULL
+    )
+    try:
+        yield running
+    finally:
+        if running.returncode is None:
+            running.terminate()
+        await running.communicate()
+
+
+async def arm(client: TruckClient, clock: Clock) -> None:
+    """Arm the truck; the tracker then drives."""
+    with client.subscribe(topics.GATE, latest()) as gate:
+        async with clock.deadline(PATIENCE):
+            while gate.latest is None or gate.latest.mode not in MOVING:
+                await client.order(Order.ARM)
+                await clock.sleep(0.25)
+
+
+async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float) -> dict[str, Any]:
+    """Figures of one run of the daemon."""
+    report = config.with_name("report.json")
+    async with process(str(HERE / "loop_watched.py"), "daemon", str(config), str(report)) as daemon:  # noqa: SIM117
+        async with await connect(clock, "truck", endpoint) as client, process("-c", SUBSCRIBER, endpoint) as subscriber:
+            assert subscriber.stdout is not None
+            assert subscriber.stdin is not None
+            await subscriber.stdout.readline()
+            await arm(client, clock)
+            await clock.sleep(WARM_UP)
+            begin, used = clock.now(), _used(daemon.pid)
+            await clock.sleep(seconds)
+            end, used = clock.now(), _used(daemon.pid) - used
+            memory = _memory(daemon.pid)
+            subscriber.stdin.close()
+            received = int(await subscriber.stdout.readline())
+    found = json.loads(report.read_text())
+    ticks = np.array([late for at, late in found["ticks"] if begin <= at < end])
+    slow = [(used, name) for at, used, name in found["callbacks"] if begin <= at < end]
+    return {
+        "late": ticks,
+        "slow": slow,
+        "cpu_percent": 100 * used / (end - begin) * SECOND,
+        "received": received,
+        **memory,
+    }
+
+
+async def empty_round(config: Path, seconds: float) -> np.ndarray:
+    """Lateness of an empty loop, ms."""
+    report = config.with_name("empty.json")
+    async with process(str(HERE / "loop_watched.py"), "empty", str(report), str(seconds)) as running:
+        await running.wait()
+    return np.array(json.loads(report.read_text())["ticks"])[:, 1]
+
+
+def _used(pid: int) -> float:
+    """Processor seconds of another process, by the clock clock_getcpuclockid(3) gives."""
+    return time.clock_gettime((~pid << 3) | 2)
+
+
+def _memory(pid: int) -> dict[str, float]:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    values = {line.split(":")[0]: line.split()[1] for line in lines if line.startswith(("VmRSS", "VmHWM"))}
+    return {"rss_mb": int(values["VmRSS"]) / 1024, "peak_rss_mb": int(values["VmHWM"]) / 1024}
+
+
+async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
+    """All rounds."""
+    floor: list[np.ndarray] = []
+    runs: list[dict[str, Any]] = []
+    with TemporaryDirectory() as folder:
+        endpoint = free_endpoint()
+        config = write_overlay(FULL, Path(folder), endpoint)
+        output = Path(folder) / "simulate.txt"
+        async with program(output, "simulate", "--config", str(config)):
+            async with clock.deadline(PATIENCE):
+                while b"ready" not in output.read_bytes():
+                    await clock.sleep(0.1)
+            for _ in range(rounds):
+                floor.append(await empty_round(config, seconds))
+                runs.append(await daemon_round(clock, config, endpoint, seconds))
+    return figures(floor, runs)
+
+
+def figures(floor: list[np.ndarray], runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians of the rounds; callbacks of all of them."""
+
+    def median(values: list[float]) -> float:
+        return float(np.median(values))
+
+    p99 = np.array(
+        [[np.percentile(empty, 99), np.percentile(run["late"], 99)] for empty, run in zip(floor, runs, strict=True)]
+    )
+    slow = sorted((entry for run in runs for entry in run["slow"]), reverse=True)
+    over = [(used, name) for used, name in slow if used > 2.0]
+    for used, name in slow[:12]:
+        print(f"{used:8.2f} ms  {name}  {EXPLAINED.get(name, '')}")
+    return {
+        "floor_p50_ms": median([np.percentile(empty, 50) for empty in floor]),
+        "floor_p99_ms": float(np.median(p99[:, 0])),
+        "late_p50_ms": median([np.percentile(run["late"], 50) for run in runs]),
+        "late_p99_ms": float(np.median(p99[:, 1])),
+        "late_max_ms": median([run["late"].max() for run in runs]),
+        "late_p99_over_floor_ms": float(np.median(p99[:, 1] - p99[:, 0])),
+        "ticks": sum(len(run["late"]) for run in runs),
+        "callbacks_over_2ms": len([name for _, name in over if name not in EXPLAINED]),
+        "callbacks_over_2ms_explained": len([name for _, name in over if name in EXPLAINED]),
+        "longest_callback_ms": slow[0][0] if slow else 0.0,
+        "cpu_percent": median([run["cpu_percent"] for run in runs]),
+        "rss_mb": median([run["rss_mb"] for run in runs]),
+        "peak_rss_mb": median([run["peak_rss_mb"] for run in runs]),
+        "messages_received": sum(run["received"] for run in runs),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    arguments = parser.parse_args()
+    found = run_wall(lambda clock: compare(clock, arguments.rounds, arguments.seconds))
+    for name, value in found.items():
+        print(f"{name:30} {value:10.3f}")
+    met = all(found[name] <= goal for name, goal in GOALS.items())
+    print(json.dumps({"bench": "loop", "figures": found, "goals": GOALS, "met": met}))
+
+
+if __name__ == "__main__":
+    main()
