@@ -19,7 +19,7 @@ from ompl import geometric as og
 from ompl import util as ou
 from scipy.ndimage import distance_transform_edt
 
-from monstertruck_drivers.world.maps import load_map
+from monstertruck_runtime.map_files import load_map
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.hybrid import HybridPlanner

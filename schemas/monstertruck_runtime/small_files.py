@@ -22,12 +22,12 @@ def number_of(file: Path) -> int | None:
         return None
 
 
-def replace_file(path: Path, text: str, mode: int = 0o644) -> None:
-    """Make the file say ``text``, as a whole or not at all; one that was there keeps its mode.
+def replace_file(path: Path, content: str | bytes, mode: int = 0o644) -> None:
+    """Give the file its ``content``, as a whole or not at all; one that was there keeps its mode.
 
     Args:
         path: the file, or a link to it, which stays a link.
-        text: new content.
+        content: new content; text becomes UTF-8.
         mode: of a new file.
 
     Raises:
@@ -36,8 +36,8 @@ def replace_file(path: Path, text: str, mode: int = 0o644) -> None:
     place = path.resolve()
     handle, scratch = tempfile.mkstemp(dir=place.parent, prefix=place.name)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(handle)
         Path(scratch).chmod(place.stat().st_mode if place.exists() else mode)

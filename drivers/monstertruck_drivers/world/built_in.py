@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from monstertruck_drivers.world.maps import FREE, OCCUPIED, UNKNOWN, WorldMap
 from monstertruck_drivers.world.terrain import Profile
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
 
 RESOLUTION = 0.025
 """m per cell."""

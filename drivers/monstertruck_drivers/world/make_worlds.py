@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 from monstertruck_drivers.world.built_in import BUILT_IN, lap
-from monstertruck_drivers.world.maps import save_map
 from monstertruck_drivers.world.terrain import profile_path, save_profile
+from monstertruck_runtime.map_files import save_map
 
 
 def make_worlds(out: Path) -> list[Path]:

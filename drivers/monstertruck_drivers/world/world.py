@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from monstertruck_drivers.base import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
 from monstertruck_drivers.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_drivers.world.config import SinusoidTilt, TiltConfig, WorldConfig
-from monstertruck_drivers.world.maps import FREE, OCCUPIED, load_map
 from monstertruck_drivers.world.obstacles import Box, Obstacle, discs_and_segments, penetration
 from monstertruck_drivers.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_drivers.world.sensors import (
@@ -22,6 +21,7 @@ from monstertruck_drivers.world.sensors import (
 from monstertruck_drivers.world.terrain import load_profile, profile_path, rocking
 from monstertruck_drivers.world.truck_plant import Pose, TruckPlant, TruthState
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 
 _ROOM = 0.05
 """Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.world.config import ServoConfig, WorldConfig
-from monstertruck_drivers.world.maps import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_drivers.world.world import World
 from monstertruck_kinematics.polynomials import SteeringPolynomials
+from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
 
 SECOND = 1_000_000_000

@@ -1,9 +1,10 @@
 """Occupancy maps in the map_server format: one YAML file that names one image.
 
-The world's array convention differs from the image's: row 0 is the lowest y, so cell (row, column) covers
+The array's convention differs from the image's: row 0 is the lowest y, so cell (row, column) covers
 ``origin + resolution * ([column, column + 1], [row, row + 1])``.
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import replace_file
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
@@ -74,12 +76,18 @@ def load_map(path: Path) -> WorldMap:
 
 
 def save_map(world: WorldMap, path: Path) -> None:
-    """Write ``path`` (YAML) and a grey PNG of the same stem beside it; ``load_map`` reads back an equal map."""
+    """Write ``path`` (YAML) and a grey PNG of the same stem beside it; ``load_map`` reads back an equal map.
+
+    Raises:
+        OSError: a file could not be written; the YAML is the last one.
+    """
     shades = np.full(world.cells.shape, 205, dtype=np.uint8)
     shades[world.cells == FREE] = 254
     shades[world.cells == OCCUPIED] = 0
     image = path.with_suffix(".png")
-    Image.fromarray(np.flipud(shades)).save(image, optimize=True)
+    picture = io.BytesIO()
+    Image.fromarray(np.flipud(shades)).save(picture, "PNG", optimize=True)
+    replace_file(image, picture.getvalue())
     keys = {
         "image": image.name,
         "mode": "trinary",
@@ -89,7 +97,7 @@ def save_map(world: WorldMap, path: Path) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
-    path.write_text(yaml.safe_dump(keys, sort_keys=False), encoding="utf-8")
+    replace_file(path, yaml.safe_dump(keys, sort_keys=False))
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -5,8 +5,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from monstertruck_drivers.world.maps import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 
 KEYS = {
     "image": "m.png",
