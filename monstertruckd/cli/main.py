@@ -15,6 +15,7 @@ from monstertruckd.cli import (
     live,
     logs,
     orders,
+    plan,
     robot,
     service,
     usb,
@@ -58,6 +59,7 @@ app.command("arm")(orders.arm)
 app.command("disarm")(orders.disarm)
 app.command("estop")(orders.estop)
 app.command("reset")(orders.reset)
+app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
 app.command("replay")(logs.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from monstertruck_planners.route import motion_rows
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import Path, Steering
 
 Array = NDArray[np.float64]
-
-Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +109,7 @@ class MotionPath:
     @property
     def backward(self) -> float:
         """Of these, metres backward."""
-        return float(-np.minimum(self.rows[:, 0], 0.0).sum())
+        return float(np.maximum(-self.rows[:, 0], 0.0).sum())
 
     @property
     def cusps(self) -> int:
@@ -179,7 +177,7 @@ class MotionPath:
 
     def message(self, *, stamp: int, seq: int = 0, frame: str = "map", name: str = "", step: float = 0.05) -> Path:
         """The path of the base as a ``plan/path`` message, sampled every ``step`` metres."""
-        samples = self.sample(step)
+        samples, segments = self.sample(step), self.segments
         return Path(
             stamp=stamp,
             received=stamp,
@@ -187,6 +185,7 @@ class MotionPath:
             frame=frame,
             poses=moved(samples.poses, -self.reference).ravel(),
             directions=samples.direction,
+            steering=tuple(segments[i].steering for i in samples.segment.tolist()) if segments else (),
             name=name,
         )
 

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_planners.route import crab_words, reeds_shepp_words
-from monstertruck_planners.route.motion import MotionPath, Steering
+from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.plan import Steering
 
 Array = NDArray[np.float64]
 

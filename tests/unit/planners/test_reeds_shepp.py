@@ -129,6 +129,7 @@ def test_messages_speak_of_the_base():
     message = path.message(stamp=5, step=0.5, name="out")
     assert message.poses.reshape(-1, 3)[:, 0] == pytest.approx([0.16, -0.34, -0.84])
     assert message.directions.tolist() == [-1.0, -1.0, -1.0]
+    assert message.steering == ("front",) * 3
     assert moved(path.base_poses(0.5), -0.16) == pytest.approx(path.sample(0.5).poses)
     still = CAR.path((1, 2, 3), (1, 2, 3))
     assert (still.length, len(still.sample(0.1).poses)) == (0.0, 1)
