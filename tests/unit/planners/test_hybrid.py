@@ -3,7 +3,6 @@ import math
 
 import numpy as np
 import pytest
-from tests.unit.planners.route_kit import CAR, TRUCK, assert_drivable, ground, room
 
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
@@ -11,6 +10,7 @@ from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.replan import KeepPolicy, Waypoint, plan_through, replan, rest_of
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
+from tests.unit.planners.route_kit import CAR, TRUCK, assert_drivable, ground, room
 
 QUICK = HybridConfig(effort=6000)
 FRONT, BOTH = HybridPlanner(CAR, QUICK), HybridPlanner(TRUCK, QUICK)
