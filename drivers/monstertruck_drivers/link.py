@@ -7,6 +7,7 @@ whether the bytes come from a tty, a pty or another coroutine.
 import asyncio
 import contextlib
 import errno
+import os
 import termios
 from collections.abc import Callable
 from pathlib import Path
@@ -261,8 +262,17 @@ class _SerialProtocol(asyncio.Protocol):
     def own(self, transport: "serial_asyncio.SerialTransport") -> Link:
         self._transport = transport
         # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(self._name, transport.write, transport.abort)
+        self.link = Link(self._name, self._send, transport.abort)
         return self.link
+
+    def _send(self, data: bytes) -> None:
+        """Write what the tty takes at once, nearly always all; the transport sends the rest, or reports the loss."""
+        assert self._transport is not None
+        if self._transport.get_write_buffer_size() == 0:
+            with contextlib.suppress(OSError):  # not even one byte now
+                data = data[os.write(self._transport.serial.fileno(), data) :]
+        if data:
+            self._transport.write(data)
 
     def data_received(self, data: bytes) -> None:
         if self.link is not None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import tty
 from pathlib import Path
 
 import pytest
@@ -236,6 +237,23 @@ async def test_serial_port_over_a_pty(tmp_path: Path):
         pty.device.write(b"back")
         assert await again.read() == b"back"
     pty.unplug()
+
+
+async def test_what_a_full_tty_does_not_take_at_once_follows_in_order(tmp_path: Path):
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    (tmp_path / "dev").symlink_to(os.ttyname(slave))
+    async with await SerialPort(tmp_path / "dev").open() as link:
+        sent = bytes(range(256)) * 400
+        for at in range(0, len(sent), 1000):
+            link.write(sent[at : at + 1000])
+        got = b""
+        while len(got) < len(sent):
+            await asyncio.sleep(0)
+            got += os.read(master, 4096)
+    assert got == sent
+    os.close(master)
+    os.close(slave)
 
 
 async def test_a_vanished_pty_does_not_spin_the_loop(tmp_path: Path):
