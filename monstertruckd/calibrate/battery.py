@@ -92,11 +92,10 @@ class BatteryWizard:
     def _result(self, readings: list[Reading], keys: tuple[str, str]) -> Result:
         volts = [reading.volts for reading in readings]
         gain, offset = self.bounds(readings)
-        share = abs(gain.value) * self.meter_share
         told = offset.half < 0.9 * GROUND
         bounds = (
-            f"pack volts; bounds from the meter's {self.meter_digits:g} V, the input's rounding and at most "
-            f"{GROUND:g} V along the ground wire; the gain's also from the meter's {self.meter_share:.1%}"
+            f"pack volts; bounds from the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
+            f"rounding, and at most {GROUND:g} V along the ground wire"
         )
         estimates = tuple(
             Estimate(
@@ -110,8 +109,8 @@ class BatteryWizard:
                 key=key,
             )
             for name, found, unit, what, key in (
-                ("gain", gain.widened(share), "", "factor from the input's reading to", keys[0]),
-                ("offset", offset.widened(abs(offset.value) * self.meter_share), "V", "added to get", keys[1]),
+                ("gain", gain, "", "factor from the input's reading to", keys[0]),
+                ("offset", offset, "V", "added to get", keys[1]),
             )
         )
         return Result(
@@ -130,7 +129,8 @@ class BatteryWizard:
         """
         rows, limits = [(0.0, 1.0), (0.0, -1.0)], [GROUND, GROUND]
         for reading in readings:
-            bound = self.meter_digits + NORMAL * reading.error * reading.volts / reading.raw
+            noise = NORMAL * reading.error * reading.volts / reading.raw
+            bound = self.meter_share * reading.volts + self.meter_digits + noise
             rows += [(reading.raw, 1.0), (-reading.raw, -1.0)]
             limits += [reading.volts + bound, bound - reading.volts]
         sides, ends = np.array(rows), np.array(limits)

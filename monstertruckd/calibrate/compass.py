@@ -32,6 +32,8 @@ OVERLAP: Final = 1.05
 """Turns to be driven."""
 TILT: Final = math.radians(0.5)
 """Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
+LINEARITY: Final = 0.001
+"""Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
 GAP: Final = math.radians(30)
 """Greatest gap between directions of the field that still is a circle."""
 
@@ -123,22 +125,23 @@ def result_of(circle: Circle) -> Result:
         )
     errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
     vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)
+    bounds = [vertical if name.startswith("hard") else LINEARITY for name in _NAMES]
     taken_out = np.degrees(np.abs(_wrapped(circle.heading - angle - _mean_angle(circle.heading - angle))).max())
     tilt = f"95 % of the readings' noise, and {math.degrees(TILT):g} deg of the unit's tilt error"
     estimates = [
         Estimate(
             name=name,
             value=value,
-            low=value - error - (vertical if name.startswith("hard") else 0.0),
-            high=value + error + (vertical if name.startswith("hard") else 0.0),
+            low=value - error - bound,
+            high=value + error + bound,
             unit="uT" if name.startswith("hard") else "",
             samples=circle.x.size,
             meaning=f"hard iron, unit's own scale; {tilt}"
             if name.startswith("hard")
-            else "what makes the ellipse a circle, determinant 1; 95 % of the readings' noise",
+            else f"makes the ellipse a circle, determinant 1; 95 % of the readings' noise, {LINEARITY:.1%} of bend",
             key=f"{COMPASS}.{name}",
         )
-        for name, value, error in zip(_NAMES, _iron(fit.parameters), errors, strict=True)
+        for name, value, error, bound in zip(_NAMES, _iron(fit.parameters), errors, bounds, strict=True)
     ]
     estimates.append(
         Estimate(
