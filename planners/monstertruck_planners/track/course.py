@@ -74,7 +74,11 @@ class Course:
 
     def steering(self, s: float) -> Steering:
         """How the axles steer at ``s`` metres."""
-        return self._modes(np.array([s]))[0] if self.given else self._default
+        return self.steerings(np.array([s]))[0]
+
+    def steerings(self, s: Array) -> list[Steering]:
+        """The same at several places."""
+        return self._modes(s) if self.given else [self._default] * len(s)
 
     def at(self, s: Array | float) -> Reference:
         """Values at ``s`` metres; outside the run those of its ends."""

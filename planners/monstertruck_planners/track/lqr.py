@@ -1,0 +1,108 @@
+"""Linear-quadratic regulator with preview, its gains for the present speed and way of steering.
+
+Dead time is bridged by prediction, the axles' lag is part of the state, and the path's coming curves act through the
+optimal preview gains; so the wheels begin to turn before the curve does.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.actuator import Angles
+from monstertruck_planners.track.config import LqrConfig
+from monstertruck_planners.track.error_model import BASES, discretise, riccati
+from monstertruck_planners.track.law import Here, Law
+from monstertruck_schemas.plan import Steering
+
+Array = NDArray[np.float64]
+
+SPEED_STEP: Final = 0.05
+"""Speeds this near to each other (relatively) share their gains."""
+APPROACH: Final = 0.6
+"""Steepest angle at which the path is approached, rad."""
+BETWEEN: Final = 4
+"""Places per period whose mean is the reference."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """For inputs (m), states (n) and k periods of preview."""
+
+    feedback: Array
+    """Shape (m, n): change of the input by the error; states e, p, axles, last input."""
+    preview: Array
+    """Shape (m, 2 k): by the reference's slip and turn, period by period."""
+    furthest: float
+    """Greatest distance from the path that counts, m."""
+
+
+class Lqr(Law[LqrConfig]):
+    """See the module."""
+
+    def __init__(self, config: LqrConfig, geometry: FourWheelSteering) -> None:
+        super().__init__(config, geometry)
+        self._periods = max(math.ceil(config.preview * config.rate), 1)
+        self._gains: dict[tuple[Steering, bool, int], Gains] = {}
+
+    def steer(self, here: Here) -> Angles:
+        """Axle angles for the coming period."""
+        basis = BASES[here.steering]
+        gains = self._at(here.steering, here.speed)
+        onto = np.linalg.pinv(basis)
+        axles = onto @ np.tan(here.angles)
+        asked = onto @ np.tan(self.axles.asked)
+        offset = min(max(here.offset, -gains.furthest), gains.furthest)
+        error = np.concatenate(([offset, here.turned], axles, asked))
+        change = gains.preview @ self._reference(here) - gains.feedback @ error
+        front, rear = np.arctan(basis @ (asked + change))
+        return float(front), float(rear)
+
+    def _reference(self, here: Here) -> Array:
+        """Slip and turn of the coming periods, shape (2 k,)."""
+        step = abs(here.speed) * self.period / BETWEEN
+        ahead = here.course.at(here.s + step * (np.arange(self._periods * BETWEEN) + 0.5))
+        if here.steering == "crab":
+            slip = np.remainder(ahead.heading - here.pose[2] + math.pi, math.tau) - math.pi
+            slip, turn = np.clip(slip, -1.0, 1.0), np.zeros_like(slip)
+        else:
+            slip, turn = ahead.slip, ahead.turn / np.cos(ahead.slip)
+        both = np.stack((np.tan(slip), turn), axis=1)
+        return np.asarray(both.reshape(self._periods, BETWEEN, 2).mean(axis=1).ravel())
+
+    def _at(self, steering: Steering, speed: float) -> Gains:
+        """Gains for a speed, computed once."""
+        key = (steering, speed > 0, round(math.log(abs(speed)) / SPEED_STEP))
+        if key not in self._gains:
+            size = math.exp(key[2] * SPEED_STEP)
+            self._gains[key] = self._design(steering, math.copysign(size, speed))
+        return self._gains[key]
+
+    def _design(self, steering: Steering, speed: float) -> Gains:
+        config, period = self.config, self.period
+        model = discretise(self.geometry, steering, speed, config.lag, period)
+        n, m = model.b.shape
+        a = np.block([[model.a, model.b], [np.zeros((m, n)), np.eye(m)]])
+        b = np.vstack((model.b, np.eye(m)))
+        d = np.vstack((model.d, np.zeros((m, 2))))
+        q = np.zeros((n + m, n + m))
+        q[0, 0] = period / config.lateral_scale**2
+        q[1, 1] = period / config.heading_scale**2
+        if steering == "crab":  # the heading is given: nothing can be done about it
+            q[1, 1] = a[0, 1] = 0.0
+            a[1, :] = 0.0
+        r = np.eye(m) / (period * config.rate_scale**2)
+        cost = riccati(a, b, q, r)
+        inverse = np.linalg.inv(r + b.T @ cost @ b)
+        feedback = inverse @ b.T @ cost @ a
+        closed = a - b @ feedback
+        preview, ahead = [], cost @ d
+        for _ in range(self._periods):
+            preview.append(-inverse @ b.T @ ahead)
+            ahead = closed.T @ ahead
+        single = m == 1 and steering != "crab"
+        furthest = APPROACH * abs(feedback[0, 1] / feedback[0, 0]) if single else math.inf
+        return Gains(feedback, np.hstack(preview), furthest)

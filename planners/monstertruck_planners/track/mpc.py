@@ -1,0 +1,213 @@
+"""Model-predictive control of both axles: a quadratic programme over the coming seconds, re-linearised at each step.
+
+Model: the error from the path as in ``error_model``, but with the axles' angles themselves, exact tangents and the
+curved frame of the path; dead time is bridged by prediction, lag is in the model, angles and rates are limits. States
+are eliminated (condensed form), so the programme has one or two unknowns per period. One linearisation per step, about
+the last plan moved on (real-time iteration: Diehl, Bock and Schloeder, SIAM J. Control Optim. 43, 2005).
+
+The solver is OSQP, with settings that do not depend on measured time: equal inputs give equal outputs.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import osqp
+from numpy.typing import NDArray
+from scipy import sparse
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.actuator import Angles
+from monstertruck_planners.track.config import MpcConfig
+from monstertruck_planners.track.course import Reference
+from monstertruck_planners.track.error_model import BASES, LEAST_LAG
+from monstertruck_planners.track.law import Here, Law
+from monstertruck_schemas.plan import Steering
+
+Array = NDArray[np.float64]
+
+MOST_PERIODS: Final = 30
+FINE: Final = 0.05
+"""Longest step the errors are integrated with, s."""
+APPROACH: Final = 0.3
+"""Distance from the path that counts, as a share of the way to be driven."""
+GENTLE: Final = 1e-6
+"""Weight that keeps inputs without effect where they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """Errors along a plan, at the end of each fine step, and how they move with it."""
+
+    errors: Array
+    """Shape (2 f,): distance, then yaw error."""
+    by_plan: Array
+    """Shape (2 f, n)."""
+
+
+class Mpc(Law[MpcConfig]):
+    """See the module."""
+
+    def __init__(self, config: MpcConfig, geometry: FourWheelSteering) -> None:
+        super().__init__(config, geometry)
+        self._periods = min(max(math.ceil(config.preview * config.rate), 2), MOST_PERIODS)
+        per = max(math.ceil(self.period / FINE - 1e-9), 1)
+        self._h = self.period / per
+        self._fine = self._periods * per
+        self._lag, self._fading = self._responses(per)
+        self._solvers: dict[int, Solver] = {}
+        self._plan: Array | None = None
+        self._planned: tuple[Steering, ...] = ()
+
+    def reset(self) -> None:
+        """See ``Tracker``."""
+        super().reset()
+        self._plan = None
+        self._solvers.clear()
+
+    def steer(self, here: Here) -> Angles:
+        """Axle angles for the coming period."""
+        step = abs(here.speed) * self.period
+        modes = tuple(here.course.steerings(here.s + step * (np.arange(self._periods) + 0.5)))
+        modes = (here.steering, *modes[1:])
+        bases = self._bases(modes)
+        last = np.linalg.pinv(bases[0]) @ np.array(self.axles.asked)
+        fine = here.course.at(here.s + step * (np.arange(self._fine) + 0.5) / (self._fine / self._periods))
+        nominal = self._nominal(here, modes, bases)
+        rollout = self._roll(here, fine, bases, nominal)
+        weights = self._weights(modes)
+        wanted = self._solve(rollout, weights, nominal, last)
+        self._plan, self._planned = wanted, modes
+        front, rear = bases[0] @ wanted[0]
+        return float(front), float(rear)
+
+    def _bases(self, modes: tuple[Steering, ...]) -> Array:
+        """Axle angles of each period's inputs, shape (k, 2, m); an input without effect has zeros."""
+        m = max(BASES[mode].shape[1] for mode in modes)
+        padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
+        return np.array([padded[mode] for mode in modes])
+
+    def _nominal(self, here: Here, modes: tuple[Steering, ...], bases: Array) -> Array:
+        """Plan to linearise about, shape (k, m): the last one, one period on; else what the path asks for."""
+        old = self._plan
+        if old is not None and old.shape == (len(modes), bases.shape[2]) and self._planned[1] == modes[0]:
+            return np.vstack((old[1:], old[-1:]))
+        ahead = here.course.at(here.s + abs(here.speed) * self.period * (np.arange(self._periods) + 0.5))
+        asked = np.column_stack(self.geometry.steer_for(ahead.turn, np.clip(ahead.slip, -1.0, 1.0)))
+        inputs = np.array([np.linalg.pinv(basis) @ both for basis, both in zip(bases, asked, strict=True)])
+        return np.clip(inputs, -self.config.angle, self.config.angle)
+
+    def _responses(self, per: int) -> tuple[Array, Array]:
+        """Axle angle in the middle of each fine step, by the requests (f, k) and by the present angle (f,)."""
+        middle = (np.arange(self._fine) + 0.5) * self._h
+        begin = np.arange(self._periods) * self.period
+        lag = max(self.config.lag, LEAST_LAG)
+        risen = [1.0 - np.exp(-np.maximum(middle[:, None] - b, 0.0) / lag) for b in (begin, begin + self.period)]
+        return risen[0] - risen[1], np.exp(-middle / lag)
+
+    def _roll(self, here: Here, reference: Reference, bases: Array, plan: Array) -> Rollout:
+        asked = np.einsum("kij,kj->ki", bases, plan)
+        angles = self._fading[:, None] * np.array(here.angles) + self._lag @ asked
+        tangents = np.tan(np.clip(angles, -1.4, 1.4))
+        slopes = 1.0 + tangents**2
+        c, base = self.geometry.cg_split, self.geometry.wheelbase
+        slip_tangent = (1.0 - c) * tangents[:, 0] + c * tangents[:, 1]
+        cosine = 1.0 / np.sqrt(1.0 + slip_tangent**2)
+        turn = cosine * (tangents[:, 0] - tangents[:, 1]) / base
+        errors = self._integrate(here, reference, turn, np.arctan(slip_tangent))
+        # One column of axle angles per input, then sums along the way.
+        effect = np.einsum("fk,kij->fikj", self._lag, bases).reshape(self._fine, 2, -1) * slopes[:, :, None]
+        ahead = self._h * here.speed
+        by_turn = ahead * np.cumsum((cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
+        halfway = by_turn - 0.5 * np.diff(by_turn, axis=0, prepend=0.0)
+        by_slip = (cosine**2)[:, None] * ((1.0 - c) * effect[:, 0] + c * effect[:, 1])
+        by_side = ahead * np.cumsum(halfway + by_slip, axis=0)
+        return Rollout(errors, np.vstack((by_side, by_turn)))
+
+    def _integrate(self, here: Here, reference: Reference, turn: Array, slip: Array) -> Array:
+        """Errors along the plan in the path's curved frame."""
+        furthest = APPROACH * abs(here.speed) * self.period * self._periods
+        side, turned = min(max(here.offset, -furthest), furthest), here.turned
+        ahead = self._h * here.speed
+        bend = here.run.direction * reference.curvature
+        sides, yaws = [], []
+        rows = np.column_stack((turn, slip - reference.slip, reference.turn, bend)).tolist()
+        for body_turn, beside, wanted_turn, curvature in rows:
+            along = math.cos(turned + beside) / max(1.0 - curvature * side, 0.2)
+            gained = ahead * (body_turn - wanted_turn * along)
+            side += ahead * math.sin(turned + 0.5 * gained + beside)
+            turned += gained
+            sides.append(side)
+            yaws.append(turned)
+        return np.array(sides + yaws)
+
+    def _weights(self, modes: tuple[Steering, ...]) -> Array:
+        """Of the squared errors, shape (2 f,)."""
+        config = self.config
+        free = np.repeat([mode == "crab" for mode in modes], self._fine // self._periods)
+        heading = np.where(free, 0.0, self._h / config.heading_scale**2)
+        return np.concatenate((np.full(self._fine, self._h / config.lateral_scale**2), heading))
+
+    def _solve(self, rollout: Rollout, weights: Array, nominal: Array, last: Array) -> Array:
+        """The best plan, shape (k, m)."""
+        count, m = nominal.shape
+        if m not in self._solvers:
+            self._solvers[m] = Solver(count, m, self.config, self.period)
+        sensitivity = rollout.by_plan
+        offset = rollout.errors - sensitivity @ nominal.ravel()
+        weighted = sensitivity.T * weights
+        plan = self._solvers[m].solve(weighted @ sensitivity, weighted @ offset, last)
+        return nominal if plan is None else plan.reshape(count, m)
+
+
+class Solver:
+    """The programme of one size: inputs limited in size and in change from period to period.
+
+    Args:
+        count: periods.
+        m: inputs per period.
+        config: limits and the weight of changes.
+        period: s.
+    """
+
+    def __init__(self, count: int, m: int, config: MpcConfig, period: float) -> None:
+        n = count * m
+        change = np.eye(n) - np.eye(n, k=-m)
+        weight = 1.0 / (period * config.rate_scale**2)
+        self._smooth = weight * change.T @ change + GENTLE * np.eye(n)
+        self._pull = weight
+        self._m = m
+        self._upper = np.nonzero(np.triu(np.ones((n, n))).T)[::-1]
+        self._low = np.concatenate((np.full(n, -config.angle), np.full(n, -config.steering_rate * period)))
+        self._scale = 1.0
+        self._problem: Any = osqp.OSQP()
+        self._problem.setup(
+            P=sparse.csc_matrix(np.triu(np.ones((n, n)) + n * np.eye(n))),
+            q=np.zeros(n),
+            A=sparse.csc_matrix(np.vstack((np.eye(n), change))),
+            l=self._low,
+            u=-self._low,
+            verbose=False,
+            max_iter=config.iterations,
+            eps_abs=1e-4,
+            eps_rel=1e-4,
+            check_termination=10,
+            adaptive_rho_interval=50,
+            polishing=False,
+        )
+
+    def solve(self, quadratic: Array, linear: Array, last: Array) -> Array | None:
+        """Minimise x'Qx/2 + l'x + changes from ``last`` on; None if the solver found nothing."""
+        q = linear.copy()
+        q[: self._m] -= self._pull * last
+        p = quadratic + self._smooth
+        scale = 1.0 / max(float(np.abs(p).max()), 1e-12)
+        low, high = self._low.copy(), -self._low
+        first = slice(len(q), len(q) + self._m)
+        low[first] += last
+        high[first] += last
+        rows, columns = self._upper
+        self._problem.update(Px=p[rows, columns] * scale, q=q * scale, l=low, u=high)
+        result = self._problem.solve(raise_error=False)
+        return None if result.x is None or not np.isfinite(result.x).all() else np.asarray(result.x)
