@@ -17,13 +17,13 @@ from monstertruck_estimation.slam.store import Key
 
 Array = NDArray[np.float64]
 
-PARTNERS: Final = 8
+PARTNERS: Final = 12
 """Earlier key scans each is paired with, at most."""
-REACH: Final = 3.0
+REACH: Final = 4.5
 """Distance of a partner at most, m; an angle of view counts as TURN metres per radian."""
 TURN: Final = 1.0
-SPACING: Final = 10
-"""Of this many successive key scans one at most is a partner, beside the neighbours in time."""
+SPACING: Final = 1.0
+"""Of the key scans on this much way one at most is a partner, beside the neighbours in time, m."""
 LEAST_OVERLAP: Final = 0.4
 FARTHEST: Final = 0.2
 """A pair that wishes to move further than this, m, is not believed in this round."""
@@ -32,13 +32,15 @@ FARTHEST: Final = 0.2
 def partners(poses: Array) -> NDArray[np.int64]:
     """Pairs (earlier, later), shape (n, 2): the two before in time, and the nearest of every stretch of the past."""
     result: list[tuple[int, int]] = []
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    stretch = np.floor(np.cumsum(steps) / SPACING).astype(np.int64)
     for k in range(1, len(poses)):
         result += [(j, k) for j in range(max(k - 2, 0), k)]
         off = between(poses[k], poses[: max(k - 2, 0)])
         cost = np.hypot(off[:, 0], off[:, 1]) + TURN * np.abs(off[:, 2])
         near = np.flatnonzero(cost < REACH)
         near = near[np.argsort(cost[near], kind="stable")]
-        _, first = np.unique(near // SPACING, return_index=True)
+        _, first = np.unique(stretch[near], return_index=True)
         result += [(int(j), k) for j in near[np.sort(first)][:PARTNERS]]
     return np.array(result, dtype=np.int64).reshape(-1, 2)
 
