@@ -106,11 +106,14 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
     found = json.loads(report.read_text())
     ticks = np.array([late for at, late in found["ticks"] if begin <= at < end])
     slow = [(used, name) for at, used, name in found["callbacks"] if begin <= at < end]
+    collections = [(used, generation) for at, used, generation in found["collections"] if begin <= at < end]
     return {
         "late": ticks,
         "slow": slow,
+        "collected": collections,
         "cpu_percent": 100 * used / (end - begin) * SECOND,
         "received": received,
+        "seconds": (end - begin) / SECOND,
         **memory,
     }
 
@@ -175,6 +178,9 @@ def figures(floor: list[np.ndarray], runs: list[dict[str, Any]]) -> dict[str, An
         "ticks": sum(len(run["late"]) for run in runs),
         "callbacks_over_2ms": len([name for _, name in over if name not in EXPLAINED]),
         "callbacks_over_2ms_explained": len([name for _, name in over if name in EXPLAINED]),
+        "longest_collection_ms": max((used for run in runs for used, _ in run["collected"]), default=0.0),
+        "collecting_percent": median([sum(used for used, _ in run["collected"]) / run["seconds"] / 10 for run in runs]),
+        "full_collections": sum(generation == 2 for run in runs for _, generation in run["collected"]),
         "longest_callback_ms": slow[0][0] if slow else 0.0,
         "cpu_percent": median([run["cpu_percent"] for run in runs]),
         "rss_mb": median([run["rss_mb"] for run in runs]),

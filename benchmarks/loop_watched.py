@@ -4,11 +4,12 @@
     python loop_watched.py empty REPORT SECONDS     an event loop with nothing but a tick of the gate's rate
 
 The report is JSON. ``ticks``: every tick's instant, ns, and its lateness, ms. ``callbacks``: those of at least
-``NOTABLE`` ms of processor time, as instant, ms, and what it was. ``turns``: how many callbacks there were. The
-look costs the daemon about half a percent of a core.
+``NOTABLE`` ms of processor time, as instant, ms, and what it was. ``collections``: of garbage, as instant, ms,
+generation. The look costs the daemon about half a percent of a core.
 """
 
 import asyncio
+import gc
 import json
 import sys
 import time
@@ -25,14 +26,12 @@ RATE = 50.0
 def watch_callbacks(report: dict[str, Any]) -> None:
     """Measure every callback of every event loop in this thread."""
     found: list[tuple[int, float, str]] = report.setdefault("callbacks", [])
-    report["turns"] = 0
     run, clock = asyncio.Handle._run, time.thread_time  # noqa: SLF001  # where the loop calls its callbacks
 
     def measured(handle: asyncio.Handle) -> None:
         begin = clock()
         run(handle)
         used = 1e3 * (clock() - begin)
-        report["turns"] += 1
         if used >= NOTABLE:
             found.append((time.monotonic_ns(), used, _name(handle)))
 
@@ -48,6 +47,21 @@ def _name(handle: asyncio.Handle) -> str:
     if isinstance(task, asyncio.Task):
         return f"{task.get_name()}: {task.get_coro().__qualname__}"  # type: ignore[union-attr]
     return getattr(callback, "__qualname__", repr(callback))
+
+
+def watch_collector(report: dict[str, Any]) -> None:
+    """Measure every collection of garbage: generation and ms of processor time."""
+    found: list[tuple[int, float, int]] = report.setdefault("collections", [])
+    begin = 0.0
+
+    def measure(phase: str, info: dict[str, int]) -> None:
+        nonlocal begin
+        if phase == "start":
+            begin = time.thread_time()
+        else:
+            found.append((time.monotonic_ns(), 1e3 * (time.thread_time() - begin), info["generation"]))
+
+    gc.callbacks.append(measure)
 
 
 def watch_ticks(report: dict[str, Any]) -> None:
@@ -86,6 +100,7 @@ def main() -> None:
         target = Path(sys.argv[3])
         watch_ticks(report)
         watch_callbacks(report)
+        watch_collector(report)
         run_daemon(Path(sys.argv[2]), verbose=False)
     target.write_text(json.dumps(report))
 
