@@ -104,7 +104,7 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
         "recorder": {"directory": str(here / "logs")},
         "state_directory": str(here / "state"),
     }
-    if "map" in given:
+    if given.get("map"):
         overlay["map"] = {"picture": str(here / "map.png")}
     if seed is not None:
         overlay["sim"] = {"seed": seed}

@@ -1,0 +1,130 @@
+"""`monstertruckd calibrate` as a process beside the daemon: killed and interrupted half-way, scripted to the end."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode
+from tests.daemon.wall_kit import ROOT, Robot, end, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+
+YARD = ROOT / "configs" / "yard.yaml"
+PATIENT = {
+    "gate": {sensor: {"stale_after": 1.5} for sensor in ("scan", "drive", "steering", "attitude")}
+    | {"max_latency": 1.0, "tick_stall": 1.0}
+}
+"""A busy computer shall not end what a signal is to end."""
+
+
+@asynccontextmanager
+async def truck_with_a_calibration(folder: Path) -> AsyncIterator[tuple[Robot, TruckClient, dict[Path, bytes]]]:
+    async with robot(folder, PATIENT, YARD) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client() as client:
+            done = await command(truck, "battery", "--json", "--answer", "meter=24.6", "--answer", "another=no")
+            assert done.returncode == 0, done.stderr
+            saved = json.loads(done.stdout)
+            assert saved["result"]["estimates"][0]["key"] == "devices.steering.driver.battery.gain"
+            yield truck, client, files(folder)
+
+
+def files(folder: Path) -> dict[Path, bytes]:
+    found = {path: path.read_bytes() for path in (folder / "state" / "calibration").iterdir()}
+    assert found
+    return found
+
+
+async def command(truck: Robot, *words: str) -> subprocess.CompletedProcess[str]:
+    arguments = [sys.executable, "-m", "monstertruckd", "calibrate", *words, "--endpoint", truck.endpoint]
+    return await asyncio.to_thread(
+        subprocess.run, arguments, cwd=ROOT, capture_output=True, text=True, timeout=90, check=False, input=""
+    )
+
+
+async def drive_away(truck: Robot, client: TruckClient) -> asyncio.subprocess.Process:
+    """A drive wizard in the middle of its first run."""
+    words = ("drive", "--yes", "--answer", "forward=yes", "--metres", "5", "--endpoint", truck.endpoint)
+    wizard = await truck.spawn("calibrate", *words)
+    with client.subscribe(topics.ODOMETRY, latest()) as odometry:
+        async with asyncio.timeout(60):
+            while odometry.latest is None or odometry.latest.twist.vx < 0.1:
+                assert wizard.returncode is None, (truck.folder / "calibrate.txt").read_text()
+                await asyncio.sleep(0.05)
+    return wizard
+
+
+async def ends_by(number: int, folder: Path) -> int | None:
+    """End the wizard by a signal in mid-run; its exit code, once truck and file are as they should be."""
+    async with truck_with_a_calibration(folder) as (truck, client, before):
+        wizard = await drive_away(truck, client)
+        ended = truck.clock.now() / 1e9
+        code = await end(wizard, number)
+        with client.subscribe(topics.GATE, latest()) as gate:
+            async with asyncio.timeout(10):
+                while gate.latest is None or gate.latest.mode is not GateMode.DISARMED:
+                    await asyncio.sleep(0.05)
+        assert files(folder) == before, "the old file is intact, and no other one is there"
+        await asyncio.sleep(2.0)
+        assert await end(truck.daemon) == 0
+        truth = await truck.truth()
+    after = truth[truth[:, 0] > ended + 1.5]
+    assert abs(after[:, 4]).max() < 0.01
+    return code
+
+
+async def test_kill_9_of_the_wizard_leaves_truck_neutral_and_file_intact(tmp_path: Path):
+    assert await ends_by(signal.SIGKILL, tmp_path) == -signal.SIGKILL
+
+
+async def test_ctrl_c_does_the_same_and_says_so(tmp_path: Path):
+    assert await ends_by(signal.SIGINT, tmp_path) == Reason.CANCELLED.exit_code
+    assert Reason.CANCELLED.text in (tmp_path / "calibrate.txt").read_text()
+
+
+async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Path):
+    async with truck_with_a_calibration(tmp_path) as (truck, _, before):
+        shown = await command(truck, "show")
+        assert shown.returncode == 0
+        assert "battery.gain" in shown.stdout
+        assert "the daemon still runs on no calibration: restart it" in shown.stderr
+        assert await end(truck.daemon) == 0
+        await truck.start_daemon()
+        async with truck.client() as client:
+            told: dict[str, Any] = await client.call("calibration")
+            config = await client.call("config")
+        gain = json.loads(next(iter(before.values())))["results"]["battery"]["estimates"][0]["value"]
+        assert config["devices"]["steering"]["driver"]["battery"]["gain"] == gain != 1.0
+        assert told["loaded"] == told["newest"] == str(next(iter(before)))
+        undone = await command(truck, "battery", "--undo", "--json")
+        assert undone.returncode == 0, undone.stderr
+        newest = Path(json.loads(undone.stdout)["file"])
+        assert json.loads(newest.read_text())["results"] == {}
+        again = await command(truck, "battery", "--undo", "--config", str(truck.config))
+        assert again.returncode == 0, "without the daemon too"
+        assert len(files(tmp_path)) == 3
+
+
+async def test_a_script_that_cannot_answer_is_told_which_question(tmp_path: Path):
+    async with truck_with_a_calibration(tmp_path) as (truck, _, before):
+        unanswered = await command(truck, "drive", "--yes", "--sign-only")
+        assert unanswered.returncode == Reason.BAD_INPUT.exit_code
+        assert "forward: no answer on standard input; give it by --answer forward=VALUE" in unanswered.stderr
+        assert unanswered.stdout == ""
+        refused = await command(truck, "battery", "--answer", "meter=240")
+        assert refused.returncode == Reason.BAD_INPUT.exit_code
+        assert "meter: 240 is not within 5 to 70" in refused.stderr
+        assert files(tmp_path) == before
