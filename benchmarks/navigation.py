@@ -16,7 +16,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from navigation_parts import Options, Part
 
-PARTS = ("reeds_shepp", "routes")
+FOLDER = Path(__file__).parent / "navigation_parts"
+PARTS = sorted(path.stem for path in FOLDER.glob("*.py") if "\ndef run(" in path.read_text())
 OUT = Path(__file__).resolve().parents[1] / "runs" / "navigation"
 
 

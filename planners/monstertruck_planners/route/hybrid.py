@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,8 +39,11 @@ PATIENCE = 12
 FINE = (0.1, 0.03, 0.01)
 """Shares of a stretch by which poses move at last."""
 
-LAST_SHARE = 0.3
-"""Of the budget, for shortening with translations."""
+FINE_SHARE = 0.1
+"""Of the budget, for these."""
+
+LAST_SHARE = 0.4
+"""Of the budget, for shortening with translations and for these."""
 
 APART = 2.5
 """Ways differ if they are this far apart somewhere, turning radii."""
@@ -142,26 +146,24 @@ class _Run:
         self.layer = planner.layer(ground)
         self.factor = max(round(togo.COARSE / self.field.resolution), 1)
         self.cell = self.factor * self.field.resolution
-        self.toll = togo.tolls(
-            self.field, self.layer.price, self.factor,
-            self.body.inscribed, planner.side, planner.side + 0.25 * self.vehicle.radius,
-        )  # fmt: skip
         self.car = planner.car(LEVELS[0])
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
 
     def route(self) -> RouteResult:
-        go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-        row, column = self._cell(self.start)
-        if go.cost[row, column] >= togo.FAR:
-            return self._none(Reason.GOAL_UNREACHABLE, "no way is wide enough")
-        rows, reason = self._first(go)
+        rows = self._direct()
         if rows is None:
-            return self._none(reason, "no drivable way found")
+            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
+            row, column = self._cell(self.start)
+            if go.cost[row, column] >= togo.FAR:
+                return self._none(Reason.GOAL_UNREACHABLE, "no way is wide enough")
+            rows, reason = self._first(go)
+            if rows is None:
+                return self._none(reason, "no drivable way found")
         self.statistics["first_s"] = self.budget.elapsed
         self.statistics["first_length"] = float(np.abs(rows[:, 0]).sum())
         if self.config.improve:
-            rows = self._improve(rows, go)
+            rows = self._improve(rows)
         path = MotionPath(self.start, rows, self.vehicle.steering, self.vehicle.reference)
         return RouteResult(Reason.OK, path, cost=self._cost(rows), statistics=self._told())
 
@@ -173,6 +175,15 @@ class _Run:
 
     def _cell(self, pose: Array) -> tuple[int, int]:
         return togo.cell_at(self.field, self.cell, pose[0], pose[1])
+
+    @cached_property
+    def toll(self) -> NDArray[np.int16]:
+        """Cost of entering each coarse cell."""
+        side = self.planner.side
+        return togo.tolls(
+            self.field, self.layer.price, self.factor,
+            self.body.inscribed, side, side + 0.25 * self.vehicle.radius,
+        )  # fmt: skip
 
     def _ways(self, allowed: NDArray[np.bool_], stretch: float) -> togo.ToGo:
         row, column = self._cell(self.start)
@@ -188,6 +199,12 @@ class _Run:
             np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
             np.zeros((rows, columns, HEADINGS), np.int32), cell, np.zeros(4, np.int64),
         )  # fmt: skip
+
+    def _direct(self) -> Array | None:
+        """The best motion without obstacles, if it is free."""
+        rows = self.planner.steer.path(self.start, self.goal).rows
+        free = search.rows_free(self.field, self.body, self.car, self.start, np.ascontiguousarray(rows), len(rows))
+        return np.array(rows) if free else None
 
     def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason]:
         for level in LEVELS:
@@ -217,17 +234,19 @@ class _Run:
             return search.trace(car, goal, nodes), Reason.OK
         return None, Reason.GOAL_UNREACHABLE if status == search.EXHAUSTED else Reason.ROUTE_TIMEOUT
 
-    def _improve(self, rows: Array, go: togo.ToGo) -> Array:
+    def _improve(self, rows: Array) -> Array:
         car = self.car
-        # Motions without translations are found in half the time: those come last.
-        self.car = car._replace(crab=0.0)
-        rows = self._rounds(rows, self._other_ways(go), PATIENCE, LAST_SHARE if car.crab > 0.0 else 0.0)
-        self.car = car
+        # Motions without translations are found in half the time: only the middle part allows for these.
+        plain = self.car = car._replace(crab=0.0)
+        rows = self._rounds(rows, self._other_ways(), PATIENCE, LAST_SHARE if car.crab > 0.0 else FINE_SHARE)
         if car.crab > 0.0:
-            rows = self._rounds(rows, iter(()), 4, 0.05)
+            self.car = car
+            rows = self._rounds(rows, iter(()), 4, FINE_SHARE)
+            self.car = plain
         best = self._draft(rows)
         for shift in FINE:
             self._settle(best, 1e-4, shift)
+        self.car = car
         return best.rows[: best.used[0]].copy()
 
     def _rounds(self, rows: Array, others: Iterator[Array], patience: int, reserve: float) -> Array:
@@ -274,8 +293,9 @@ class _Run:
             self.field, self.body, self.layer, self.car, samples.poses, samples.travelled, 16.0 * self.vehicle.radius
         )
 
-    def _other_ways(self, go: togo.ToGo) -> Iterator[Array]:
-        """First drafts along other ways, the shortest ways first."""
+    def _other_ways(self) -> Iterator[Array]:
+        """First drafts along all ways worth a look, the shortest ways first."""
+        go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
         columns = self.toll.shape[1]
         whole = np.zeros((0, 0), np.bool_)
         back, back_step = togo.spread(self.toll, whole, *self._cell(self.start), -1, 1.0)
