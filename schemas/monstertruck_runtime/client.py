@@ -24,6 +24,7 @@ from monstertruck_schemas.base import Message, Pose2D, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import (
     GATE,
     REQ_CONTROL,
@@ -87,7 +88,8 @@ class TruckClient:
         self._tls = tls
         self._session: zenoh.Session | None = None
         self._subscriptions: dict[Mailbox[Any], Callable[[], None]] = {}
-        self._gate: Mailbox[Any] | None = None
+        self._gate: Mailbox[GateState] | None = None
+        self._asking = asyncio.Lock()
         # Must grow for each source over runs of this program, too.
         self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
 
@@ -195,20 +197,25 @@ class TruckClient:
         Raises:
             NoAnswerError: the robot's nonce did not come in time.
         """
-        header = await self._header(lease)
+        header = await self._answered(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
 
     async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Arm, disarm, emergency stop, reset, stop. Raises as ``drive`` does."""
-        self._put(REQ_CONTROL, ControlRequest(**await self._header(lease), order=order))
+        """Arm, disarm, stop, reset; an emergency stop goes out at once, whatever is known of the robot.
+
+        Raises:
+            NoAnswerError: the robot's nonce did not come in time; never of an emergency stop.
+        """
+        header = self._header(lease) if order is Order.ESTOP else await self._answered(lease)
+        self._put(REQ_CONTROL, ControlRequest(**header, order=order))
 
     async def goal(self, goal: Pose2D, frame: str = "map", lease: float = 1.0) -> None:
         """Ask to drive to a pose in ``frame``. Raises as ``drive`` does."""
-        self._put(REQ_GOAL, GoalRequest(**await self._header(lease), frame=frame, goal=goal))
+        self._put(REQ_GOAL, GoalRequest(**await self._answered(lease), frame=frame, goal=goal))
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Ask to follow a path computed here. Raises as ``drive`` does."""
-        self._put(REQ_PATH, PathRequest(**await self._header(lease), frame=path.frame, path=path))
+        self._put(REQ_PATH, PathRequest(**await self._answered(lease), frame=path.frame, path=path))
 
     def _put(self, topic: Topic[M], message: M) -> None:
         assert topic.writer is Writer.OUTSIDE
@@ -223,19 +230,27 @@ class TruckClient:
             express=True,
         )
 
-    async def _header(self, lease: float) -> dict[str, Any]:
+    async def _answered(self, lease: float) -> dict[str, Any]:
+        """Header of a request once the robot's nonce is known; one task at a time waits for it."""
+        async with self._asking:
+            gate = self._followed_gate()
+            if gate.latest is None:
+                try:
+                    async with self._clock.deadline(self._timeout):
+                        await gate.next()
+                except TimeoutError:
+                    msg = f"robot {self.robot!r} does not publish its gate state at {self.endpoint}"
+                    raise NoAnswerError(msg) from None
+        return self._header(lease)
+
+    def _followed_gate(self) -> Mailbox[GateState]:
         if self._gate is None:
             self._gate = self.subscribe(GATE, latest())
-        if self._gate.latest is None:
-            try:
-                async with self._clock.deadline(self._timeout):
-                    await self._gate.next()
-            except TimeoutError:
-                msg = f"robot {self.robot!r} does not publish its gate state at {self.endpoint}"
-                raise NoAnswerError(msg) from None
-        state = self._gate.latest
-        assert state is not None
-        if state.holder == self.source and state.last_seq is not None:
+        return self._gate
+
+    def _header(self, lease: float) -> dict[str, Any]:
+        state = self._followed_gate().latest
+        if state is not None and state.holder == self.source and state.last_seq is not None:
             self._seq = max(self._seq, state.last_seq)
         self._seq += 1
         now = self._clock.now()
@@ -246,8 +261,8 @@ class TruckClient:
             "source": self.source,
             "role": self.role,
             "lease": lease,
-            "nonce": state.nonce,
-            "gate_stamp": state.stamp,
+            "nonce": "" if state is None else state.nonce,
+            "gate_stamp": None if state is None else state.stamp,
         }
 
     # Zenoh

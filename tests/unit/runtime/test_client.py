@@ -145,6 +145,28 @@ async def test_requests_carry_the_nonce_and_a_growing_sequence():
         assert seqs == sorted(set(seqs))
 
 
+async def test_an_emergency_stop_waits_for_nothing():
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint, timeout=60.0) as client:
+        orders = robot.bus.subscribe(REQ_CONTROL, fifo(4))
+        async with asyncio.timeout(3):
+            await client.order(Order.ESTOP)
+            stop = await orders.next()
+    assert (stop.order, stop.nonce) == (Order.ESTOP, "")
+
+
+async def test_tasks_that_ask_at_once_share_one_wait():
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
+        orders = robot.bus.subscribe(REQ_CONTROL, fifo(4))
+        asking = asyncio.gather(client.order(Order.ARM), client.order(Order.STOP))
+        await asyncio.sleep(0.2)
+        robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        async with asyncio.timeout(3):
+            await asking
+            first, second = await orders.next(), await orders.next()
+    assert second.seq == first.seq + 1
+    assert {first.order, second.order} == {Order.ARM, Order.STOP}
+
+
 async def test_a_source_the_robot_knows_goes_on_counting_above_it():
     async with running_robot() as robot:
         known = 2**62
@@ -170,7 +192,7 @@ async def test_a_restarted_robot_is_found_again_with_its_new_nonce():
         async with asyncio.timeout(10):
             assert (await gate.next()).nonce == "second"
         box = robot.bus.subscribe(REQ_CONTROL, fifo(1))
-        await client.order(Order.ESTOP)
+        await client.order(Order.ARM)
         async with asyncio.timeout(3):
             assert (await box.next()).nonce == "second"
         await client.__aexit__(None, None, None)
