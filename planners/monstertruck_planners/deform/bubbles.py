@@ -95,7 +95,7 @@ def _radius(field: FieldData, cover: Cover, rules: Rules, x: float, y: float, ya
 @njit(cache=True)
 def _apart(rules: Rules, band: FloatArray, i: int, j: int) -> float:
     turned = abs((band[i, 2] - band[j, 2] + pi) % (2 * pi) - pi)
-    return hypot(band[i, 0] - band[j, 0], band[i, 1] - band[j, 1]) + rules.reach * turned
+    return float(hypot(band[i, 0] - band[j, 0], band[i, 1] - band[j, 1]) + rules.reach * turned)
 
 
 @njit(cache=True)
