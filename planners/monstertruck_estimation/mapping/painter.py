@@ -1,0 +1,104 @@
+"""Draws the grid from scans, and draws it anew when a loop closure has moved where they were taken."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.mapping.config import GridConfig
+from monstertruck_estimation.mapping.exchange import Vector
+from monstertruck_estimation.mapping.grid import OccupancyGrid
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.se2 import between, transform
+from monstertruck_runtime.clock import SECOND
+
+Array = NDArray[np.float64]
+
+MILLIMETRES: Final = 1000.0
+FARTHEST: Final = 32.7
+"""Points are kept as 16-bit millimetres, m."""
+MOVED: Final = (0.5, 0.01)
+"""Poses that moved by less (cells, rad) are not worth drawing anew."""
+
+
+class Painter:
+    """Grid of the scans it was given and still remembers.
+
+    Args:
+        config: grid, and which scans join it.
+    """
+
+    def __init__(self, config: GridConfig) -> None:
+        self.grid = OccupancyGrid(config)
+        self._config = config
+        self._stamps: list[int] = []
+        self._poses: list[Array] = []
+        self._scans: list[tuple[NDArray[np.int16], Vector]] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, scan: Scan, stamp: int, pose: Array, mount: Vector) -> bool:
+        """Take a scan in if it is due; tells whether it was.
+
+        Args:
+            scan: points in base.
+            stamp: ns, later than those before.
+            pose: shape (3,), base in map.
+            mount: planar pose of the sensor in base.
+        """
+        if not len(scan) or not self._due(stamp, pose):
+            return False
+        near = scan.points[np.abs(scan.points).max(axis=1) < FARTHEST]
+        self._stamps.append(stamp)
+        self._poses.append(np.array(pose))
+        self._scans.append((np.round(near * MILLIMETRES).astype(np.int16), mount))
+        self._draw(len(self._stamps) - 1)
+        if len(self._stamps) > self._config.remembered:
+            self._thin()
+        return True
+
+    def follow(self, stamps: NDArray[np.int64], poses: Array) -> bool:
+        """Draw anew if the trajectory puts remembered scans elsewhere; tells whether it did.
+
+        Args:
+            stamps: shape (n,), ns, rising, those of all remembered scans among them.
+            poses: shape (n, 3), base in map.
+        """
+        if not self._stamps or not len(stamps):
+            return False
+        at = np.clip(np.searchsorted(stamps, self._stamps), 0, len(stamps) - 1)
+        now = poses[at]
+        off = between(np.array(self._poses), now)
+        if (np.hypot(off[:, 0], off[:, 1]) < MOVED[0] * self._config.resolution).all() and (
+            np.abs(off[:, 2]) < MOVED[1]
+        ).all():
+            return False
+        self._poses = list(now)
+        self.grid.clear()
+        for i in range(len(self._stamps)):
+            self._draw(i)
+        return True
+
+    def _due(self, stamp: int, pose: Array) -> bool:
+        if not self._stamps:
+            return True
+        config, off = self._config, between(self._poses[-1], pose)
+        return bool(
+            np.hypot(off[0], off[1]) >= config.spacing
+            or abs(off[2]) >= config.turn
+            or stamp - self._stamps[-1] >= config.pause * SECOND
+        )
+
+    def _draw(self, i: int) -> None:
+        points, mount = self._scans[i]
+        sensor = transform(self._poses[i], np.array([mount[:2]]))[0]
+        self.grid.add(sensor, transform(self._poses[i], points / MILLIMETRES))
+
+    def _thin(self) -> None:
+        """Forget every other scan but the newest quarter."""
+        count = len(self._stamps)
+        kept = [i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4]
+        self._stamps = [self._stamps[i] for i in kept]
+        self._poses = [self._poses[i] for i in kept]
+        self._scans = [self._scans[i] for i in kept]

@@ -1,0 +1,75 @@
+"""Front end over kiss-icp: its point-to-point ICP on a voxel map, seeded by the wheels and judged by us.
+
+All points are kept: the package's own second downsampling leaves too few of a planar scan. It tells neither a score nor
+a failure, so every result is registered once more by the common measure (overlap, residual, information) and gated.
+"""
+
+from typing import Final
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.mapping import VoxelHashMap
+from kiss_icp.registration import get_registration
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.frontend import LEAST_PAIRS, Match, Verdict, judge, rejected
+from monstertruck_estimation.slam.registration import register
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.submap import Submap
+
+Array = NDArray[np.float64]
+
+VOXEL: Final = 0.1
+"""Edge of the voxels of its map, m."""
+FARTHEST: Final = 100.0
+"""Points of the map farther away are forgotten by the package, m."""
+PER_VOXEL: Final = 20
+REACH: Final = 0.5
+"""Greatest distance of a pair, m."""
+KERNEL: Final = 0.1
+"""Distance at which a pair's influence drops, m."""
+
+
+class Kiss:
+    """See ``FrontEnd``; the map it registers to is the mapper's submap, so loop closures move it too."""
+
+    def __init__(self) -> None:
+        config = KISSConfig()
+        config.registration.max_num_threads = 1
+        self._registration = get_registration(config)
+        self._submap: Submap | None = None
+        self._map = VoxelHashMap(VOXEL, FARTHEST, PER_VOXEL)
+
+    def locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
+        """See ``FrontEnd``."""
+        if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
+            return rejected(guess, covariance, Verdict.EMPTY)
+        if submap is not self._submap:
+            self._submap = submap
+            self._map.clear()
+            self._map.add_points(_spatial(submap.cloud.points))
+        found = self._registration.align_points_to_map(
+            points=_spatial(scan.points),
+            voxel_map=self._map,
+            initial_guess=_matrix(guess),
+            max_correspondance_distance=REACH,
+            kernel=KERNEL,
+        )
+        pose = np.array((found[0, 3], found[1, 3], np.arctan2(found[1, 0], found[0, 0])))
+        if not np.isfinite(pose).all():
+            return rejected(guess, covariance, Verdict.FAR)
+        # No step is taken: the pose stays kiss-icp's, measured as every other.
+        measured = register(scan, submap.cloud, pose, iterations=0)
+        return judge(measured, guess, covariance)
+
+
+def _spatial(points: Array) -> Array:
+    return np.column_stack((points, np.zeros(len(points))))
+
+
+def _matrix(pose: Array) -> Array:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    result = np.eye(4)
+    result[:2, :2] = (c, -s), (s, c)
+    result[:2, 3] = pose[:2]
+    return result

@@ -1,0 +1,139 @@
+"""The occupancy grid: what a scan leaves in it, growth, changed tiles, redrawing."""
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.mapping.config import GridConfig
+from monstertruck_estimation.mapping.grid import TILE, OccupancyGrid
+from monstertruck_estimation.mapping.painter import Painter
+from monstertruck_estimation.slam.scans import Scan
+
+ORIGIN = np.zeros(2)
+
+
+def value(grid: OccupancyGrid, x: float, y: float) -> int:
+    patch = grid.patch()
+    column = int(np.floor((x - patch.origin[0]) / patch.resolution + 1e-9))
+    row = int(np.floor((y - patch.origin[1]) / patch.resolution + 1e-9))
+    rows, columns = patch.cells.shape
+    return int(patch.cells[row, column]) if 0 <= row < rows and 0 <= column < columns else -1
+
+
+def scan_of(*points: tuple[float, float]) -> Scan:
+    array = np.array(points, float)
+    return Scan(array, np.tile((1.0, 0.0), (len(array), 1)), np.full((len(array), 2), 1e-4))
+
+
+@pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 17))
+def test_a_beam_frees_what_it_passed_and_occupies_its_end(angle: float):
+    grid = OccupancyGrid()
+    middle = np.array((0.025, 0.025))  # of a cell
+    end = np.array((2.02 * np.cos(angle), 2.02 * np.sin(angle)))
+    grid.add(middle, (middle + end)[None])
+    assert value(grid, *(middle + end)) == 70
+    assert value(grid, *middle) == 40
+    sideways = 0.04 * np.array((-np.sin(angle), np.cos(angle)))
+    for share in (0.25, 0.5, 0.9):  # within a cell of the true line
+        near = {value(grid, *(middle + end * share + shift * sideways)) for shift in (-1, 0, 1)}
+        assert 40 in near
+        assert near <= {40, -1}
+    assert value(grid, *(middle + end * 1.2)) == -1
+
+
+def test_a_scan_counts_once_per_cell_and_ends_outweigh_passes():
+    once, often = OccupancyGrid(), OccupancyGrid()
+    wall = np.stack((np.linspace(0.5, 3.0, 400), np.full(400, 0.21)), axis=-1)  # seen at a grazing angle
+    often.add(ORIGIN, np.repeat(wall, 5, axis=0))
+    once.add(ORIGIN, wall)
+    assert np.array_equal(once.patch().cells, often.patch().cells)
+    assert all(value(once, x, 0.21) == 70 for x in np.linspace(0.55, 2.95, 20))
+
+
+def test_the_odds_are_limited_so_that_what_leaves_is_forgotten():
+    grid = OccupancyGrid()
+    for _ in range(200):
+        grid.add(ORIGIN, np.array([[1.0, 0.0]]))
+    assert value(grid, 1.0, 0.0) == 98
+    for _ in range(12):
+        grid.add(ORIGIN, np.array([[2.0, 0.0]]))
+    assert value(grid, 1.0, 0.0) < 50
+
+
+def test_it_grows_into_all_directions_and_keeps_what_it_knows():
+    grid = OccupancyGrid()
+    ends = [(1.0, 0.0), (-30.0, 2.0), (4.0, 25.0), (3.0, -41.0)]
+    for end in ends:
+        grid.add(ORIGIN, np.array([end]))
+    assert [value(grid, *end) for end in ends] == [70] * 4
+
+
+def test_marks_may_wrap_round():
+    grid = OccupancyGrid()
+    grid._mark = np.iinfo(np.uint16).max - 1
+    for _ in range(3):
+        grid.add(ORIGIN, np.array([[1.0, 0.0]]))
+    assert value(grid, 1.0, 0.0) == 93
+
+
+def test_changes_are_the_tiles_that_differ():
+    grid = OccupancyGrid()
+    grid.add(ORIGIN, np.array([[1.0, 0.5]]))
+    (tile,) = grid.changes()
+    assert tile.cells.shape == (TILE, TILE)
+    assert tile.origin == (0.0, 0.0)
+    assert grid.changes() == []
+    grid.add(ORIGIN, np.array([[-1.0, 0.5]]))
+    assert [patch.origin for patch in grid.changes()] == [(-TILE * 0.05, 0.0), (0.0, 0.0)]
+
+
+def test_tiles_put_together_are_the_grid():
+    rng = np.random.default_rng(1)
+    grid = OccupancyGrid(GridConfig(resolution=0.1))
+    tiles = {}
+    for _ in range(20):
+        grid.add(rng.uniform(-5, 5, 2), rng.uniform(-12, 12, (30, 2)))
+        tiles |= {patch.origin: patch.cells for patch in grid.changes()}
+    whole = grid.patch()
+    count = 0
+    for (x, y), cells in tiles.items():
+        for row, column in zip(*np.nonzero(cells != -1), strict=True):
+            assert value(grid, x + (column + 0.5) * 0.1, y + (row + 0.5) * 0.1) == cells[row, column]
+            count += 1
+            if count > 3000:
+                break
+    assert sum((cells != -1).sum() for cells in tiles.values()) == (whole.cells != -1).sum()
+
+
+def test_after_a_closure_the_map_is_drawn_anew_and_old_places_are_told_unknown():
+    painter = Painter(GridConfig())
+    scan = scan_of((1.0, 0.0), (1.0, 0.2))
+    poses = np.array([(float(i), 0.0, 0.0) for i in range(5)])
+    for i, pose in enumerate(poses):
+        assert painter.add(scan, i + 1, pose, (0.0, 0.0, 0.0))
+    painter.grid.changes()
+    stamps = np.arange(1, 6)
+    assert not painter.follow(stamps, poses + 0.001)
+    moved = poses + np.array((0.0, 20.0, 0.0))
+    assert painter.follow(stamps, moved)
+    assert value(painter.grid, 5.0, 20.0) == 70
+    assert value(painter.grid, 5.0, 0.0) == -1
+    told = {patch.origin: patch.cells for patch in painter.grid.changes()}
+    assert (told[(0.0, 0.0)] == -1).all()
+
+
+def test_scans_join_by_way_turn_or_time():
+    painter = Painter(GridConfig(spacing=0.1, turn=0.1, pause=1.0))
+    scan, level = scan_of((1.0, 0.0)), (0.0, 0.0, 0.0)
+    assert painter.add(scan, 0, np.zeros(3), level)
+    assert not painter.add(scan, 10**8, np.array((0.05, 0, 0)), level)
+    assert painter.add(scan, 2 * 10**8, np.array((0.11, 0, 0)), level)
+    assert painter.add(scan, 3 * 10**8, np.array((0.11, 0, 0.15)), level)
+    assert painter.add(scan, 14 * 10**8, np.array((0.11, 0, 0.15)), level)
+
+
+def test_memory_is_bounded():
+    painter = Painter(GridConfig(remembered=32))
+    for i in range(500):
+        painter.add(scan_of((1.0, 0.0)), i, np.array((0.2 * i, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    assert len(painter) <= 32
+    assert value(painter.grid, 30.0, 0.0) != -1
