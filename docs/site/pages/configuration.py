@@ -1,0 +1,74 @@
+"""Configuration reference: one page for each section of the file, made from the models that check it."""
+
+from collections.abc import Iterator
+
+from monstertruckd.catalog import KINDS
+from monstertruckd.sim.config import SimulatedTruckConfig
+from pages.markdown import Page, join
+from pages.models import Definitions, Json, label, plain
+
+DRIVER = "And `driver`: the settings of the device's kind, on the device's page."
+DRIVERS = {kind.config_class().__name__: kind for kind in KINDS}
+
+
+def pages() -> list[Page]:
+    """The whole file, then each section that has keys of its own."""
+    models = Definitions(SimulatedTruckConfig)
+    sections = {name: field for name, field in models.root["properties"].items() if any(models.models_in(field))}
+    places = {model: f"{name}.md" for name, field in sections.items() for model in models.models_in(field)}
+    text = join(
+        "# Configuration",
+        "One YAML file for each robot or experiment. `include: FILE` at its top merges it over another one, relative "
+        "to itself. Keys that are not listed here are refused, with file, line and a suggestion; `monstertruckd config "
+        "show FILE` prints what comes out, with the origin of every value. Defaults are those of the author's truck.",
+        models.fields(models.root, places.get),
+        "`sim` is for simulated trucks only.",
+    )
+    first = Page("configuration/index.md", "The file", text)
+    return [first, *(_section(models, name, field) for name, field in sections.items())]
+
+
+def _section(models: Definitions, key: str, field: Json) -> Page:
+    found = dict(_walk(models, key, field))
+    anchors = {name: f"#{_anchor(heading)}" for heading, name in found.items()}
+
+    def link(name: str) -> str | None:
+        driver = DRIVERS.get(name.removeprefix("Device_").rstrip("_"))
+        return f"../devices/{driver.name}.md" if driver is not None else anchors.get(name)
+
+    parts = [f"# {key}", plain(field.get("description", ""))]
+    for heading, name in found.items():
+        model = models[name]
+        if heading != key:
+            parts.append(f"## `{heading}` {{ #{_anchor(heading)} }}")
+        about = plain(model.get("description", ""))
+        if "properties" in model and "driver" in model["properties"]:
+            parts += [about, models.fields(model, link, frozenset({"driver"})), DRIVER]
+        else:
+            parts += [about, models.fields(model, link)]
+    return Page(f"configuration/{key}.md", key, join(*parts))
+
+
+def _walk(models: Definitions, key: str, field: Json) -> Iterator[tuple[str, str]]:
+    """Headings and models, each model once, from the outside in; drivers have pages of their own."""
+    waiting, seen = [(key, field)], set()
+    while waiting:
+        at, schema = waiting.pop(0)
+        names = [name for name in models.models_in(schema) if name not in DRIVERS]
+        for name in names:
+            if _one_of_all(name) in seen:
+                continue
+            seen.add(_one_of_all(name))
+            inside = "devices.<role>" if name.startswith("Device_") else at
+            kind = label(models[name], name)
+            yield (f"{inside}, {kind.strip('`')}" if len(names) > 1 else inside), name
+            waiting += [(f"{inside}.{inner}", value) for inner, value in models[name]["properties"].items()]
+
+
+def _one_of_all(name: str) -> str:
+    """Devices differ by their drivers only: one stands for all."""
+    return "Device" if name.startswith("Device_") else name
+
+
+def _anchor(heading: str) -> str:
+    return "".join(letter if letter.isalnum() else "-" for letter in heading.lower()).strip("-")

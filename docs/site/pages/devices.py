@@ -1,0 +1,138 @@
+"""One page for each kind of device: from the catalog, the settings, and what driver and emulator say of themselves."""
+
+import re
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import yaml
+
+from monstertruck_schemas.topics import TOPICS
+from monstertruckd.catalog import KINDS, Kind
+from monstertruckd.config.yaml_tree import load_tree
+from pages.markdown import Page, join, prose, raised, section, table
+from pages.models import Definitions, label, plain
+from pages.topics import anchor
+
+CONFIG = Path(__file__).resolve().parents[3] / "configs" / "truck.yaml"
+
+LINE_FAULTS = """\
+And of the cable: `unplug`, `plug`, `power-cycle`, `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`.
+[`emulate`](../commands/emulate.md) and [`simulate`](../commands/simulate.md) take faults on standard input."""
+
+
+def pages(sections: dict[str, str]) -> list[Page]:
+    """A page for each kind.
+
+    Args:
+        sections: heading of ``devices.md`` by role, in lower case.
+    """
+    return [_page(kind, sections.get(kind.role)) for kind in KINDS]
+
+
+def _page(kind: Kind, habits: str | None) -> Page:
+    driver, emulator, probe = kind.driver_class(), kind.emulator_class(), kind.probe()
+    models = Definitions(kind.config_class())
+    text = join(
+        f"# {kind.doc}",
+        _facts(kind, driver),
+        f"What its emulator does as the device does, test by test: [table](../devices.md#{habits})." if habits else "",
+        "## Driver",
+        prose(driver.__doc__),
+        "Its session ends, and is tried again by the restart policy, with:",
+        table(("error", "when"), [(f"`{name}`", when) for name, when in raised(driver.run.__doc__)]),
+        "## Settings",
+        _example(kind),
+        *_settings(models),
+        "## Probe",
+        f"`monstertruckd probe {kind.name}{PROBED[kind.asked]}`: {prose(probe.__doc__)}",
+        section(probe.__doc__, "Returns"),
+        "## Emulator",
+        _without_faults(emulator.__doc__),
+        "## Faults",
+        _faults(emulator),
+        LINE_FAULTS if kind.asked == "port" else "",
+    )
+    return Page(f"devices/{kind.name}.md", f"{kind.role}: {kind.name}", text)
+
+
+PROBED = {"port": " --port /dev/...", "path": " --port '/dev/video*'", "machine": ""}
+
+
+def _facts(kind: Kind, driver: type[Any]) -> str:
+    writes, reads = _topics(kind, driver, "Publisher"), _topics(kind, driver, "Subscription")
+    place = f"monitors.{kind.role}" if kind.asked == "machine" else f"devices.{kind.role}"
+    rows = [
+        ("place in the configuration", f"`{place}`"),
+        ("`kind`", f"`{kind.name}`"),
+        ("publishes", writes),
+        ("reads", reads),
+        ("line", f"{kind.baud} baud" if kind.baud and kind.asked == "port" else ""),
+        ("code", f"`{kind.package}`"),
+    ]
+    return table(("", " "), [row for row in rows if row[1]])
+
+
+def _topics(kind: Kind, driver: type[Any], port: str) -> str:
+    """Topics whose messages go through the ``port`` s of a driver's constructor."""
+    models = {
+        get_args(end)[0]
+        for hint in get_type_hints(driver.__init__).values()
+        for end in (hint, *get_args(hint))
+        if getattr(get_origin(end), "__name__", "") == port
+    }
+    writers = {"Publisher": {"driver"}, "Subscription": {"gate", "planner", "driver"}}[port]
+    fitting = [topic for topic in TOPICS if topic.model in models and topic.writer in writers]
+    own = [topic for topic in fitting if topic.name.partition("/")[2].startswith(kind.role)]
+    first = {topic.model: topic for topic in reversed(fitting)}  # other shafts' feedback is none of its business
+    found = [topic for topic in fitting if topic in own or topic is first[topic.model]]
+    return ", ".join(f"[`{topic.name}`](../topics/{topic.group}.md#{anchor(topic)})" for topic in found)
+
+
+def _example(kind: Kind) -> str:
+    """What the author's truck says of it."""
+    group = "monitors" if kind.asked == "machine" else "devices"
+    said = load_tree(CONFIG).data.get(group, {}).get(kind.role)
+    if said is None:
+        return ""
+    text = yaml.safe_dump({group: {kind.role: said}}, sort_keys=False, default_flow_style=False)
+    return f"In [truck.yaml](../../configs/truck.yaml):\n\n```yaml\n{text}```"
+
+
+def _settings(models: Definitions) -> list[str]:
+    def link(name: str) -> str:
+        return f"#{name.lower()}"
+
+    parts = [plain(models.root.get("description", "")), models.fields(models.root, link)]
+    held: dict[str, list[str]] = {}
+    waiting = [models.root]
+    while waiting:
+        for key, field in waiting.pop(0)["properties"].items():
+            for name in models.models_in(field):
+                waiting += [] if name in held else [models[name]]
+                held.setdefault(name, []).append(f"`{key}`")
+    for name, keys in held.items():
+        heading = f"### {', '.join(keys)}: {label(models[name], name)} {{ #{name.lower()} }}"
+        parts += [heading, plain(models[name].get("description", "")), models.fields(models[name], link)]
+    return parts
+
+
+FAULTS = re.compile(r"\s*Faults \(`inject`\): (.*?)(?=\n\n|\Z)", re.DOTALL)
+
+
+def _without_faults(docstring: str | None) -> str:
+    return FAULTS.sub("", prose(docstring))
+
+
+def _faults(emulator: Any) -> str:
+    """What an emulator, or its ``inject``, says of its faults.
+
+    Raises:
+        ValueError: neither does.
+    """
+    in_class = FAULTS.search(prose(emulator.__doc__))
+    if in_class is not None:
+        return in_class[1]
+    said = prose(emulator.inject.__doc__).partition("\n\n")[2]
+    if not said:
+        raise ValueError(f"{emulator.__name__}: neither the class nor `inject` lists its faults")
+    return said

@@ -1,0 +1,68 @@
+"""The documentation's command lines that need a running truck: all of them on one, in the order of the pages."""
+
+import asyncio
+import os
+import pty
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.wall_kit import ROOT, Robot, command, robot
+from tests.unit.docs.command_lines import INSTEAD, Line, needs_truck, ours, starts_truck
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+
+
+async def test_every_line_on_a_running_truck(tmp_path: Path):
+    started = {Path(line.arguments[line.arguments.index("--config") + 1]) for line in ours() if starts_truck(line)}
+    assert started == {Path("configs/emulated.yaml")}, "start the others here as well"
+    async with robot(tmp_path, base=ROOT / started.pop()) as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        async with made.client():
+            pass
+        for line in ours():
+            if needs_truck(line):
+                await _follow(line, made)
+
+
+async def _follow(line: Line, made: Robot) -> None:
+    instead = INSTEAD.get(line.text)
+    if instead is not None and instead.line is None:
+        return
+    arguments = Line(line.place, instead.line if instead and instead.line else line.text).arguments
+    arguments += ["--endpoint", made.endpoint]
+    if arguments[0] == "drive":
+        assert await _at_a_terminal(arguments, b"q") == 0
+        return
+    done = await command(*arguments)
+    assert done.returncode == 0, f"{line.place}: {line.text}: {done.stderr}"
+
+
+async def _at_a_terminal(arguments: list[str], keys: bytes) -> int:
+    """Start a command before a terminal, press keys once it shows something, wait for its end."""
+    user, program = pty.openpty()
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "monstertruckd", *arguments),
+        **dict.fromkeys(("stdin", "stdout", "stderr"), program),
+        cwd=ROOT,
+        env=os.environ | {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"},
+        start_new_session=True,
+    )
+    os.close(program)
+    shown = asyncio.to_thread(_read_all, user, keys)
+    try:
+        async with asyncio.timeout(60):
+            await shown
+            return await process.wait()
+    finally:
+        os.close(user)
+
+
+def _read_all(terminal: int, keys: bytes) -> None:
+    try:
+        while os.read(terminal, 65536):
+            os.write(terminal, keys)
+    except OSError:  # how a pty says that the program is gone
+        return

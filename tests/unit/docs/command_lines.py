@@ -1,0 +1,167 @@
+"""The command lines of README, CONTRIBUTING and docs, and how a test runs each."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from monstertruckd.cli.main import app
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGES = (
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(page for page in sorted((ROOT / "docs").rglob("*.md")) if "site" not in page.parent.parts),
+)
+PROGRAMS = r"(?:[\w./]*/)?(?:monstertruckd|mkdocs|pip|python3?|systemctl|journalctl|pre-commit|lint-imports)"
+SHELL = re.compile(rf"(?:sudo )?{PROGRAMS} (?=[\w-])(?:[^ ].*)")
+INLINE = re.compile(r"`((?:monstertruckd [^`]+)|(?:(?:python )?benchmarks/[^`]+))`")
+
+
+@dataclass(frozen=True, slots=True)
+class Instead:
+    """What is run in place of a line."""
+
+    line: str | None
+    """None = it is only looked up: command and options have to be there."""
+    why: str
+    code: int | None = 0
+    """None = any that is the exit code of a reason."""
+
+
+MOVES = "drives for minutes; tests/daemon/test_calibration_virtual.py does it on the virtual clock"
+SYSTEM = "needs root"
+
+INSTEAD = {
+    "monstertruckd log view logs/run-000001-000.mcap": Instead(
+        "monstertruckd log view logs/run-000001-000.mcap --save shown.rrd", "opens a window and stays"
+    ),
+    "monstertruckd install-service --config configs/truck.yaml --start": Instead(
+        "monstertruckd install-service --config configs/truck.yaml --start --root system --dry-run", SYSTEM
+    ),
+    "monstertruckd install-service --start": Instead(
+        "monstertruckd install-service --start --root system --dry-run", SYSTEM
+    ),
+    "monstertruckd uninstall-service": Instead("monstertruckd uninstall-service --root system --dry-run", SYSTEM),
+    "monstertruckd doctor": Instead("monstertruckd doctor --root system", "looks at this computer", code=None),
+    "monstertruckd usb --local": Instead("monstertruckd usb --local", "looks at this computer", code=None),
+    "monstertruckd find-port lidar --write configs/truck.yaml": Instead(
+        None, "waits for a hand at a cable; tests/daemon/test_usb_wall.py pulls an emulated one"
+    ),
+    "monstertruckd probe lidar --port /dev/ttyACM0": Instead(
+        None, "needs the device; tests/daemon/test_commands_wall.py probes its emulator"
+    ),
+    "monstertruckd calibrate battery": Instead(
+        "monstertruckd calibrate battery --yes --answer meter=24.2 --answer another=no", "asks somebody"
+    ),
+    "monstertruckd calibrate drive": Instead(None, MOVES),
+    "monstertruckd calibrate drive --sign-only": Instead(None, MOVES),
+    "monstertruckd calibrate steering": Instead(None, MOVES),
+    "monstertruckd calibrate steering --rough": Instead(None, MOVES),
+    "monstertruckd calibrate compass": Instead(None, MOVES),
+}
+FOREIGN = {
+    "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
+    "python3 -m monstertruckd.bootstrap check": "runs this very test",
+    "mkdocs build -f docs/site/mkdocs.yml": "test_site.py builds it into another folder",
+    "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
+    "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
+    "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",
+}
+"""Lines that are no command of ours: why they are not run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One command line of a page, without ``sudo``, folders of programs, and comments."""
+
+    place: str
+    text: str
+
+    @property
+    def arguments(self) -> list[str]:
+        return shlex.split(self.text)[1:]
+
+
+def lines() -> list[Line]:
+    """Every command line in a code block, each once."""
+    found: dict[str, Line] = {}
+    for page in PAGES:
+        for number, text in _code(page.read_text(encoding="utf-8")):
+            if SHELL.fullmatch(text):
+                plain = re.sub(rf"^(?:sudo )?({PROGRAMS})", lambda m: Path(m[1]).name, text.partition("  #")[0].strip())
+                found.setdefault(plain, Line(f"{page.relative_to(ROOT)}:{number}", plain))
+    return list(found.values())
+
+
+def _code(text: str) -> Iterator[tuple[int, str]]:
+    """Numbered lines of indented blocks and of blocks between fences."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith("```"):
+            fenced = not fenced
+        elif fenced or line.startswith("    "):
+            yield number, line.strip()
+
+
+def inline() -> list[tuple[str, str]]:
+    """Every command named within a sentence, with its page."""
+    return [
+        (page.name, found)
+        for page in PAGES
+        if page.name != "CHANGELOG.md"
+        for found in INLINE.findall(page.read_text(encoding="utf-8"))
+    ]
+
+
+def ours() -> list[Line]:
+    """Lines that begin with our own command."""
+    return [line for line in lines() if line.text.startswith("monstertruckd ")]
+
+
+def needs_truck(line: Line) -> bool:
+    """Whether a running daemon has to answer."""
+    command, _ = resolve(line.arguments)
+    return "--endpoint" in options_of(command) and command.name != "replay"
+
+
+def starts_truck(line: Line) -> bool:
+    """Whether it is one of the two processes of an emulated truck."""
+    return line.arguments[0] in {"run", "simulate"}
+
+
+def resolve(words: list[str]) -> tuple[Any, list[str]]:
+    """Command, and the words behind its name.
+
+    Raises:
+        LookupError: no such command.
+    """
+    command: Any = typer.main.get_command(app)
+    rest = list(words)
+    while hasattr(command, "commands"):
+        if not rest or rest[0] not in command.commands:
+            raise LookupError(f"no command {' '.join(words)}")
+        command = command.commands[rest.pop(0)]
+    return command, rest
+
+
+def options_of(command: Any) -> set[str]:
+    return {flag for parameter in command.params for flag in (*parameter.opts, *parameter.secondary_opts)} | {"--help"}
+
+
+def commands_of(group: Any) -> list[tuple[str, ...]]:
+    """Names of all commands that are shown."""
+
+    def walk(command: Any, name: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        if not hasattr(command, "commands"):
+            if not command.hidden:
+                yield name
+            return
+        for word, inner in command.commands.items():
+            yield from walk(inner, (*name, word))
+
+    return list(walk(typer.main.get_command(group), ()))

@@ -1,0 +1,110 @@
+"""Every command line of the documentation does what it says; those on a running truck are in test_docs_wall.py."""
+
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.cli.main import app
+from tests.unit.docs.command_lines import (
+    FOREIGN,
+    INSTEAD,
+    ROOT,
+    Line,
+    commands_of,
+    inline,
+    lines,
+    needs_truck,
+    options_of,
+    ours,
+    resolve,
+    starts_truck,
+)
+
+GOLDEN = ROOT / "tests" / "data" / "golden" / "0.1.0" / "run.mcap"
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the documentation's lines find what they name."""
+    folder = tmp_path_factory.mktemp("desk")
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    for logs in (folder / "logs", folder / "runs" / "demo" / "logs"):
+        logs.mkdir(parents=True)
+        shutil.copy(GOLDEN, logs / "run-000001-000.mcap")
+    installed = CliRunner().invoke(
+        app, ["install-service", "--config", str(ROOT / "configs" / "truck.yaml"), "--root", str(folder / "system")]
+    )
+    assert installed.exit_code == 0, installed.output
+    return folder
+
+
+def test_the_pages_have_command_lines():
+    assert len(ours()) > 20
+
+
+@pytest.mark.parametrize("line", [line for line in lines() if line not in ours()], ids=lambda line: line.text)
+def test_lines_of_other_programs_are_known(line: Line):
+    assert line.text in FOREIGN, f"{line.place}: say in FOREIGN why {line.text!r} is not run"
+    if extra := re.search(r"monstertruckd\[(\w+)\]", line.text):
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        assert extra[1] in project["optional-dependencies"]
+    if "ctl " in line.text:
+        assert (ROOT / "systemd" / "monstertruckd.service").is_file()
+
+
+@pytest.mark.parametrize(
+    "line", [line for line in ours() if not needs_truck(line) and not starts_truck(line)], ids=lambda line: line.text
+)
+def test_it_runs(line: Line, desk: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(desk)
+    instead = INSTEAD.get(line.text)
+    if instead is not None and instead.line is None:
+        _look_up(line.text)
+        return
+    arguments = Line(line.place, instead.line).arguments if instead and instead.line else line.arguments
+    done = CliRunner().invoke(app, arguments)
+    assert not isinstance(done.exception, Exception), done.exception
+    if instead is not None and instead.code is None:
+        assert done.exit_code in {reason.exit_code for reason in Reason} - {Reason.INTERNAL.exit_code}, done.output
+    else:
+        assert done.exit_code == (0 if instead is None else instead.code), f"{line.place}: {done.output}"
+
+
+def test_nothing_is_replaced_that_is_not_there():
+    there = {line.text for line in lines()}
+    assert there >= INSTEAD.keys()
+    assert there >= FOREIGN.keys()
+
+
+@pytest.mark.parametrize(("page", "text"), sorted(set(inline())), ids=lambda word: word)
+def test_what_sentences_name_is_there(page: str, text: str):
+    if "benchmarks/" in text:
+        assert (ROOT / text.removeprefix("python ").split()[0]).is_file(), page
+    else:
+        _look_up(text)
+
+
+def _look_up(text: str) -> None:
+    words = text.split()[1:]
+    if words[0] == "--install-completion":
+        return
+    command, rest = resolve([word for word in words if not word.endswith(">")] if "<" in text else words)
+    options = {word.partition("=")[0] for word in rest if re.match(r"--?[a-z]", word)}
+    assert options <= options_of(command), (text, options - options_of(command))
+
+
+def test_the_readme_names_every_command_and_no_other():
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    named: set[str] = set()
+    for call in re.findall(r"`([^`]+)`", " ".join(row.replace("\\|", "/") for row in rows)):
+        first, *rest = call.split()
+        named |= {f"{first} {word}" for word in rest[0].split("/")} if rest and "/" in rest[0] else {first}
+    all_names = {" ".join(name) for name in commands_of(app)} | {name[0] for name in commands_of(app)}
+    assert named <= all_names
+    missing = {" ".join(name) for name in commands_of(app) if not {name[0], " ".join(name)} & named}
+    assert not missing

@@ -1,0 +1,79 @@
+"""The documentation site is built without a warning and asks nobody for anything."""
+
+import html.parser
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from monstertruck_schemas.topics import TOPICS
+from monstertruckd.catalog import KINDS
+from monstertruckd.cli.main import app
+from tests.unit.docs.command_lines import commands_of
+
+ROOT = Path(__file__).resolve().parents[3]
+CONFIG = ROOT / "docs" / "site" / "mkdocs.yml"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    build = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", CONFIG, "-d", folder],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},  # an announcement of the theme's makers, no finding
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert build.returncode == 0, build.stderr
+    assert "WARNING" not in build.stderr
+    return folder
+
+
+class Loaded(html.parser.HTMLParser):
+    """What a browser fetches for a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.places: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        names = dict(attrs)
+        if tag == "link" and names.get("rel") not in {"prev", "next", "canonical"}:
+            self.places.add(names.get("href") or "")
+        elif tag in {"script", "img", "iframe", "source"}:
+            self.places.add(names.get("src") or "")
+
+
+def test_no_page_fetches_anything_from_elsewhere_or_that_is_not_there(site: Path):
+    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    assert len(pages) > 80
+    for page in pages:
+        loaded = Loaded()
+        loaded.feed(page.read_text())
+        for place in loaded.places - {""}:
+            assert "//" not in place, (page, place)
+            assert (page.parent / place.partition("?")[0]).resolve().is_file(), (page, place)
+
+
+def test_every_device_command_and_topic_has_its_place(site: Path):
+    for kind in KINDS:
+        text = (site / "devices" / f"{kind.name}.html").read_text()
+        for heading in ("Settings", "Probe", "Emulator", "Faults"):
+            assert f'id="{heading.lower()}"' in text, (kind.name, heading)
+    for name in commands_of(app):
+        assert (site / "commands" / f"{'-'.join(name)}.html").is_file(), name
+    for topic in TOPICS:
+        text = (site / "topics" / f"{topic.group}.html").read_text()
+        assert topic.key("&lt;robot&gt;") in text
+
+
+def test_what_was_never_tried_is_gathered_and_code_is_shown(site: Path):
+    text = (site / "never-tried.html").read_text()
+    assert "no byte has gone to a real" in text
+    assert "Any of this on the truck" in text
+    assert 'class="k">def</span>' in (site / "writing-a-driver.html").read_text()
+    assert not [page for page in site.rglob("*.html") if "source: monstertruck" in page.read_text()]
