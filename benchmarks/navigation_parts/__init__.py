@@ -23,10 +23,12 @@ class Part:
     goals: dict[str, float] = field(default_factory=dict)
 
     def add(self, name: str, figure: float, goal: float | None = None) -> None:
+        """Note a figure, and its goal if it has one."""
         self.figures[name] = round(figure, 6)
         if goal is not None:
             self.goals[name] = goal
 
     @property
     def met(self) -> bool:
+        """Whether every goal is kept."""
         return all(self.figures[name] <= goal for name, goal in self.goals.items())

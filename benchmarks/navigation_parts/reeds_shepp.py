@@ -4,10 +4,10 @@ import math
 import time
 
 import numpy as np
-from navigation_parts import Options, Part
 from ompl import base as ob
 
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
+from navigation_parts import Options, Part
 
 PAIRS, PATHS, RADIUS = 10_000, 400, 0.757
 

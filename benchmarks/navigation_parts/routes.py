@@ -8,22 +8,23 @@ import json
 import math
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from navigation_parts import Options, Part, strict
 from numba import njit
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 from scipy.ndimage import distance_transform_edt
 
-from monstertruck_runtime.map_files import load_map
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
+from navigation_parts import Options, Part, strict
 
 RADIUS_4WS, CRAB = 0.378, 0.4
 RUNS = 7
@@ -119,7 +120,7 @@ def judged(result, world, planner, query: Query, tolerance) -> dict:  # noqa: AN
 
 def refuse(part: Part, name: str, planner, ground, query: Query, world) -> None:  # noqa: ANN001
     """Bad goals: which reason, and after which time."""
-    wall = np.array(shapely_centre(world))
+    wall = np.array(middle_of_a_square(world))
     worst = 0.0
     for goal, reasons in (
         ((*wall, 0.0), {Reason.GOAL_BLOCKED}),
@@ -134,7 +135,7 @@ def refuse(part: Part, name: str, planner, ground, query: Query, world) -> None:
     part.add(f"refused_ms_{name}", worst * 1e3, 100.0)
 
 
-def shapely_centre(world):  # noqa: ANN001, ANN201
+def middle_of_a_square(world):  # noqa: ANN001, ANN201
     box = world.squares[len(world.squares) // 2].bounds
     return (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
 
@@ -229,7 +230,7 @@ def turns(space, path) -> int:  # noqa: ANN001
     """Changes of direction along a path of Reeds-Shepp motions, seen at many points."""
     states, between = path.getStates(), [space.allocState(), space.allocState()]
     signs = []
-    for a, b in zip(states[:-1], states[1:], strict=True):
+    for a, b in pairwise(states):
         count = max(int(space.distance(a, b) / 0.02), 1)
         space.interpolate(a, b, 0.0, between[0])
         for k in range(1, count + 1):
@@ -244,10 +245,10 @@ def turns(space, path) -> int:  # noqa: ANN001
 
 def draw(options: Options, rows: list[dict]) -> None:
     """The routes on their maps."""
-    import matplotlib as mpl
+    import matplotlib as mpl  # noqa: PLC0415
 
     mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib import pyplot as plt  # noqa: PLC0415
 
     for name in dict.fromkeys(row["map"] for row in rows):
         occupied, resolution = read(options.data / "maps" / f"{name}.yaml")

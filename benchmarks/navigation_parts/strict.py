@@ -1,7 +1,7 @@
 """A strict judge of routes, of shapely polygons, that shares no code with any planner.
 
 It integrates a path's segments itself, takes a pose every centimetre and both ends of every segment, and looks for
-overlaps of the footprint's polygons with the squares of occupied cells, unknown cells and everything off the map included.
+overlaps of the footprint's polygons with the squares of occupied cells, unknown ones and all off the map included.
 """
 
 import math
