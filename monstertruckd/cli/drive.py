@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from monstertruckd.cli.driving_modes import SPEEDS, SteeringMode
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption
 from monstertruckd.cli.output import until_stopped
-from monstertruckd.cli.teleop import SPEEDS, SteeringMode, Teleop
 
 
 def drive(
@@ -30,6 +30,7 @@ def drive(
     """
     from monstertruck_runtime.errors import InputError
     from monstertruckd.cli.drive_session import DriveSession
+    from monstertruckd.cli.teleop import Teleop
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise InputError("drive reads keys as they are held: it needs a terminal")

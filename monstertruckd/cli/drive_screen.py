@@ -11,8 +11,9 @@ from rich.text import Text
 
 from monstertruck_schemas.state import GateMode
 from monstertruckd.cli import screen
+from monstertruckd.cli.driving_modes import SteeringMode
 from monstertruckd.cli.screen import ScreenState
-from monstertruckd.cli.teleop import MODE_KEYS, STEPS, SteeringMode, Teleop, Wish
+from monstertruckd.cli.teleop import MODE_KEYS, STEPS, Teleop, Wish
 
 HELP = "Enter arm  WASD drive  space stop  e E-STOP  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}

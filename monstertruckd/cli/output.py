@@ -19,7 +19,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from pydantic import BaseModel
 from typer.core import TyperGroup
 
 from monstertruck_runtime.clock import WallClock, run_wall
@@ -50,6 +49,8 @@ def print_json(value: Any, *, indent: int | None = 2) -> None:
 
 
 def _plain(value: Any) -> Any:
+    from pydantic import BaseModel
+
     match value:
         case BaseModel():
             return _plain(value.model_dump(mode="json"))

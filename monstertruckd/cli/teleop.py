@@ -7,28 +7,14 @@ even if this program hangs or its link breaks, for nothing renews the lease.
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final, Literal
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
-
-SPEEDS: Final = (0.05, 0.1, 0.15, 0.2, 0.3, 0.5)
-"""m/s."""
+from monstertruckd.cli.driving_modes import SPEEDS, SteeringMode
 
 STEPS: Final = 8
 """Key presses from straight to full lock."""
-
-
-class SteeringMode(StrEnum):
-    """How one steering key moves two axles."""
-
-    FRONT = "front"
-    REAR = "rear"
-    COUNTER = "counter"
-    CRAB = "crab"
-    HYBRID = "hybrid"
-
 
 MODE_KEYS: Final = {str(number): mode for number, mode in enumerate(SteeringMode, start=1)}
 

@@ -1,0 +1,17 @@
+"""What ``drive`` offers at the command line, light enough for ``--help``."""
+
+from enum import StrEnum
+from typing import Final
+
+SPEEDS: Final = (0.05, 0.1, 0.15, 0.2, 0.3, 0.5)
+"""m/s."""
+
+
+class SteeringMode(StrEnum):
+    """How one steering key moves two axles."""
+
+    FRONT = "front"
+    REAR = "rear"
+    COUNTER = "counter"
+    CRAB = "crab"
+    HYBRID = "hybrid"
