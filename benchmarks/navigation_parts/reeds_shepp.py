@@ -50,13 +50,11 @@ def run(options: Options) -> Part:
     part.add("path_us", min(mine) * 1e6)
     part.add("path_ompl_us", min(script) * 1e6)
     part.add("path_over_ompl", min(mine) / min(script), 0.3)
-    print(
-        f"Reeds-Shepp: difference {difference.max():.1e} m on {PAIRS} pairs; distance {part.figures['distance_us']:.2f} us, "
-    )
-    print(
-        f"  with crab {part.figures['distance_4ws_us']:.2f}, ompl {part.figures['distance_ompl_us']:.2f}; sampled path "
-    )
-    print(f"  {part.figures['path_us']:.0f} us, ompl {part.figures['path_ompl_us']:.0f} us")
+    figures = part.figures
+    print(f"Reeds-Shepp: difference {difference.max():.1e} m on {PAIRS} pairs")
+    print(f"  distance {figures['distance_us']:.2f} us, with crab {figures['distance_4ws_us']:.2f} us")
+    print(f"  ompl {figures['distance_ompl_us']:.2f} us")
+    print(f"  sampled path {figures['path_us']:.0f} us, ompl {figures['path_ompl_us']:.0f} us")
     return part
 
 
