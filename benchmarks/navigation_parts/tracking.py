@@ -170,6 +170,7 @@ def drive(
             "reverse_speed": speed,
             "min_speed": 0.05,
             "deceleration": 0.5,
+            "acceleration": 1.0,
             "angle": 0.6,
             "steering": "front",
             "dead_time": dead_time,
@@ -288,10 +289,10 @@ def four_wheels(part: Part, arcs: np.ndarray) -> None:
 
 
 def draw(options: Options, table: dict, courses: dict) -> None:
-    import matplotlib as mpl
+    import matplotlib as mpl  # noqa: PLC0415
 
     mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib import pyplot as plt  # noqa: PLC0415
 
     figure, axes = plt.subplots(len(courses), 3, figsize=(18, 6 * len(courses)), squeeze=False)
     for row, (course, points) in zip(axes, courses.items(), strict=True):

@@ -42,6 +42,8 @@ class TrackerConfig(Schema):
     """Backward, m/s."""
     min_speed: Positive = 0.03
     """Slowest speed before a stop, m/s."""
+    acceleration: Positive = 0.3
+    """With which the truck is taken to gain speed, m/s^2."""
     deceleration: Positive = 0.1
     """Deceleration before curves, the end of the path and where the direction changes, m/s^2."""
     lateral_acceleration: Positive = 0.5

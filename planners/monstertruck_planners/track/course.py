@@ -3,7 +3,7 @@
 Headings come from chords, so points rounded to millimetres do not shake the wheels. A truck with one way of steering
 turns about the line through the point ``a`` of its middle that never slips sideways: the fixed axle's, or the middle
 between two axles that counter-steer. There sin(sideslip of C) = -a * turn, hence its heading follows that of the path
-through a first-order lag of the length \\|a\\|; where that point leads, the lag runs against the travel.
+through a first-order lag as long as ``a`` is from C; where that point leads, the lag runs against the travel.
 """
 
 import math

@@ -8,6 +8,9 @@ import math
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.actuator import Angles, Axles, Pose
@@ -18,6 +21,8 @@ from monstertruck_planners.track.line import Foot, Line, Progress, Run
 from monstertruck_planners.track.speed import wanted_speed
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
+
+Array = NDArray[np.float64]
 
 C = TypeVar("C", bound=TrackerConfig)
 
@@ -37,6 +42,10 @@ class Here:
     """Of the axles, rad."""
     speed: float
     """Forward, m/s; at least ``min_speed`` in size."""
+    wanted: float
+    """Speed that will be asked for, m/s."""
+    acceleration: float
+    """With which it is reached, m/s^2."""
     run: Run
     course: Course
     s: float
@@ -47,6 +56,17 @@ class Here:
     reference: Reference
     turned: float
     """Yaw less the reference's, rad."""
+
+    def speeds(self, times: Array) -> Array:
+        """Forward speed after ``times`` seconds: gained, never lost, as braking depends on what lies ahead."""
+        size, most = abs(self.speed), max(abs(self.wanted), abs(self.speed))
+        return self.run.direction * np.minimum(size + self.acceleration * times, most)
+
+    def ways(self, times: Array) -> Array:
+        """Metres from the run's beginning after ``times`` seconds."""
+        size, most = abs(self.speed), max(abs(self.wanted), abs(self.speed))
+        gaining = np.minimum(times, (most - size) / self.acceleration)
+        return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
 
 
 class Law(Generic[C]):
@@ -100,13 +120,13 @@ class Law(Generic[C]):
             angles = self.axles.asked  # coming to rest at a cusp
         speed = 0.0
         if outcome is Reason.DRIVING and not ended and not self._turning_at_rest(state, angles):
-            speed = self.speed(state, here, foot)
+            speed = self.speed(here)
         self.axles.ask(t, angles)
         return self._command(state, run, foot, here, speed, angles, Progress(progress.run, foot.s), outcome)
 
-    def speed(self, state: TruckState, here: Here, foot: Foot) -> float:
-        """Wanted speed, m/s."""
-        return wanted_speed(self.config, state, here.run, here.course, foot.s)
+    def speed(self, here: Here) -> float:
+        """Speed to ask for, m/s."""
+        return here.wanted
 
     def limited(self, steering: Steering, front: float, rear: float) -> Angles:
         """Angles within the limits of a way of steering."""
@@ -150,6 +170,8 @@ class Law(Generic[C]):
             pose=pose,
             angles=angles,
             speed=speed or run.direction * self.config.min_speed,
+            wanted=wanted_speed(self.config, state, run, course, s),
+            acceleration=self.config.acceleration,
             run=run,
             course=course,
             s=foot.s,

@@ -46,12 +46,14 @@ class Lqr(Law[LqrConfig]):
     def __init__(self, config: LqrConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
         self._periods = max(math.ceil(config.preview * config.rate), 1)
+        self._times = (np.arange(self._periods * BETWEEN, dtype=np.float64) + 0.5) * (self.period / BETWEEN)
+        self._soon = self._times[: max(len(self._times) // 3, 1)]
         self._gains: dict[tuple[Steering, bool, int], Gains] = {}
 
     def steer(self, here: Here) -> Angles:
         """Axle angles for the coming period."""
         basis = BASES[here.steering]
-        gains = self._at(here.steering, here.speed)
+        gains = self._at(here.steering, float(here.speeds(self._soon).mean()))
         onto = np.linalg.pinv(basis)
         axles = onto @ np.tan(here.angles)
         asked = onto @ np.tan(self.axles.asked)
@@ -63,8 +65,7 @@ class Lqr(Law[LqrConfig]):
 
     def _reference(self, here: Here) -> Array:
         """Slip and turn of the coming periods, shape (2 k,)."""
-        step = abs(here.speed) * self.period / BETWEEN
-        ahead = here.course.at(here.s + step * (np.arange(self._periods * BETWEEN) + 0.5))
+        ahead = here.course.at(here.ways(self._times))
         if here.steering == "crab":
             slip = np.remainder(ahead.heading - here.pose[2] + math.pi, math.tau) - math.pi
             slip, turn = np.clip(slip, -1.0, 1.0), np.zeros_like(slip)

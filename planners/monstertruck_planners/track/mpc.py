@@ -55,7 +55,9 @@ class Mpc(Law[MpcConfig]):
         per = max(math.ceil(self.period / FINE - 1e-9), 1)
         self._h = self.period / per
         self._fine = self._periods * per
-        self._lag, self._fading = self._responses(per)
+        self._times = (np.arange(self._periods, dtype=np.float64) + 0.5) * self.period
+        self._middles = (np.arange(self._fine, dtype=np.float64) + 0.5) * self._h
+        self._lag, self._fading = self._responses()
         self._solvers: dict[int, Solver] = {}
         self._plan: Array | None = None
         self._planned: tuple[Steering, ...] = ()
@@ -68,12 +70,11 @@ class Mpc(Law[MpcConfig]):
 
     def steer(self, here: Here) -> Angles:
         """Axle angles for the coming period."""
-        step = abs(here.speed) * self.period
-        modes = tuple(here.course.steerings(here.s + step * (np.arange(self._periods) + 0.5)))
+        modes = tuple(here.course.steerings(here.ways(self._times)))
         modes = (here.steering, *modes[1:])
         bases = self._bases(modes)
         last = np.linalg.pinv(bases[0]) @ np.array(self.axles.asked)
-        fine = here.course.at(here.s + step * (np.arange(self._fine) + 0.5) / (self._fine / self._periods))
+        fine = here.course.at(here.ways(self._middles))
         nominal = self._nominal(here, modes, bases)
         rollout = self._roll(here, fine, bases, nominal)
         weights = self._weights(modes)
@@ -93,18 +94,18 @@ class Mpc(Law[MpcConfig]):
         old = self._plan
         if old is not None and old.shape == (len(modes), bases.shape[2]) and self._planned[1] == modes[0]:
             return np.vstack((old[1:], old[-1:]))
-        ahead = here.course.at(here.s + abs(here.speed) * self.period * (np.arange(self._periods) + 0.5))
+        ahead = here.course.at(here.ways(self._times))
         asked = np.column_stack(self.geometry.steer_for(ahead.turn, np.clip(ahead.slip, -1.0, 1.0)))
         inputs = np.array([np.linalg.pinv(basis) @ both for basis, both in zip(bases, asked, strict=True)])
-        return np.clip(inputs, -self.config.angle, self.config.angle)
+        return np.asarray(np.clip(inputs, -self.config.angle, self.config.angle))
 
-    def _responses(self, per: int) -> tuple[Array, Array]:
+    def _responses(self) -> tuple[Array, Array]:
         """Axle angle in the middle of each fine step, by the requests (f, k) and by the present angle (f,)."""
-        middle = (np.arange(self._fine) + 0.5) * self._h
-        begin = np.arange(self._periods) * self.period
+        middle = self._middles
+        begin = np.arange(self._periods, dtype=np.float64) * self.period
         lag = max(self.config.lag, LEAST_LAG)
         risen = [1.0 - np.exp(-np.maximum(middle[:, None] - b, 0.0) / lag) for b in (begin, begin + self.period)]
-        return risen[0] - risen[1], np.exp(-middle / lag)
+        return risen[0] - risen[1], np.asarray(np.exp(-middle / lag))
 
     def _roll(self, here: Here, reference: Reference, bases: Array, plan: Array) -> Rollout:
         asked = np.einsum("kij,kj->ki", bases, plan)
@@ -118,22 +119,22 @@ class Mpc(Law[MpcConfig]):
         errors = self._integrate(here, reference, turn, np.arctan(slip_tangent))
         # One column of axle angles per input, then sums along the way.
         effect = np.einsum("fk,kij->fikj", self._lag, bases).reshape(self._fine, 2, -1) * slopes[:, :, None]
-        ahead = self._h * here.speed
-        by_turn = ahead * np.cumsum((cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
+        ahead = (self._h * here.speeds(self._middles))[:, None]
+        by_turn = np.cumsum(ahead * (cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
         halfway = by_turn - 0.5 * np.diff(by_turn, axis=0, prepend=0.0)
         by_slip = (cosine**2)[:, None] * ((1.0 - c) * effect[:, 0] + c * effect[:, 1])
-        by_side = ahead * np.cumsum(halfway + by_slip, axis=0)
+        by_side = np.cumsum(ahead * (halfway + by_slip), axis=0)
         return Rollout(errors, np.vstack((by_side, by_turn)))
 
     def _integrate(self, here: Here, reference: Reference, turn: Array, slip: Array) -> Array:
         """Errors along the plan in the path's curved frame."""
-        furthest = APPROACH * abs(here.speed) * self.period * self._periods
+        furthest = APPROACH * float(here.ways(self._times[-1:])[0] - here.s)
         side, turned = min(max(here.offset, -furthest), furthest), here.turned
-        ahead = self._h * here.speed
+        steps = self._h * here.speeds(self._middles)
         bend = here.run.direction * reference.curvature
         sides, yaws = [], []
-        rows = np.column_stack((turn, slip - reference.slip, reference.turn, bend)).tolist()
-        for body_turn, beside, wanted_turn, curvature in rows:
+        rows = np.column_stack((turn, slip - reference.slip, reference.turn, bend, steps)).tolist()
+        for body_turn, beside, wanted_turn, curvature, ahead in rows:
             along = math.cos(turned + beside) / max(1.0 - curvature * side, 0.2)
             gained = ahead * (body_turn - wanted_turn * along)
             side += ahead * math.sin(turned + 0.5 * gained + beside)

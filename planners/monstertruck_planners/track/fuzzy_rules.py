@@ -1,0 +1,133 @@
+"""Rules of rsband_local_planner's path tracker: Takagi-Sugeno of order 0, as published or corrected.
+
+AND is min, rules with one conclusion are joined by max, the outcome is the weighted mean. Angles in degrees, left
+positive. Corrected are: the lopsided "front right" orientation; backing up close to the sub-goal straight (no rule
+fired); the sideways angle, which fell back to 0 for large offsets and had the wrong sign backwards.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+Membership = Callable[[float], float]
+
+SHARES: Final = {"RH": -1.0, "RL": -0.5, "Z": 0.0, "LL": 0.5, "LH": 1.0}
+"""Steering terms as shares of the greatest angle."""
+
+FAR_TURNS: Final = {
+    "RBL": "Z", "RL": "LH", "SL": "LH", "FL": "LL", "FA": "Z", "FR": "RL", "SR": "RH", "RR": "RH", "RBR": "Z",
+}  # fmt: skip
+"""Front steering by the sub-goal's bearing, far from it."""
+CLOSE_TURNS: Final = {"SL": "LH", "FL": "LL", "FA": "Z", "FR": "RL", "SR": "RH"}
+"""Front steering by the sub-goal's orientation, close to it and forward; backward left and right change places."""
+OPPOSITE: Final = {"LH": "RH", "LL": "RL", "Z": "Z", "RL": "LL", "RH": "LH"}
+
+
+def trapezoid(a: float, b: float, c: float, d: float) -> Membership:
+    """0 up to a, 1 from b to c, 0 from d on."""
+
+    def membership(x: float) -> float:
+        rising = 1.0 if x >= b else (x - a) / (b - a) if x > a else 0.0
+        falling = 1.0 if x <= c else (d - x) / (d - c) if x < d else 0.0
+        return min(rising, falling)
+
+    return membership
+
+
+BEARINGS: Final = {
+    "RBR": trapezoid(-181, -180, -175, -165),
+    "RR": trapezoid(-175, -165, -130, -120),
+    "SR": trapezoid(-130, -120, -35, -25),
+    "FR": trapezoid(-35, -25, -15, -5),
+    "FA": trapezoid(-15, -5, 5, 15),
+    "FL": trapezoid(5, 15, 25, 35),
+    "SL": trapezoid(25, 35, 120, 130),
+    "RL": trapezoid(120, 130, 165, 175),
+    "RBL": trapezoid(165, 175, 180, 181),
+}
+PUBLISHED_ORIENTATIONS: Final = BEARINGS | {"FR": trapezoid(-40, -30, -15, -10)}
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The sub-goal seen from the truck."""
+
+    bearing: float
+    """Deg."""
+    orientation: float
+    """Deg."""
+    distance: float
+    """M."""
+    aside: float
+    """To the left, m."""
+    direction: float
+    """+1 forward, -1 backward."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Shares of the greatest values; None where no rule fired."""
+
+    speed: float | None
+    front: float | None
+    sideways: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """One rule base.
+
+    Args:
+        near: up to here the sub-goal is close, from twice as much on far, m.
+        tolerance: lateral deviation called small, m.
+        published: with its slips.
+    """
+
+    near: float
+    tolerance: float
+    published: bool
+
+    def infer(self, inputs: Inputs) -> Outputs:
+        """Outputs by all rules."""
+        far = min(max(inputs.distance / self.near - 1.0, 0.0), 1.0)
+        close = 1.0 - far
+        return Outputs(
+            speed=mean([(close, 0.5), (far, 1.0)]),
+            front=mean(self._front(inputs, close, far)),
+            sideways=mean(self._sideways(inputs)),
+        )
+
+    def _orientations(self) -> dict[str, Membership]:
+        return PUBLISHED_ORIENTATIONS if self.published else BEARINGS
+
+    def _front(self, inputs: Inputs, close: float, far: float) -> list[tuple[float, float]]:
+        forward = min(max(0.5 + inputs.direction / 0.2, 0.0), 1.0)
+        fired = [(min(far, BEARINGS[term](inputs.bearing)), SHARES[turn]) for term, turn in FAR_TURNS.items()]
+        for term, turn in CLOSE_TURNS.items():
+            fits = min(close, self._orientations()[term](inputs.orientation))
+            fired.append((min(fits, forward), SHARES[turn]))
+            if term != "FA" or not self.published:
+                fired.append((min(fits, 1.0 - forward), SHARES[OPPOSITE[turn]]))
+        return fired
+
+    def _sideways(self, inputs: Inputs) -> list[tuple[float, float]]:
+        orientation = self._orientations()
+        front = max(orientation[term](inputs.orientation) for term in ("FA", "FL", "FR"))
+        t = self.tolerance
+        sign = 1.0 if self.published else inputs.direction
+        small = {1.0: trapezoid(0, t, t, 2 * t), -1.0: trapezoid(-2 * t, -t, -t, 0)}
+        big = {1.0: trapezoid(t, 3 * t, 1e9, 2e9), -1.0: trapezoid(-2e9, -1e9, -3 * t, -t)}
+        fired = [(1.0 - front, 0.0), (min(front, trapezoid(-t, 0, 0, t)(inputs.aside)), 0.0)]
+        for side in (1.0, -1.0):
+            fired.append((min(front, small[side](inputs.aside)), sign * side))
+            fired.append((min(front, big[side](inputs.aside)), 0.0 if self.published else sign * side))
+        return fired
+
+
+def mean(fired: list[tuple[float, float]]) -> float | None:
+    """Weighted mean of conclusions; equal ones count once, with their greatest weight. None if all weights are 0."""
+    weights: dict[float, float] = {}
+    for weight, value in fired:
+        weights[value] = max(weights.get(value, 0.0), weight)
+    total = sum(weights.values())
+    return sum(weight * value for value, weight in weights.items()) / total if total > 0.0 else None
