@@ -1,6 +1,7 @@
 """One page for each kind of device: from the catalog, the settings, and what driver and emulator say of themselves."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -47,6 +48,7 @@ def _page(kind: Kind, habits: str | None) -> Page:
         f"`monstertruckd probe {kind.name}{PROBED[kind.asked]}`: {prose(probe.__doc__)}",
         section(probe.__doc__, "Returns"),
         "## Emulator",
+        prose(sys.modules[emulator.__module__].__doc__).partition("\n\n")[2],
         _without_faults(emulator.__doc__),
         "## Faults",
         _faults(emulator),
