@@ -22,7 +22,8 @@ M = TypeVar("M", bound=Message)
 
 PERIOD: Final = 0.05
 """Seconds between two requests."""
-LEASE: Final = 0.25
+LEASE: Final = 0.5
+"""Asked for, s; the gate grants what it thinks right."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
 STEERING: Final = 1.0

@@ -5,6 +5,7 @@ and a string on the floor shows what neither sees, the crabbing of two axles tha
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -165,6 +166,8 @@ class SteeringWizard:
         self, guide: Guide, model: SteeringModel, legs: list[Leg], first: Maps, travel: "list[Reach]"
     ) -> Result:
         fit = model.fit(legs, first)
+        maps = Maps.from_parameters(fit.parameters)
+        travel = [Reach.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
         halves, share = half_widths(fit), _way_error(guide) + WHEELBASE
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
@@ -219,16 +222,19 @@ class Reach:
 
     half: float
     """Half the 95 % interval of that, rad."""
+    legs: tuple[Leg, ...]
+    """Arcs with the wheels far over."""
 
     @classmethod
-    def of(cls, axle: int, sign: int, legs: list[Leg], model: SteeringModel, maps: Maps) -> "Reach":
-        """From arcs with the wheels far over."""
+    def of(cls, axle: int, sign: int, legs: Sequence[Leg], model: SteeringModel, maps: Maps) -> "Reach":
+        """From arcs with the wheels far over, as far as ``maps`` tell where the other axle stood."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
         angle = float(model.linkages[axle].axle_from_servo(servo))
         noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
-        return cls(axle, sign, servo, angle, stopped, abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE))
+        half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
+        return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
     def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
         """What is told of it, and the limit of the pulse, us, where something stops the wheels.

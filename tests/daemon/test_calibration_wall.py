@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 YARD = ROOT / "configs" / "yard.yaml"
 PATIENT = {
     "gate": {sensor: {"stale_after": 1.5} for sensor in ("scan", "drive", "steering", "attitude")}
-    | {"max_latency": 1.0, "tick_stall": 1.0}
+    | {"max_latency": 1.0, "tick_stall": 1.0, "leases": {"station": 1.0}}
 }
 """A busy computer shall not end what a signal is to end."""
 
