@@ -37,3 +37,11 @@ class MapperConfig:
     """Key scans of a submap at most."""
     neighbours: int = 4
     """Relations from a new key scan to those it overlaps."""
+    fastest: tuple[float, float] = (5.0, 1.0)
+    """Odometry that claims a greater way is not believed, m/s and m besides (stamps come in bursts)."""
+    most_keys: int = 4000
+    """Key scans at most; then the most dispensable go."""
+    thinning: float = 0.1
+    """Share of them that goes at once."""
+    most_scans: int = 200_000
+    """Scans of the trajectory at most; then every second one is forgotten."""

@@ -8,7 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.correlation import RESOLUTION, correlate
+from monstertruck_estimation.slam.correlation import correlate
 from monstertruck_estimation.slam.registration import Fit, register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.submap import Submap
@@ -86,8 +86,16 @@ class Match:
 class FrontEnd(Protocol):
     """Registers scans; may keep a map of its own."""
 
-    def locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
-        """Pose of ``scan`` near ``guess`` (shape (3,), covariance (3, 3)) in the submap's frame."""
+    def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
+        """Pose of ``scan`` in the submap's frame.
+
+        Args:
+            scan: points in base.
+            delta: shape (3,), predicted motion of the base since the last scan.
+            guess: shape (3,), pose predicted by it in the submap's frame.
+            covariance: shape (3, 3), of ``guess``.
+            submap: what is known around.
+        """
         ...
 
 
@@ -98,7 +106,7 @@ class Planar:
     any covariance says; a place found that way must fit better (``LEAST_AFAR``).
     """
 
-    def locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
+    def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
         """See ``FrontEnd``."""
         if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
             return rejected(guess, covariance, Verdict.EMPTY)

@@ -45,6 +45,26 @@ class Edges:
     def __len__(self) -> int:
         return len(self.origin)
 
+    def chosen(self, kept: NDArray[np.bool_]) -> "Edges":
+        """The marked relations."""
+        return Edges(
+            self.origin[kept], self.target[kept], self.measured[kept], self.information[kept], self.loop[kept]
+        )
+
+    def renumbered(self, number: Index) -> "Edges":
+        """The same between poses that are now called ``number[k]``."""
+        return Edges(number[self.origin], number[self.target], self.measured, self.information, self.loop)
+
+    def joined(self, other: "Edges") -> "Edges":
+        """The relations of both."""
+        return Edges(
+            np.concatenate((self.origin, other.origin)),
+            np.concatenate((self.target, other.target)),
+            np.concatenate((self.measured, other.measured)),
+            np.concatenate((self.information, other.information)),
+            np.concatenate((self.loop, other.loop)),
+        )
+
 
 def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
     """Residuals, shape (n, 3), and squared Mahalanobis norms, shape (n,), of ``edges``."""

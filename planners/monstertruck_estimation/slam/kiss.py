@@ -7,13 +7,9 @@ a failure, so every result is registered once more by the common measure (overla
 from typing import Final
 
 import numpy as np
-from kiss_icp.config import KISSConfig
-from kiss_icp.mapping import VoxelHashMap
-from kiss_icp.registration import get_registration
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.frontend import LEAST_PAIRS, Match, Verdict, judge, rejected
-from monstertruck_estimation.slam.registration import register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.submap import Submap
 
@@ -31,40 +27,18 @@ KERNEL: Final = 0.1
 
 
 class Kiss:
-    """See ``FrontEnd``; the map it registers to is the mapper's submap, so loop closures move it too."""
+    """``KissOdometry`` as a front end, judged against the submap."""
 
     def __init__(self) -> None:
-        config = KISSConfig()
-        config.registration.max_num_threads = 1
-        self._registration = get_registration(config)
-        self._submap: Submap | None = None
-        self._map = VoxelHashMap(VOXEL, FARTHEST, PER_VOXEL)
+        self._odometry = KissOdometry()
 
-    def locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
+    def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
         """See ``FrontEnd``."""
         if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
             return rejected(guess, covariance, Verdict.EMPTY)
-        if submap is not self._submap:
-            self._submap = submap
-            self._map.clear()
-            self._map.add_points(_spatial(submap.cloud.points))
-        found = self._registration.align_points_to_map(
-            points=_spatial(scan.points),
-            voxel_map=self._map,
-            initial_guess=_matrix(guess),
-            max_correspondance_distance=REACH,
-            kernel=KERNEL,
-        )
-        pose = np.array((found[0, 3], found[1, 3], np.arctan2(found[1, 0], found[0, 0])))
-        if not np.isfinite(pose).all():
-            return rejected(guess, covariance, Verdict.FAR)
-        # No step is taken: the pose stays kiss-icp's, measured as every other.
-        measured = register(scan, submap.cloud, pose, iterations=0)
-        return judge(measured, guess, covariance)
-
-
-def _spatial(points: Array) -> Array:
-    return np.column_stack((points, np.zeros(len(points))))
+        moved = self._odometry.register(scan.points, delta)
+        pose = compose(compose(guess, inverse(delta)), moved)
+        return judge(measure(scan, submap.cloud, pose), guess, covariance)
 
 
 def _matrix(pose: Array) -> Array:

@@ -51,12 +51,24 @@ class MotionModel:
         """Newest pose of base in odom."""
         return self._odom
 
+    @property
+    def twist(self) -> tuple[float, float, float]:
+        """Velocity of base between the last two scans (vx, vy, wz; m/s, rad/s)."""
+        if self._dt <= 0:
+            return 0.0, 0.0, 0.0
+        vx, vy, wz = (self._delta / self._dt).tolist()
+        return vx, vy, wz
+
     def predict(self, dt: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""
         config = self._config
         known = odom is not None and bool(np.isfinite(odom).all())
+        delta = None
         if known and self._odom is not None:
             delta = between(self._odom, np.asarray(odom, dtype=float))
+            if math.hypot(delta[0], delta[1]) > config.fastest[0] * dt + config.fastest[1]:
+                delta = None
+        if delta is not None:
             way, turned = math.hypot(delta[0], delta[1]), abs(float(delta[2]))
             place = self.factor * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
             by_turn, by_way = config.odometry_turn

@@ -17,6 +17,8 @@ from monstertruck_estimation.slam.store import Key
 
 Array = NDArray[np.float64]
 
+NEIGHBOURS: Final = 2
+"""Key scans before it that each is paired with anyway."""
 PARTNERS: Final = 12
 """Earlier key scans each is paired with, at most."""
 REACH: Final = 4.5
@@ -35,8 +37,8 @@ def partners(poses: Array) -> NDArray[np.int64]:
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
     stretch = np.floor(np.cumsum(steps) / SPACING).astype(np.int64)
     for k in range(1, len(poses)):
-        result += [(j, k) for j in range(max(k - 2, 0), k)]
-        off = between(poses[k], poses[: max(k - 2, 0)])
+        result += [(j, k) for j in range(max(k - NEIGHBOURS, 0), k)]
+        off = between(poses[k], poses[: max(k - NEIGHBOURS, 0)])
         cost = np.hypot(off[:, 0], off[:, 1]) + TURN * np.abs(off[:, 2])
         near = np.flatnonzero(cost < REACH)
         near = near[np.argsort(cost[near], kind="stable")]
@@ -51,7 +53,7 @@ def refine(keys: list[Key], poses: Array, steady: Edges, rounds: int = 8) -> Arr
     for turn in range(rounds):
         reach = CELL if turn < rounds // 2 else CELL / 2
         wishes = _linearised(keys, poses, pairs, reach)
-        moved = optimise(poses, joined(steady, wishes), iterations=3)
+        moved = optimise(poses, steady.joined(wishes), iterations=3)
         change = float(np.abs(between(poses, moved)[:, :2]).max())
         poses = moved
         if change < 5e-4 and reach < CELL:
@@ -62,7 +64,7 @@ def refine(keys: list[Key], poses: Array, steady: Edges, rounds: int = 8) -> Arr
 def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
     """One relation per overlapping pair: where a Gauss-Newton step would take it, and how sure that is."""
     places = between(poses[pairs[:, 0]], poses[pairs[:, 1]])
-    measured, information, kept = np.empty((len(pairs), 3)), np.empty((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
+    measured, information, kept = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs.tolist()):
         h, g, found = normal_equations(keys[j].scan, keys[i].cloud, places[k], reach)
         if found < LEAST_OVERLAP * len(keys[j].scan):
@@ -72,16 +74,5 @@ def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: 
             continue
         measured[k], information[k], kept[k] = places[k] + step, h, True
     measured[:, 2] = wrap(measured[:, 2])
-    pairs = pairs[kept]
-    return Edges(pairs[:, 0], pairs[:, 1], measured[kept], information[kept], pairs[:, 1] - pairs[:, 0] > 2)
+    return Edges(pairs[:, 0], pairs[:, 1], measured, information, pairs[:, 1] - pairs[:, 0] > NEIGHBOURS).chosen(kept)
 
-
-def joined(first: Edges, second: Edges) -> Edges:
-    """The relations of both."""
-    return Edges(
-        np.concatenate((first.origin, second.origin)),
-        np.concatenate((first.target, second.target)),
-        np.concatenate((first.measured, second.measured)),
-        np.concatenate((first.information, second.information)),
-        np.concatenate((first.loop, second.loop)),
-    )

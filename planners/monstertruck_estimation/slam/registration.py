@@ -113,6 +113,11 @@ def register(
     return Fit(pose, information, pairs / total, math.sqrt(stats[1] / max(pairs, 1)), pairs, float(stats[2]))
 
 
+def measure(scan: Scan, cloud: Cloud, pose: Array) -> Fit:
+    """How ``scan`` fits at ``pose``, without moving it."""
+    return register(scan, cloud, pose, iterations=0)
+
+
 def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL) -> tuple[Array, Array, int]:
     """Information (3, 3) and gradient (3,) of a registration at ``pose``, and the number of fitting pairs."""
     h, g, stats = accumulate(

@@ -1,7 +1,7 @@
 """Key scans and the relations between them: arrays that grow, and forget when told to."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.slam.graph import Edges
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.se2 import compose
 
 Array = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ class Rows:
     """Rows of one shape, appended in constant time."""
 
     def __init__(self, *shape: int, dtype: type = float) -> None:
-        self._data = np.zeros((START, *shape), dtype)
+        self._data: NDArray[Any] = np.zeros((START, *shape), dtype)
         self._count = 0
 
     def append(self, row: object) -> None:
@@ -30,14 +31,14 @@ class Rows:
         self._data[self._count] = row
         self._count += 1
 
-    def keep(self, kept: NDArray[np.bool_]) -> None:
-        """Leave only the rows marked in ``kept``."""
-        rows = self.view[kept]
-        self._data[: len(rows)] = rows
-        self._count = len(rows)
+    def set(self, rows: NDArray[Any]) -> None:
+        """Have these rows and no others."""
+        data = np.zeros((max(START, len(rows)), *self._data.shape[1:]), self._data.dtype)
+        data[: len(rows)] = rows
+        self._data, self._count = data, len(rows)
 
     @property
-    def view(self) -> NDArray[np.generic]:
+    def view(self) -> NDArray[Any]:
         """The rows, not copied."""
         return self._data[: self._count]
 
@@ -87,27 +88,67 @@ class EdgeStore:
         self._loop.append(loop)
         self._odometry.append(odometry)
 
-    def drop(self, dropped: NDArray[np.bool_]) -> None:
-        """Forget the marked relations."""
+    def cut(self, count: int) -> None:
+        """Forget all relations after the first ``count``."""
         for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
-            rows.keep(~dropped)
+            rows.set(rows.view[:count])
+
+    def replace(self, edges: Edges, spread: Array, odometry: NDArray[np.bool_]) -> None:
+        """Have these relations and no others."""
+        self._ends.set(np.stack((edges.origin, edges.target), axis=1))
+        self._measured.set(edges.measured)
+        self._information.set(edges.information)
+        self._spread.set(spread)
+        self._loop.set(edges.loop)
+        self._odometry.set(odometry)
 
     def edges(self) -> Edges:
         """Views of all relations."""
         ends = self._ends.view
         return Edges(ends[:, 0], ends[:, 1], self._measured.view, self._information.view, self._loop.view)
 
-    def odometry(self) -> Edges:
-        """The relations that odometry gave."""
-        kept, every = self._odometry.view, self.edges()
-        return Edges(
-            every.origin[kept], every.target[kept], every.measured[kept], every.information[kept], every.loop[kept]
-        )
-
     @property
     def spread(self) -> Array:
         """Shape (n, 2)."""
         return self._spread.view
 
+    @property
+    def odometry(self) -> NDArray[np.bool_]:
+        """Shape (n,): whether odometry gave the relation."""
+        return self._odometry.view
+
     def __len__(self) -> int:
         return len(self._ends)
+
+
+class Trail:
+    """Every scan's place relative to a key scan, so that the whole trajectory moves with the graph.
+
+    Args:
+        most: scans remembered; beyond that every second one is forgotten.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._stamps = Rows(dtype=np.int64)
+        self._keys = Rows(dtype=np.int64)
+        self._relative = Rows(3)
+
+    def append(self, stamp: int, key: int, relative: Array) -> None:
+        """One more scan."""
+        self._stamps.append(stamp)
+        self._keys.append(key)
+        self._relative.append(relative)
+        if len(self._stamps) > self._most:
+            for rows in (self._stamps, self._keys, self._relative):
+                rows.set(rows.view[::2])
+
+    def move(self, stand_in: NDArray[np.int64], offset: Array) -> None:
+        """Key k is now known as ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
+        keys = self._keys.view
+        self._relative.set(compose(offset[keys], self._relative.view))
+        self._keys.set(stand_in[keys])
+
+    def poses(self, keys: Array) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (n,) and poses (n, 3), given those of the key scans."""
+        return self._stamps.view.copy(), compose(keys[self._keys.view], self._relative.view)
