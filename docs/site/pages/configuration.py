@@ -36,16 +36,21 @@ def _section(models: Definitions, key: str, field: Json) -> Page:
         driver = DRIVERS.get(name.removeprefix("Device_").rstrip("_"))
         return f"../devices/{driver.name}.md" if driver is not None else anchors.get(name)
 
+    kinds = list(models.models_in(field))
+    common = models.common(kinds)
     parts = [f"# {key}", plain(field.get("description", ""))]
+    if common:
+        alike = frozenset(models[kinds[0]]["properties"]) - common
+        parts += ["## Every kind", models.fields(models[kinds[0]], link, alike)]
     for heading, name in found.items():
         model = models[name]
         if heading != key:
             parts.append(f"## `{heading}` {{ #{_anchor(heading)} }}")
         about = plain(model.get("description", ""))
-        if "properties" in model and "driver" in model["properties"]:
+        if "driver" in model["properties"]:
             parts += [about, models.fields(model, link, frozenset({"driver"})), DRIVER]
         else:
-            parts += [about, models.fields(model, link)]
+            parts += [about, models.fields(model, link, common if name in kinds else frozenset())]
     return Page(f"configuration/{key}.md", key, join(*parts))
 
 

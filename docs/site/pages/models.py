@@ -45,6 +45,7 @@ class Definitions:
     def fields(self, schema: Json, link: Link, leave_out: frozenset[str] = frozenset()) -> str:
         """Table of a model's fields."""
         required = schema.get("required", ())
+        shown = [item for item in schema.get("properties", {}).items() if item[0] not in leave_out]
         rows = [
             (
                 f"`{name}`",
@@ -52,10 +53,15 @@ class Definitions:
                 "required" if name in required else self.default(field),
                 self.meaning(field),
             )
-            for name, field in schema.get("properties", {}).items()
-            if name not in leave_out
+            for name, field in sorted(shown, key=lambda item: "const" not in item[1])
         ]
         return table(("field", "type", "default", "meaning"), rows)
+
+    def common(self, names: list[str]) -> frozenset[str]:
+        """Fields that all these models have alike."""
+        first, *others = (self._models[name]["properties"] for name in names)
+        alike = (name for name, field in first.items() if all(other.get(name) == field for other in others))
+        return frozenset(alike) if others else frozenset()
 
     def meaning(self, field: Json) -> str:
         """What a field is for; where it says nothing, the first sentence about the one model it holds."""
@@ -104,6 +110,8 @@ class Definitions:
     def default(self, field: Json) -> str:
         """Default of a field; of a model, what differs from the model's own defaults."""
         value = field.get("default")
+        if "const" in field:
+            return "may be left out"
         if not isinstance(value, dict):
             return f"`{json.dumps(value)}`"
         names = list(self.models_in(field))
