@@ -181,7 +181,7 @@ class PathSource(Schema):
 class MapRender(Schema):
     """The picture of path over scan map that the worker draws."""
 
-    latency: Annotated[float, Field(gt=0, le=5)] = 0.05
+    latency: Annotated[float, Field(gt=0, le=5)] = 0.2
     """Seconds after which its results count on the virtual clock"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
     """Seconds after which a silent worker is killed"""

@@ -233,8 +233,9 @@ class FourWheelSteering:
         the speed of the axle's middle along its wheels; the rigid transfer case turns with the mean of both axles.
         Proportional to ``speed``: divide by ``drive_speed(1.0, front, rear)`` for the way back.
         """
-        vx, _, _ = self.body_twist(speed, front, rear)
-        tan_f, tan_r = tan(front), tan(rear)
+        require_finite("speed", speed)
+        tan_f, tan_r = self._tangents(front, rear)
+        vx = speed / secant(self.tan_sideslip(tan_f, tan_r))
         return vx * (0.5 * (secant(tan_f) + secant(tan_r)))
 
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:

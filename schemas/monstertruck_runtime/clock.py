@@ -163,13 +163,24 @@ class _JumpingSelector(selectors.DefaultSelector):
     def __init__(self, loop: VirtualLoop) -> None:
         super().__init__()
         self._loop = loop
+        self._files = 0
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        key = super().register(fileobj, events, data)
+        self._files += 1
+        return key
+
+    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
+        key = super().unregister(fileobj)
+        self._files -= 1
+        return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         events: list[tuple[selectors.SelectorKey, int]] = []
         if timeout is None:
             self._loop.woken.clear()
             return super().select(None)
-        if self._loop.woken.is_set() or len(self.get_map()) > 1:
+        if self._files > 1 or self._loop.woken.is_set():
             self._loop.woken.clear()
             events = super().select(0)
         if not events and timeout > 0:
