@@ -58,6 +58,7 @@ class Plant:
         self.queue = deque([(0.0, 0.0)] * round(self.dead_time / STEP))
 
     def step(self, front: float, rear: float) -> None:
+        """One step with these requests."""
         self.queue.append((front, rear))
         front, rear = self.queue.popleft()
         self.front, self.rear = self._turn(self.front, front), self._turn(self.rear, rear)

@@ -59,7 +59,7 @@ class Axles:
             self.angles = self._turned(self.angles, target, until)
             self._target = target
         while self._due and self._due[0][0] <= t:
-            self._due.popleft()
+            self._target = self._due.popleft()[1]
         self._t = t
 
     def ahead(self, pose: Pose, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose, Angles]:
@@ -69,10 +69,9 @@ class Axles:
         for _, duration, target in self._pieces(begin, begin + seconds):
             count = max(math.ceil(duration / LONGEST), 1)
             for _ in range(count):
-                later = self._turned(angles, target, duration / count)
-                middle = (0.5 * (angles[0] + later[0]), 0.5 * (angles[1] + later[1]))
+                middle = self._turned(angles, target, 0.5 * duration / count)
                 pose = geometry.integrate(pose, *geometry.body_twist(speed, *middle), duration / count)
-                angles = later
+                angles = self._turned(angles, target, duration / count)
         return pose, angles
 
     def _pieces(self, begin: float, end: float) -> list[tuple[float, float, Angles]]:

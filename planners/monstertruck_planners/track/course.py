@@ -58,6 +58,8 @@ class Course:
         tangent, curvature = _bends(run, self._s)
         heading = tangent if run.direction > 0 else tangent + math.pi
         self.given = bool(run.steering)
+        changes = [i for i in range(1, len(run.steering)) if run.steering[i] != run.steering[i - 1]]
+        self._changes = run.vertices[changes]
         modes = self._modes(self._s) if self.given else [steering]
         yaw, turn = heading.copy(), run.direction * curvature
         for mode in sorted(set(modes)):
@@ -83,6 +85,11 @@ class Course:
     def at(self, s: Array | float) -> Reference:
         """Values at ``s`` metres; outside the run those of its ends."""
         return Reference(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
+
+    def section_end(self, s: float) -> float:
+        """Where the steering changes next, m; the end of the way if it does not."""
+        later = self._changes[self._changes > s]
+        return float(later[0]) if len(later) else self._run.end
 
     def _modes(self, s: Array) -> list[Steering]:
         run = self._run

@@ -28,6 +28,8 @@ C = TypeVar("C", bound=TrackerConfig)
 
 REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
+STEEPEST: Final = 1.4
+"""Angles are cut to this before their curvature is kept, rad."""
 TURNED: Final = 0.03
 """Axles this near to what is asked count as turned, rad."""
 
@@ -131,6 +133,7 @@ class Law(Generic[C]):
     def limited(self, steering: Steering, front: float, rear: float) -> Angles:
         """Angles within the limits of a way of steering."""
         angle = self.config.angle
+        front, rear = min(max(front, -STEEPEST), STEEPEST), min(max(rear, -STEEPEST), STEEPEST)
         if steering == "crab":
             front = rear = min(max(0.5 * (front + rear), -angle), angle)
             return front, rear

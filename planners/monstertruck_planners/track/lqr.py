@@ -24,6 +24,8 @@ SPEED_STEP: Final = 0.05
 """Speeds this near to each other (relatively) share their gains."""
 APPROACH: Final = 0.6
 """Steepest angle at which the path is approached, rad."""
+JUST_BEFORE: Final = 0.03
+"""A change of steering, m: more than the spacing of the reference."""
 BETWEEN: Final = 4
 """Places per period whose mean is the reference."""
 
@@ -38,6 +40,8 @@ class Gains:
     """Shape (m, 2 k): by the reference's slip and turn, period by period."""
     furthest: float
     """Greatest distance from the path that counts, m."""
+    cost: Array
+    """Shape (n, n): of an error, for all time."""
 
 
 class Lqr(Law[LqrConfig]):
@@ -48,12 +52,12 @@ class Lqr(Law[LqrConfig]):
         self._periods = max(math.ceil(config.preview * config.rate), 1)
         self._times = (np.arange(self._periods * BETWEEN, dtype=np.float64) + 0.5) * (self.period / BETWEEN)
         self._soon = self._times[: max(len(self._times) // 3, 1)]
-        self._gains: dict[tuple[Steering, bool, int], Gains] = {}
+        self._gains = GainTable(config, geometry, self._periods)
 
     def steer(self, here: Here) -> Angles:
         """Axle angles for the coming period."""
         basis = BASES[here.steering]
-        gains = self._at(here.steering, float(here.speeds(self._soon).mean()))
+        gains = self._gains.at(here.steering, float(here.speeds(self._soon).mean()))
         onto = np.linalg.pinv(basis)
         axles = onto @ np.tan(here.angles)
         asked = onto @ np.tan(self.axles.asked)
@@ -65,7 +69,8 @@ class Lqr(Law[LqrConfig]):
 
     def _reference(self, here: Here) -> Array:
         """Slip and turn of the coming periods, shape (2 k,)."""
-        ahead = here.course.at(here.ways(self._times))
+        # What comes after a change of steering is not for these axles: as if the path went on as it is.
+        ahead = here.course.at(np.minimum(here.ways(self._times), here.course.section_end(here.s) - JUST_BEFORE))
         if here.steering == "crab":
             slip = np.remainder(ahead.heading - here.pose[2] + math.pi, math.tau) - math.pi
             slip, turn = np.clip(slip, -1.0, 1.0), np.zeros_like(slip)
@@ -74,17 +79,33 @@ class Lqr(Law[LqrConfig]):
         both = np.stack((np.tan(slip), turn), axis=1)
         return np.asarray(both.reshape(self._periods, BETWEEN, 2).mean(axis=1).ravel())
 
-    def _at(self, steering: Steering, speed: float) -> Gains:
-        """Gains for a speed, computed once."""
+
+class GainTable:
+    """Gains by way of steering and speed, each computed once.
+
+    Args:
+        config: scales and lag.
+        geometry: the truck's.
+        periods: of preview.
+    """
+
+    def __init__(self, config: LqrConfig, geometry: FourWheelSteering, periods: int) -> None:
+        self._config = config
+        self._geometry = geometry
+        self._periods = periods
+        self._known: dict[tuple[Steering, bool, int], Gains] = {}
+
+    def at(self, steering: Steering, speed: float) -> Gains:
+        """Gains for a speed, m/s, not 0."""
         key = (steering, speed > 0, round(math.log(abs(speed)) / SPEED_STEP))
-        if key not in self._gains:
+        if key not in self._known:
             size = math.exp(key[2] * SPEED_STEP)
-            self._gains[key] = self._design(steering, math.copysign(size, speed))
-        return self._gains[key]
+            self._known[key] = self._design(steering, math.copysign(size, speed))
+        return self._known[key]
 
     def _design(self, steering: Steering, speed: float) -> Gains:
-        config, period = self.config, self.period
-        model = discretise(self.geometry, steering, speed, config.lag, period)
+        config, period = self._config, 1.0 / self._config.rate
+        model = discretise(self._geometry, steering, speed, config.lag, period)
         n, m = model.b.shape
         a = np.block([[model.a, model.b], [np.zeros((m, n)), np.eye(m)]])
         b = np.vstack((model.b, np.eye(m)))
@@ -106,4 +127,4 @@ class Lqr(Law[LqrConfig]):
             ahead = closed.T @ ahead
         single = m == 1 and steering != "crab"
         furthest = APPROACH * abs(feedback[0, 1] / feedback[0, 0]) if single else math.inf
-        return Gains(feedback, np.hstack(preview), furthest)
+        return Gains(feedback, np.hstack(preview), furthest, cost)

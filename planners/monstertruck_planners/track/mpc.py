@@ -23,6 +23,7 @@ from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.course import Reference
 from monstertruck_planners.track.error_model import BASES, LEAST_LAG
 from monstertruck_planners.track.law import Here, Law
+from monstertruck_planners.track.lqr import GainTable
 from monstertruck_schemas.plan import Steering
 
 Array = NDArray[np.float64]
@@ -46,6 +47,18 @@ class Rollout:
     """Shape (2 f, n)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Terminal:
+    """Errors after the last period, how they move with the plan, and their cost for all time to come."""
+
+    errors: Array
+    """Shape (2,)."""
+    by_plan: Array
+    """Shape (2, unknowns)."""
+    cost: Array
+    """Shape (2, 2)."""
+
+
 class Mpc(Law[MpcConfig]):
     """See the module."""
 
@@ -58,6 +71,7 @@ class Mpc(Law[MpcConfig]):
         self._times = (np.arange(self._periods, dtype=np.float64) + 0.5) * self.period
         self._middles = (np.arange(self._fine, dtype=np.float64) + 0.5) * self._h
         self._lag, self._fading = self._responses()
+        self._gains = GainTable(config, geometry, 1)
         self._solvers: dict[int, Solver] = {}
         self._plan: Array | None = None
         self._planned: tuple[Steering, ...] = ()
@@ -78,7 +92,8 @@ class Mpc(Law[MpcConfig]):
         nominal = self._nominal(here, modes, bases)
         rollout = self._roll(here, fine, bases, nominal)
         weights = self._weights(modes)
-        wanted = self._solve(rollout, weights, nominal, last)
+        end = self._end(here, modes[-1], rollout)
+        wanted = self._solve(rollout, weights, end, nominal, last)
         self._plan, self._planned = wanted, modes
         front, rear = bases[0] @ wanted[0]
         return float(front), float(rear)
@@ -150,7 +165,16 @@ class Mpc(Law[MpcConfig]):
         heading = np.where(free, 0.0, self._h / config.heading_scale**2)
         return np.concatenate((np.full(self._fine, self._h / config.lateral_scale**2), heading))
 
-    def _solve(self, rollout: Rollout, weights: Array, nominal: Array, last: Array) -> Array:
+    def _end(self, here: Here, mode: Steering, rollout: Rollout) -> Terminal | None:
+        """What remains to be paid after the last period with the axles where they are best; None for crab."""
+        if mode == "crab":
+            return None
+        cost = self._gains.at(mode, float(here.speeds(self._times[-1:])[0])).cost
+        least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
+        rows = [self._fine - 1, 2 * self._fine - 1]
+        return Terminal(rollout.errors[rows], rollout.by_plan[rows], least)
+
+    def _solve(self, rollout: Rollout, weights: Array, end: Terminal | None, nominal: Array, last: Array) -> Array:
         """The best plan, shape (k, m)."""
         count, m = nominal.shape
         if m not in self._solvers:
@@ -158,7 +182,12 @@ class Mpc(Law[MpcConfig]):
         sensitivity = rollout.by_plan
         offset = rollout.errors - sensitivity @ nominal.ravel()
         weighted = sensitivity.T * weights
-        plan = self._solvers[m].solve(weighted @ sensitivity, weighted @ offset, last)
+        quadratic, linear = weighted @ sensitivity, weighted @ offset
+        if end is not None:
+            weighted = end.by_plan.T @ end.cost
+            quadratic += weighted @ end.by_plan
+            linear += weighted @ (end.errors - end.by_plan @ nominal.ravel())
+        plan = self._solvers[m].solve(quadratic, linear, last)
         return nominal if plan is None else plan.reshape(count, m)
 
 

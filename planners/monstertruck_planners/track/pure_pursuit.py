@@ -6,7 +6,10 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.actuator import Angles
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.law import Here, Law
+from monstertruck_planners.track.line import Foot
 
+LEAST_WAY = 1e-6
+"""Before a change of steering the path is that of the old one, m."""
 LEAST_SQUARE = 1e-6
 """Goals nearer than the root of this are not divided by, m^2."""
 
@@ -20,8 +23,8 @@ class PurePursuit(Law[PurePursuitConfig]):
 
     def steer(self, here: Here) -> Angles:
         """Axle angles of the arc through the point ahead."""
-        goal = here.run.at(here.s + self._lookahead(here.speed))
         x, y, yaw = here.pose
+        goal = self._goal(here, here.s + self._lookahead(here.speed))
         c, sn = math.cos(yaw), math.sin(yaw)
         dx, dy = goal.point[0] - x, goal.point[1] - y
         ahead, aside = c * dx + sn * dy, c * dy - sn * dx
@@ -47,6 +50,15 @@ class PurePursuit(Law[PurePursuitConfig]):
             turn = 2 * aside / max(ahead**2 + aside**2, LEAST_SQUARE)
         _, front, rear = self.geometry.steer_for_twist(1.0, -arm * turn, turn)
         return float(front), float(rear)
+
+    def _goal(self, here: Here, s: float) -> Foot:
+        """Point at ``s`` metres; beyond a change of steering as if the path went on straight."""
+        end = here.course.section_end(here.s)
+        if s <= end or end >= here.run.end:
+            return here.run.at(s)
+        last = here.run.at(end - LEAST_WAY)
+        x, y, more = *last.point, s - end
+        return Foot(s, (x + more * math.cos(last.tangent), y + more * math.sin(last.tangent)), last.tangent)
 
     def _lookahead(self, speed: float) -> float:
         config = self.config

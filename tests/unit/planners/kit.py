@@ -3,21 +3,23 @@
 import math
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.api import TruckState
-from monstertruck_planners.track.config import PurePursuitConfig
+from monstertruck_planners.track.catalog import build_tracker
+from monstertruck_planners.track.config import AnyTracker
 from monstertruck_planners.track.line import Line
-from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 
 STEERING = FourWheelSteering()
+TRACKER = TypeAdapter(AnyTracker)
 
 
-def path(points, directions=(), *, closed=False, frame="odom"):
+def path(points, directions=(), *, closed=False, frame="odom", yaws=0.0, steering=()):
     points = np.asarray(points, dtype=float)
-    poses = np.column_stack((points, np.zeros(len(points))))
+    poses = np.column_stack((points, np.broadcast_to(yaws, len(points))))
     return Path(
         stamp=0,
         received=0,
@@ -26,6 +28,7 @@ def path(points, directions=(), *, closed=False, frame="odom"):
         poses=poses.ravel(),
         directions=list(directions),
         closed=closed,
+        steering=tuple(steering),
         name="test",
     )
 
@@ -46,11 +49,11 @@ def figure_eight(size=1.5, count=240):
 
 
 class Follower:
-    """A truck driven by pure pursuit at 20 Hz."""
+    """A truck driven by a tracker at 20 Hz."""
 
     def __init__(self, route, pose=(0.0, 0.0, 0.0), **config):
-        self.config = PurePursuitConfig(**config)
-        self.law = PurePursuit(self.config, STEERING)
+        self.config = TRACKER.validate_python({"kind": "pure_pursuit"} | config)
+        self.law = build_tracker(self.config, STEERING)
         self.pose = pose
         self.speed, self.front, self.rear = 0.0, 0.0, 0.0
         self.line = Line(route, pose, self.config.beyond)

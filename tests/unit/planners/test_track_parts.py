@@ -1,0 +1,139 @@
+"""The parts trackers are made of: axles, reference, ground, rules, gains."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.actuator import Axles
+from monstertruck_planners.track.course import Course
+from monstertruck_planners.track.error_model import discretise, exponential, riccati
+from monstertruck_planners.track.fuzzy_rules import Inputs, Rules
+from monstertruck_planners.track.ground import Ground
+from monstertruck_planners.track.line import Line
+from tests.unit.planners.kit import STEERING, circle, path, straight
+
+
+def course(route, mode="counter", geometry=STEERING):
+    line = Line(route, (0.0, 0.0, 0.0), 0.8)
+    return Course(line.runs[0], geometry, mode)
+
+
+@pytest.mark.parametrize(("lag", "rate"), [(0.1, 5.0), (0.1, 0.5), (0.0, 1.0)])
+def test_axles_follow_after_the_dead_time_by_lag_and_rate(lag, rate):
+    axles = Axles(0.05, lag, rate)
+    axles.advance(0.0)
+    axles.ask(0.0, (0.3, -0.1))
+    simulated, dt = 0.0, 1e-4
+    for k in range(1, 61):
+        axles.advance(0.01 * k)
+        for i in range(100):
+            if (k - 1) * 0.01 + i * dt >= 0.05:
+                gap = 0.3 - simulated
+                step = gap if lag == 0.0 else gap * dt / lag
+                simulated += math.copysign(min(abs(step), rate * dt), gap)
+        assert axles.angles[0] == pytest.approx(simulated, abs=2e-3)
+    assert axles.asked == (0.3, -0.1)
+
+
+def test_a_request_due_at_the_very_step_counts():
+    axles = Axles(0.05, 0.0, 100.0)
+    axles.advance(0.0)
+    axles.ask(0.0, (0.2, 0.0))
+    axles.advance(0.05)
+    axles.advance(0.1)
+    assert axles.angles == pytest.approx((0.2, 0.0))
+
+
+def test_the_pose_is_foretold_over_the_dead_time():
+    axles = Axles(0.2, 0.0, 100.0)
+    axles.advance(0.0)
+    axles.ask(0.0, (0.3, -0.3))
+    axles.advance(0.1)
+    pose, angles = axles.ahead((0.0, 0.0, 0.0), 0.5, STEERING, 0.2)
+    straight_on = (0.05, 0.0, 0.0)
+    assert pose == pytest.approx(STEERING.integrate(straight_on, *STEERING.body_twist(0.5, 0.3, -0.3), 0.1), abs=1e-3)
+    assert angles == pytest.approx((0.3, -0.3))
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("mode", ["front", "rear", "counter", "hybrid"])
+def test_on_a_circle_the_reference_is_the_steady_turn(mode, direction):
+    route = circle(1.0, 0.5, 0.005)
+    found = course(path(route, [direction] * len(route)), mode).at(1.5)
+    assert found.curvature == pytest.approx(1.0, rel=0.01)
+    front, rear = STEERING.steer_for(float(found.turn), float(found.slip))
+    fixed = {"front": rear, "rear": front}.get(mode, front + rear)
+    assert fixed == pytest.approx(0.0, abs=4e-3)
+    assert direction * STEERING.curvature(front, rear) == pytest.approx(1.0, rel=0.01)
+
+
+def test_points_rounded_to_millimetres_do_not_shake_the_reference():
+    exact, rounded = circle(1.0, 0.5, 0.025), np.round(circle(1.0, 0.5, 0.025), 3)
+    s = np.linspace(0.2, 2.8, 200)
+    difference = course(path(rounded)).at(s).heading - course(path(exact)).at(s).heading
+    assert np.abs(difference).max() < 0.03
+
+
+def test_sections_end_where_the_steering_changes():
+    found = course(path(straight(1.0, 0.1), steering=["counter"] * 6 + ["crab"] * 5))
+    assert (found.section_end(0.2), found.section_end(0.7)) == pytest.approx((0.5, 1.0))
+    assert (found.steering(0.2), found.steering(0.7)) == ("counter", "crab")
+
+
+def test_rough_ground_is_felt_and_forgotten():
+    ground = Ground()
+    for k in range(100):
+        ground.add(0.05 * k, 0.05 * (-1) ** k, 0.0)
+    assert ground.roughness == pytest.approx(0.05, rel=0.1)
+    assert ground.tilt == pytest.approx(0.05)
+    for k in range(100, 300):
+        ground.add(0.05 * k, 0.2, 0.1)
+    assert ground.roughness < 0.02
+    assert ground.tilt == pytest.approx(math.acos(math.cos(0.2) * math.cos(0.1)))
+
+
+def inferred(published=True, **more):
+    values = {"bearing": 0.0, "orientation": 0.0, "distance": 0.6, "aside": 0.0, "direction": 1.0} | more
+    return Rules(0.2, 0.05, published).infer(Inputs(**values))
+
+
+@pytest.mark.parametrize(
+    ("bearing", "share"),
+    [(0, 0), (5, 0), (10, 0.25), (15, 0.5), (25, 0.5), (30, 0.75), (35, 1), (165, 1), (170, 0.5), (180, 0)],
+)
+def test_far_steering_is_as_published(bearing, share):
+    assert inferred(bearing=bearing).front == pytest.approx(share)
+    assert inferred(bearing=-bearing).front == pytest.approx(-share)
+
+
+@pytest.mark.parametrize(("offset", "share"), [(0, 0), (0.5, 0.5), (1, 1), (1.5, 2 / 3), (2, 0), (3, 0)])
+def test_sideways_steering_is_a_bump_as_published(offset, share):
+    assert inferred(aside=0.05 * offset).sideways == pytest.approx(share)
+
+
+def test_slips_of_the_rules_are_corrected():
+    assert inferred(False, aside=0.2).sideways == pytest.approx(1.0)
+    assert inferred(False, aside=0.05, direction=-1.0).sideways == pytest.approx(-1.0)
+    backing = {"distance": 0.1, "direction": -1.0}
+    assert inferred(True, **backing).front is None
+    assert inferred(False, **backing).front == 0.0
+    assert inferred(True, distance=0.1, orientation=-8).front != -inferred(True, distance=0.1, orientation=8).front
+    assert inferred(False, distance=0.1, orientation=-8).front == -inferred(False, distance=0.1, orientation=8).front
+    assert (inferred(distance=0.1).speed, inferred(distance=0.3).speed) == (0.5, pytest.approx(0.75))
+
+
+@pytest.mark.parametrize("speed", [0.2, -0.5])
+def test_the_gains_solve_the_riccati_equation(speed):
+    model = discretise(FourWheelSteering(), "hybrid", speed, 0.1, 0.05)
+    q, r = np.diag([1.0, 0.1, 0.0, 0.0]), np.eye(2) * 1e-3
+    p = riccati(model.a, model.b, q, r)
+    gain = np.linalg.solve(r + model.b.T @ p @ model.b, model.b.T @ p @ model.a)
+    assert model.a.T @ p @ (model.a - model.b @ gain) + q == pytest.approx(p, rel=1e-6, abs=1e-6)
+    assert np.abs(np.linalg.eigvals(model.a - model.b @ gain)).max() < 1.0
+
+
+def test_the_exponential_of_a_stiff_matrix():
+    assert exponential(np.array([[0.0, 2.0], [-2.0, 0.0]]))[0, 0] == pytest.approx(math.cos(2.0))
+    assert exponential(np.diag([-100.0, 1.0])) == pytest.approx(np.diag([0.0, math.e]))

@@ -1,0 +1,218 @@
+"""What holds for every tracker."""
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from monstertruck_planners.track.api import TruckState
+from monstertruck_planners.track.catalog import TRACKERS, build_tracker
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.reasons import Reason
+from tests.unit.planners.kit import STEERING, TRACKER, Follower, circle, figure_eight, path, straight
+
+KINDS = list(TRACKERS)
+EXACT = ["stanley", "lqr", "mpc"]
+MODES = ["front", "rear", "counter", "hybrid"]
+
+
+def there_and_back():
+    out = circle(1.0, turns=0.25)
+    return path(np.concatenate((out, out[::-1][1:])), [1] * len(out) + [-1] * (len(out) - 1))
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", ["pure_pursuit", *EXACT])
+def test_a_straight_path_is_reached_from_beside_it(kind, mode, direction):
+    route = straight(2.5, 0.1) * (direction, 1)
+    truck = Follower(path(route, [direction] * len(route)), pose=(0.0, 0.12, 0.05), kind=kind, steering=mode)
+    assert truck.run() is Reason.GOAL_REACHED
+    assert truck.cross_track(after=1.9).max() < 0.015
+    assert truck.pose[0] == pytest.approx(direction * 2.5, abs=0.04)
+    assert max(max(abs(c.front), abs(c.rear)) for c in truck.log) <= 0.4 + 1e-9
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("mode", ["front", "counter", "hybrid"])
+@pytest.mark.parametrize("kind", EXACT)
+def test_curves_leave_no_error(kind, mode, direction):
+    route = circle(1.2, turns=0.4) * (direction, 1)
+    truck = Follower(path(route, [direction] * len(route)), kind=kind, steering=mode)
+    assert truck.run() is Reason.GOAL_REACHED
+    assert truck.cross_track(after=1.5).max() < 0.012
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cusp_is_driven_to_a_full_stop_and_the_direction_changes_once(kind):
+    truck = Follower(there_and_back(), kind=kind, dead_time=0.05, lag=0.1)
+    signs = [0.0]
+    while truck.step().outcome is Reason.DRIVING:
+        assert len(truck.log) < 2000
+        if truck.speed and math.copysign(1, truck.speed) != signs[-1]:
+            signs.append(math.copysign(1, truck.speed))
+    assert signs == [0.0, 1.0, -1.0]
+    runs = [c.progress.run for c in truck.log]
+    change = runs.index(1)
+    assert truck.log[change - 1].speed == 0.0
+    assert sorted(runs) == runs
+    assert truck.cross_track().max() < (0.2 if kind == "fuzzy" else 0.05)
+
+
+def test_the_wheels_turn_before_the_truck_rolls():
+    truck = Follower(path(circle(0.8, turns=0.25)), kind="lqr", dead_time=0.05, lag=0.1)
+    first = [truck.step() for _ in range(12)]
+    moving = next(i for i, command in enumerate(first) if command.speed)
+    assert moving > 0
+    assert truck.front == pytest.approx(first[moving].front, abs=0.06)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_noise_about_a_cusp_does_not_change_the_direction_again(kind):
+    truck = Follower(there_and_back(), kind=kind)
+    end = truck.line.runs[0].length
+    rng = np.random.default_rng(1)
+    progress, runs = truck.line.start, []
+    x, y = truck.line.runs[0].at(end).point
+    progress = type(progress)(0, end - 0.05)
+    for k in range(40):
+        near = (x + 0.01 * rng.standard_normal(), y + 0.01 * rng.standard_normal(), math.pi / 2)
+        command = truck.law.control(TruckState(near, 0.0), truck.line, progress, 0.05 * k)
+        progress = command.progress
+        runs.append(progress.run)
+    assert sorted(runs) == runs
+    assert runs[-1] == 1
+    assert command.speed <= 0.0 or command.outcome is Reason.GOAL_REACHED
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pose_that_is_no_number_stops(kind):
+    truck = Follower(path(straight(2.0)), kind=kind)
+    truck.step()
+    command = truck.law.control(TruckState((math.nan, 0.0, 0.0), 0.1), truck.line, truck.progress, 0.1)
+    assert (command.outcome, command.speed) == (Reason.NOT_FINITE, 0.0)
+    assert math.isfinite(command.front + command.rear + command.cross_track)
+    assert truck.step().outcome is Reason.DRIVING
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_truck_far_off_is_lost(kind):
+    truck = Follower(path(straight(2.0)), kind=kind)
+    command = truck.law.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.line, truck.progress, 0.0)
+    assert (command.outcome, command.speed) == (Reason.PATH_LOST, 0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hopeless_starts_stay_within_the_limits(kind):
+    truck = Follower(path(straight(3.0)), pose=(0.0, 0.45, 2.0), kind=kind, angle=0.25)
+    for _ in range(40):
+        truck.step()
+    assert max(max(abs(c.front), abs(c.rear)) for c in truck.log) <= 0.25 + 1e-9
+    assert all(math.isfinite(c.front + c.rear + c.speed) for c in truck.log)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_equal_runs_are_equal(kind):
+    logs = []
+    for _ in range(2):
+        truck = Follower(path(figure_eight(1.5), closed=True), kind=kind, steering="hybrid")
+        logs.append([truck.step() for _ in range(60)])
+    assert logs[0] == logs[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_slows_down_on_slopes_and_rough_ground(kind):
+    speeds = []
+    for more in ({}, {"tilt": 0.15}, {"roughness": 0.075}, {"tilt": 0.5}):
+        truck = Follower(path(straight(4.0)), kind=kind)
+        state = TruckState((0.5, 0.0, 0.0), 0.1, **more)
+        speeds.append(truck.law.control(state, truck.line, truck.progress, 0.0).speed)
+    assert speeds == pytest.approx([0.18, 0.09, 0.09, 0.03])
+
+
+def test_it_brakes_before_a_curve():
+    x = straight(1.0, 0.025)
+    route = np.concatenate((x, circle(0.5, 0.5, 0.025)[1:] + x[-1]))
+    truck = Follower(path(route), kind="lqr", speed=0.5, lateral_acceleration=0.1, steering="counter")
+    truck.run()
+    inside = [c.speed for c in truck.log if 1.1 < truck.line.along(c.progress) < 2.0]
+    assert max(inside) < 0.24
+    assert max(c.speed for c in truck.log) > 0.35
+
+
+@pytest.mark.parametrize("kind", ["pure_pursuit", *EXACT])
+def test_the_path_says_where_to_crab(kind):
+    """1 m straight, then sideways at 15 degrees with the heading kept, then straight again."""
+    out, aside = straight(1.0), straight(1.5) @ np.array([[math.cos(0.26), math.sin(0.26)], [0.0, 1.0]])
+    points = np.concatenate((out, out[-1] + aside[1:], out[-1] + aside[-1] + straight(1.0)[1:]))
+    steering = ["counter"] * len(out) + ["crab"] * (len(aside) - 1) + ["counter"] * 20
+    truck = Follower(path(points, steering=steering), kind=kind)
+    assert truck.run() is Reason.GOAL_REACHED
+    crabbing = [c for c in truck.log if 1.3 < truck.line.along(c.progress) < 2.2]
+    assert all(c.front == pytest.approx(c.rear) and c.front > 0.1 for c in crabbing)
+    assert max(abs(c.heading_error) for c in crabbing) < 0.1
+    assert truck.cross_track().max() < 0.06
+
+
+@pytest.mark.parametrize("kind", EXACT)
+def test_hybrid_corrects_sideways_with_less_turning(kind):
+    turned = {}
+    for mode in ("counter", "hybrid"):
+        truck = Follower(path(straight(3.0)), pose=(0.0, 0.1, 0.0), kind=kind, steering=mode)
+        assert truck.run() is Reason.GOAL_REACHED
+        turned[mode] = max(abs(c.heading_error) for c in truck.log)
+    assert turned["hybrid"] < 0.5 * turned["counter"]
+
+
+@pytest.mark.parametrize("kind", ["stanley", "lqr", "mpc"])
+def test_knowing_dead_time_and_lag_helps(kind):
+    found = []
+    for known in (0.0, 0.15):
+        truck = Follower(path(figure_eight(2.0)), pose=(0, 0, 0.75), kind=kind, speed=0.6, dead_time=known, lag=known)
+        delayed = Delayed(truck)
+        found.append(delayed.run())
+    assert found[1] < 0.7 * found[0]
+
+
+class Delayed:
+    """0.15 s dead time and as much lag between a tracker and its truck."""
+
+    def __init__(self, truck):
+        self.truck, self.waiting, self.angles = truck, [(0.0, 0.0)] * 3, (0.0, 0.0)
+
+    def run(self):
+        truck, errors = self.truck, []
+        for k in range(300):
+            command = truck.law.control(TruckState(truck.pose, 0.6), truck.line, truck.progress, 0.05 * k)
+            if command.outcome is not Reason.DRIVING:
+                break
+            truck.progress = command.progress
+            errors.append(command.cross_track)
+            self.waiting.append((command.front, command.rear))
+            wanted = self.waiting.pop(0)
+            for _ in range(5):
+                share = 1 - math.exp(-0.01 / 0.15)
+                self.angles = tuple(a + share * (w - a) for a, w in zip(self.angles, wanted, strict=True))
+                truck.pose = STEERING.integrate(truck.pose, *STEERING.body_twist(0.6, *self.angles), 0.01)
+        return float(np.abs(errors[20:]).max())
+
+
+def test_kinds_are_told_apart_and_unknown_keys_refused():
+    assert TRACKER.validate_python({"kind": "mpc"}).kind == "mpc"
+    for bad, hint in (({"kind": "magic"}, "kind"), ({"kind": "lqr", "lookahead": 0.4}, "lookahead"), ({}, "kind")):
+        with pytest.raises(ValidationError, match=hint):
+            TRACKER.validate_python(bad)
+    assert {TRACKER.validate_python({"kind": kind}).kind for kind in TRACKERS} == set(TRACKERS)
+
+
+def test_a_config_without_kind_has_no_tracker():
+    with pytest.raises(InputError, match=r"tracker.kind 'None': expected one of pure_pursuit"):
+        build_tracker(TrackerConfig(), STEERING)
+
+
+def test_a_missing_solver_is_named(monkeypatch):
+    monkeypatch.setitem(TRACKERS, "mpc", "monstertruck_planners.track.no_such:Mpc")
+    with pytest.raises(InputError, match=r"needs the extra \[planning\]"):
+        build_tracker(TRACKER.validate_python({"kind": "mpc"}), STEERING)
