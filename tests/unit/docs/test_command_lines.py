@@ -25,6 +25,8 @@ from tests.unit.docs.command_lines import (
     starts_truck,
 )
 
+pytestmark = pytest.mark.timeout(180)  # the first route of a computer compiles
+
 GOLDEN = ROOT / "tests" / "data" / "golden" / "0.1.0" / "run.mcap"
 
 

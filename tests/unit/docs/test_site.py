@@ -14,6 +14,8 @@ from monstertruckd.cli.main import app
 from tests.unit.docs.command_lines import commands_of
 
 ROOT = Path(__file__).resolve().parents[3]
+pytestmark = pytest.mark.timeout(180)
+
 CONFIG = ROOT / "docs" / "site" / "mkdocs.yml"
 
 
