@@ -1,153 +1,166 @@
 """Loop closure: where the robot may have come back to, whether it has, and whether that agrees with everything else.
 
-Candidates are key scans that the drift bound lets lie near, though the graph is not sure of them: the likeliest by place
-and the most alike by descriptor. The robot's own submap (not one scan: a corridor looks like itself everywhere) is searched
-for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at once; in a wide one it
-waits until others, found from different places, agree with it (pairwise consistency: Mangelson et al. 2018). After the
-optimisation a closure that the graph resists is taken back.
+Candidates are key scans that the drift bound lets lie near though the graph is not sure of them: the likeliest by place,
+and the most alike by descriptor. The robot's own surroundings (not one scan: a corridor looks like itself everywhere) are
+searched for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at once; in a wide
+one it waits until others, found from different places, agree with it (pairwise consistency: Mangelson et al. 2018). After
+the optimisation a closure that the graph resists is taken back.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.correlation import correlate
+from monstertruck_estimation.slam.descriptor import describe, likeness
 from monstertruck_estimation.slam.frontend import degeneracy, deviations
 from monstertruck_estimation.slam.graph import optimise, residuals, trust
+from monstertruck_estimation.slam.keymap import KeyMap
 from monstertruck_estimation.slam.registration import register
-from monstertruck_estimation.slam.scans import Scan, spread
+from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.se2 import between, compose, inverse, rotation
 from monstertruck_estimation.slam.submap import merged
-
-if TYPE_CHECKING:
-    from monstertruck_estimation.slam.config import MapperConfig
-    from monstertruck_estimation.slam.keymap import KeyMap
 
 Array = NDArray[np.float64]
 
 VIEW: Final = 2.5
 """Two key scans this near see enough of the same, m."""
+WINDOW: Final = 3.0
+"""Half width of a search in standard deviations of the drift."""
+MARGIN: Final = (0.3, 0.05)
+"""What is added to that, m and rad."""
 WIDEST: Final = (12.0, 1.0)
 """Half width of a search at most, m and rad."""
 SURE: Final = (1.5, 0.3)
-"""Windows up to this need no further witness, m and rad."""
+"""Hits in windows up to this need no witness, m and rad."""
+LEVELS: Final = 7
+"""Levels of the pyramid."""
+QUERY_KEYS: Final = 12
+"""Key scans of the query at most."""
+QUERY_REACH: Final = 3.0
+"""They are this near to the newest, m."""
+QUERY_CELL: Final = 0.1
+"""About one of their points is used per square of this edge, m."""
+QUERY_POINTS: Final = 320
+"""Points of the query at most."""
+PLACE_KEYS: Final = 30
+"""Key scans of the place it is searched in, at most."""
 LEAST_SCORE: Final = 0.45
-"""Mean likelihood of a submap found again."""
+"""Mean likelihood of surroundings found again."""
 LEAST_OVERLAP: Final = 0.55
-"""Share of its points that must fit."""
+"""Share of their points that must fit."""
+LEAST_RATIO: Final = 0.02
+"""Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
+FARTHEST: Final = 0.3
+"""The fine fit ends this near to the coarse one, m."""
 RIVAL: Final = 0.92
 """A second place this nearly as good makes the first one worthless."""
 APART: Final = 1.0
 """Distance at which places are different, m."""
-LEVELS: Final = 7
-QUERY_POINTS: Final = 320
-QUERY_REACH: Final = 3.0
-"""Key scans up to this far back make the query, m."""
+LEAST_LIKENESS: Final = 0.8
+"""Of a candidate by descriptor."""
+FLOOR: Final = (0.03, 0.03, 0.01)
+"""Standard deviation of a closure, m and rad: its submaps are not rigid."""
 WITNESSES: Final = 3
 """Hits that must agree before a wide search is believed."""
 BASELINE: Final = 1.0
-"""Way between the first and the last witness, m."""
+"""Way between the first and the last of them, m."""
 CONSISTENT: Final = 11.3
 """Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
+VAGUE: Final = 1.0
+"""Agreement proves nothing where the drift between the hits is greater, m."""
 FORGET: Final = 60
 """Key scans after which a hit without witnesses is forgotten."""
 REST: Final = 4
-"""Key scans between two searches in the same place without success."""
+"""Key scans between two searches in the same place."""
+BROKEN: Final = 0.02
+"""Share of the relations that a closure may strain before it is taken back."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Hit:
-    """The newest key scan found near an old one."""
+    """The key scan ``target`` found near ``origin``."""
 
     origin: int
     target: int
     measured: Array
     information: Array
-    way: float
 
 
 class LoopCloser:
-    """Finds, checks and adds closures.
+    """Finds, checks and adds closures."""
 
-    Args:
-        config: what is local, and limits.
-    """
-
-    def __init__(self, config: MapperConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._hits: list[_Hit] = []
         self._tried: dict[int, int] = {}
+        self._fingerprints: list[Array] = []
+        self.searches = 0
+        """Searches made."""
         self.refused = 0
         """Closures taken back because the graph resisted."""
-        self.searches = 0
 
     def close(self, keymap: KeyMap) -> bool:
-        """Search once from the newest key scan; True if the graph has changed."""
-        newest = len(keymap.keys) - 1
+        """Search from the newest key scan; True if a closure has moved the poses."""
+        newest = len(keymap) - 1
+        own = keymap.around(newest, QUERY_KEYS, QUERY_REACH)
+        query = _surroundings(keymap, own, newest)
+        while len(self._fingerprints) < newest:
+            self._fingerprints.append(np.zeros_like(describe(query.points)))
+        self._fingerprints.append(describe(query.points))
         covariances, far = keymap.drift(newest)
         self._hits = [hit for hit in self._hits if newest - hit.target < FORGET]
-        changed = False
+        self._tried = {place: when for place, when in self._tried.items() if newest - when < REST}
         for candidate in self._candidates(keymap, covariances, far):
-            hit = self._search(keymap, candidate, covariances[candidate])
             self._tried[candidate] = newest
-            if hit is None:
-                continue
-            sure = self._window(covariances[candidate])
-            alone = sure[0] <= SURE[0] and sure[1] <= SURE[1]
-            witnesses = [hit, *self._agreeing(keymap, hit)]
-            enough = len(witnesses) >= WITNESSES and self._baseline(keymap, witnesses) >= BASELINE
-            self._hits.append(hit)
-            if (alone or enough) and self._accept(keymap, witnesses):
-                self._hits = [other for other in self._hits if other not in witnesses]
-                changed = True
-                break
-        return changed
+            window = _window(covariances[candidate])
+            hit = self._search(keymap, query, own, candidate, window)
+            if hit is not None and self._believed(keymap, hit, window):
+                return True
+        return False
 
-    def forget(self) -> None:
-        """Key scans have new numbers: hits and searches from before mean nothing."""
+    def forget(self, kept: NDArray[np.bool_]) -> None:
+        """Only the marked key scans are left, with new numbers."""
         self._hits.clear()
         self._tried.clear()
-
-    def _window(self, covariance: Array) -> tuple[float, float]:
-        place, turn = deviations(covariance)
-        return 3 * place + 0.3, 3 * turn + 0.05
+        self._fingerprints = [one for one, left in zip(self._fingerprints, kept.tolist(), strict=False) if left]
 
     def _candidates(self, keymap: KeyMap, covariances: Array, far: Array) -> list[int]:
-        """At most two key scans to look at: the likeliest by place, and one elsewhere that looks most alike."""
-        config, newest = self._config, len(keymap.keys) - 1
+        """At most two key scans: the likeliest by place, and one elsewhere that looks most alike."""
+        newest = len(keymap) - 1
         off = between(keymap.poses[newest], keymap.poses)
         distance = np.hypot(off[:, 0], off[:, 1])
-        reach = np.minimum(3 * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), WIDEST[0])
-        possible = (far > config.local_spread**2) & (distance < VIEW + reach)
-        for candidate, when in self._tried.items():
-            if newest - when < REST:
-                possible &= np.hypot(*(keymap.poses[:, :2] - keymap.poses[candidate, :2]).T) > VIEW
+        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), WIDEST[0])
+        possible = (far > keymap.config.local_spread**2) & (distance < VIEW + reach)
+        for place in self._tried:
+            possible &= _distance(keymap, place) > VIEW
         numbers = np.flatnonzero(possible)
         if not len(numbers):
             return []
         cost = distance[numbers] / (VIEW + reach[numbers]) + 0.15 * np.abs(off[numbers, 2])
         first = int(numbers[np.argmin(cost)])
-        return [first]
+        elsewhere = numbers[_distance(keymap, first)[numbers] > VIEW]
+        if not len(elsewhere):
+            return [first]
+        alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
+        best = int(np.argmax(alike))
+        return [first, int(elsewhere[best])] if alike[best] > LEAST_LIKENESS else [first]
 
-    def _search(self, keymap: KeyMap, candidate: int, covariance: Array) -> _Hit | None:
-        """Look for the surroundings of the newest key scan in those of ``candidate``."""
+    def _search(
+        self, keymap: KeyMap, query: Scan, own: NDArray[np.intp], candidate: int, window: tuple[float, float]
+    ) -> _Hit | None:
+        """Look for ``query``, the surroundings of the newest key scan, in those of ``candidate``."""
         self.searches += 1
-        newest = len(keymap.keys) - 1
-        own = keymap.around(newest, 12, QUERY_REACH)
-        query = self._query(keymap, own, keymap.poses[newest])
-        numbers = keymap.around(candidate, 30)
+        newest = len(keymap) - 1
+        numbers = keymap.around(candidate, PLACE_KEYS)
         numbers = numbers[~np.isin(numbers, own)]
         if not len(numbers):
             return None
         submap = keymap.submap(numbers)
-        window = self._window(covariance)
         window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
-        deviation = max(window[0] / 3, 0.1), max(window[1] / 3, 0.02)
+        deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
         guess = keymap.poses[newest]
         peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, LEAST_SCORE, APART)
         if peak is None or peak.rival > RIVAL * peak.score:
@@ -155,69 +168,91 @@ class LoopCloser:
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
-        if fit.overlap < LEAST_OVERLAP or ratio < 0.02 or math.hypot(moved[0], moved[1]) > 0.3:
+        if fit.overlap < LEAST_OVERLAP or ratio < LEAST_RATIO or math.hypot(moved[0], moved[1]) > FARTHEST:
             return None
-        near = keymap.poses[numbers]
-        origin = int(numbers[np.argmin(np.hypot(*(near[:, :2] - fit.pose[:2]).T))])
+        near = keymap.poses[numbers, :2] - fit.pose[:2]
+        origin = int(numbers[np.argmin(np.hypot(near[:, 0], near[:, 1]))])
         # The information is about x, y in map; the relation is in the frame of its origin.
         turn = np.eye(3)
         turn[:2, :2] = rotation(keymap.poses[origin, 2])
-        information = turn.T @ fit.information @ turn
-        covariance = np.linalg.inv(information + np.eye(3)) + np.diag((0.03**2, 0.03**2, 0.01**2))
-        way = float(len(keymap.keys))
-        return _Hit(origin, newest, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance), way)
+        covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
+        return _Hit(origin, newest, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
 
-    def _query(self, keymap: KeyMap, numbers: NDArray[np.intp], pose: Array) -> Scan:
-        """The surroundings in the frame of ``pose``."""
-        scan = merged([keymap.keys[k].scan for k in numbers], between(pose, keymap.poses[numbers]))
-        kept = spread(scan.points, 0.1)
-        if len(kept) > QUERY_POINTS:
-            kept = kept[np.linspace(0, len(kept) - 1, QUERY_POINTS).astype(np.intp)]
-        return Scan(scan.points[kept], scan.normals[kept], scan.variances[kept])
+    def _believed(self, keymap: KeyMap, hit: _Hit, window: tuple[float, float]) -> bool:
+        """Add ``hit`` and what agrees with it to the graph if that is enough, and if the graph bears it."""
+        witnesses = [hit, *self._agreeing(keymap, hit)]
+        self._hits.append(hit)
+        sure = window[0] <= SURE[0] and window[1] <= SURE[1]
+        if not sure and (len(witnesses) < WITNESSES or _way(keymap, witnesses) < BASELINE):
+            return False
+        if not self._added(keymap, witnesses):
+            return False
+        used = {id(witness) for witness in witnesses}
+        self._hits = [other for other in self._hits if id(other) not in used]
+        return True
 
     def _agreeing(self, keymap: KeyMap, hit: _Hit) -> list[_Hit]:
         """Earlier hits that form a consistent loop with ``hit``."""
+        if not self._hits:
+            return []
         at_target, _ = keymap.drift(hit.target)
         at_origin, _ = keymap.drift(hit.origin)
         result = []
         for other in self._hits:
             if other.target == hit.target:
                 continue
-            # origin -> target -> other target -> other origin, against the graph's own origin -> other origin.
+            # Origin to target to the other's target to its origin, against the graph's own way from origin to origin.
             step = between(keymap.poses[hit.target], keymap.poses[other.target])
             there = compose(compose(hit.measured, step), inverse(other.measured))
-            graph = between(keymap.poses[hit.origin], keymap.poses[other.origin])
-            off = between(graph, there)
-            spread_ = at_target[other.target] + at_origin[other.origin]
-            spread_ = spread_ + np.linalg.inv(hit.information) + np.linalg.inv(other.information)
-            place, turn = deviations(spread_)
-            if not math.isfinite(place) or place > 1.0:
+            off = between(between(keymap.poses[hit.origin], keymap.poses[other.origin]), there)
+            drifts = at_target[other.target] + at_origin[other.origin]
+            place, turn = deviations(drifts + np.linalg.inv(hit.information) + np.linalg.inv(other.information))
+            if not place <= VAGUE:
                 continue
-            square = (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2
-            if square < CONSISTENT:
+            if (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT:
                 result.append(other)
         return result
 
-    def _baseline(self, keymap: KeyMap, hits: list[_Hit]) -> float:
-        first, last = min(hit.target for hit in hits), max(hit.target for hit in hits)
-        steps = np.diff(keymap.poses[first : last + 1, :2], axis=0)
-        return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
-
-    def _accept(self, keymap: KeyMap, hits: list[_Hit]) -> bool:
-        """Add the hits, optimise, and take them back if they do not hold or break what held."""
+    def _added(self, keymap: KeyMap, hits: list[_Hit]) -> bool:
+        """Add the hits and optimise; take them back if they do not hold or break what held."""
         before, count = keymap.poses, len(keymap.edges)
         edges = keymap.edges.edges()
         _, squares = residuals(before, edges)
         held = trust(squares, edges.loop) > 0.5
         for hit in hits:
-            keymap.edges.add(hit.origin, hit.target, hit.measured, hit.information, (0.03**2, 0.01**2), loop=True)
+            spread = (FLOOR[0] ** 2, FLOOR[2] ** 2)
+            keymap.edges.add(hit.origin, hit.target, hit.measured, hit.information, spread, loop=True)
         edges = keymap.edges.edges()
         poses = optimise(before, edges)
         _, squares = residuals(poses, edges)
         holds = trust(squares, edges.loop) > 0.5
-        if not holds[count:].all() or (held & ~holds[:count]).sum() > 0.02 * count:
+        if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > BROKEN * count:
             keymap.edges.cut(count)
             self.refused += len(hits)
             return False
         keymap.poses = poses
         return True
+
+
+def _window(covariance: Array) -> tuple[float, float]:
+    """Half widths of the search, m and rad, for this drift."""
+    place, turn = deviations(covariance)
+    return WINDOW * place + MARGIN[0], WINDOW * turn + MARGIN[1]
+
+
+def _surroundings(keymap: KeyMap, numbers: NDArray[np.intp], centre: int) -> Scan:
+    """What the numbered key scans saw, in the frame of ``centre``."""
+    poses = between(keymap.poses[centre], keymap.poses[numbers])
+    return merged([keymap.keys[k].scan for k in numbers], poses).thinned(QUERY_CELL, QUERY_POINTS)
+
+
+def _distance(keymap: KeyMap, place: int) -> Array:
+    off = keymap.poses[:, :2] - keymap.poses[place, :2]
+    return np.asarray(np.hypot(off[:, 0], off[:, 1]))
+
+
+def _way(keymap: KeyMap, hits: list[_Hit]) -> float:
+    """Way between the places the hits were made from, m."""
+    first, last = min(hit.target for hit in hits), max(hit.target for hit in hits)
+    steps = np.diff(keymap.poses[first : last + 1, :2], axis=0)
+    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())

@@ -120,11 +120,12 @@ class KeyMap:
             steady = self.edges.edges().chosen(self.edges.odometry)
             self.poses = refine(self.keys, self.poses, steady)
 
-    def thin(self) -> tuple[NDArray[np.int64], Array]:
+    def thin(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
         """Leave out key scans that others stand in for.
 
         Returns:
-            The number by which every former key scan is known now, shape (n,), and its pose in that one's frame, (n, 3).
+            For every former key scan whether it is kept, (n,), the number by which it is known now, (n,), and its pose in
+            the frame of the key scan of that number, (n, 3).
         """
         gone, stand_in, edges, spread, odometry = thinned(
             self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.thinning
@@ -134,7 +135,7 @@ class KeyMap:
         self.edges.replace(edges.renumbered(number), spread, odometry)
         self.keys = [key for key, left_out in zip(self.keys, gone.tolist(), strict=True) if not left_out]
         self.poses = self.poses[~gone]
-        return number[stand_in], offset
+        return ~gone, number[stand_in], offset
 
     def _closeness(self, numbers: Numbers, pose: Array) -> Array:
         off = between(pose, self.poses[numbers])

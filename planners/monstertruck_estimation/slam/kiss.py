@@ -7,9 +7,13 @@ a failure, so every result is registered once more by the common measure (overla
 from typing import Final
 
 import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.mapping import VoxelHashMap
+from kiss_icp.registration import get_registration
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.frontend import LEAST_PAIRS, Match, Verdict, judge, rejected
+from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.submap import Submap
 
@@ -27,18 +31,38 @@ KERNEL: Final = 0.1
 
 
 class Kiss:
-    """``KissOdometry`` as a front end, judged against the submap."""
+    """See ``FrontEnd``; the map it registers to is the mapper's submap, so that loop closures move it too."""
 
     def __init__(self) -> None:
-        self._odometry = KissOdometry()
+        config = KISSConfig()
+        config.registration.max_num_threads = 1
+        self._registration = get_registration(config)
+        self._map = VoxelHashMap(VOXEL, FARTHEST, PER_VOXEL)
+        self._submap: Submap | None = None
 
     def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
         """See ``FrontEnd``."""
         if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
             return rejected(guess, covariance, Verdict.EMPTY)
-        moved = self._odometry.register(scan.points, delta)
-        pose = compose(compose(guess, inverse(delta)), moved)
+        if submap is not self._submap:
+            self._submap = submap
+            self._map.clear()
+            self._map.add_points(_spatial(submap.cloud.points))
+        found = self._registration.align_points_to_map(
+            points=_spatial(scan.points),
+            voxel_map=self._map,
+            initial_guess=_matrix(guess),
+            max_correspondance_distance=REACH,
+            kernel=KERNEL,
+        )
+        pose = np.array((found[0, 3], found[1, 3], np.arctan2(found[1, 0], found[0, 0])))
+        if not np.isfinite(pose).all():
+            return rejected(guess, covariance, Verdict.FAR)
         return judge(measure(scan, submap.cloud, pose), guess, covariance)
+
+
+def _spatial(points: Array) -> Array:
+    return np.column_stack((points, np.zeros(len(points))))
 
 
 def _matrix(pose: Array) -> Array:

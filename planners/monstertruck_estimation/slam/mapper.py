@@ -64,7 +64,7 @@ class Mapper:
         self.map = KeyMap(self.config)
         self._front: FrontEnd = front or Planar()
         self._motion = MotionModel(self.config)
-        self._closer = LoopCloser(self.config)
+        self._closer = LoopCloser()
         self._trail = Trail(self.config.most_scans)
         self._stamp: int | None = None
         self._pose = np.zeros(3)
@@ -146,8 +146,9 @@ class Mapper:
                 self._pose = self.map.poses[-1].copy()
         if len(self.map) > self.config.most_keys:
             events += (Event.THINNED,)
-            self._trail.move(*self.map.thin())
-            self._closer.forget()
+            kept, stand_in, offset = self.map.thin()
+            self._trail.move(stand_in, offset)
+            self._closer.forget(kept)
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._look_around()
         return events
