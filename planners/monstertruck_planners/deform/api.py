@@ -84,6 +84,8 @@ class Memory:
     """Poses of the guide that are in the band, or behind."""
     path: MotionPath | None = None
     """The result of the last cycle."""
+    failed: int = 0
+    """Local searches in a row that found nothing: the next one takes another heading at its goal."""
     turning: tuple[float, ...] = ()
     """Of a turn on the spot: start x, y, yaw and wanted yaw."""
 

@@ -46,8 +46,14 @@ class DeformConfig(Schema):
     """Length of the route looked at, m."""
     inset: NotNegative = 0.1
     """Kept between the window's border and the circle round the footprint where the route is cut, m."""
-    effort: Count = 2000
+    effort: Count = 1500
     """Search steps and improvement trials of a local search."""
+    reverse_cost: Annotated[float, Field(ge=1)] = 3.0
+    """Of a metre backward, where the lidar does not look, m."""
+    cusp_cost: NotNegative = 0.3
+    """Of a change of direction, m."""
+    crab_cost: Annotated[float, Field(ge=1)] = 1.05
+    """Of a metre beside the heading, m."""
     shortest: Positive = 0.15
     """A free beginning of a blocked path is used from this length on, m."""
 
@@ -63,10 +69,6 @@ class RsbandConfig(DeformConfig):
     """Of the band poses joined one by one, m."""
     renew: Positive = 0.5
     """A path is replaced when less than this share of its length is left."""
-    cusp_cost: NotNegative = 0.3
-    """Of a change of direction, m."""
-    crab_cost: Annotated[float, Field(ge=1)] = 1.05
-    """Of a metre beside the heading, m."""
     off_path: Positive = 0.1
     """A path is replaced when the truck is further away from it, m."""
 

@@ -28,6 +28,18 @@ CUSP_REACHED = 0.1
 RUN_ENDED = 0.02
 """The same on its path, m."""
 
+STANDOFF = 0.5
+"""Where nothing leads round an obstacle the truck goes on along the route up to this far before it, m."""
+
+TURNED = (0.0, 1.0, -1.0)
+"""Headings at the end of the way round, beside the route's, rad."""
+
+PATIENCE = 5
+"""Searches that fail before another heading is tried, each beginning with a deep search."""
+
+DEEP = 3
+"""Effort of a deep search, as a factor."""
+
 LOOK_BACK = 0.05
 """Sampling of a path where the truck looks for its place on it, m."""
 
@@ -50,14 +62,16 @@ class Surveyor:
     Args:
         vehicle: what is driven.
         config: of the deformer.
-        search: costs of the local search; margin and effort are those of ``config``.
+        search: costs and effort of the local search; the margin is that of ``config``.
     """
 
     def __init__(self, vehicle: Vehicle, config: DeformConfig, search: HybridConfig | None = None) -> None:
         self.vehicle, self.config = vehicle, config
         self.cover = cover_of(vehicle.footprint)
-        search = (search or HybridConfig()).model_copy(update={"effort": config.effort})
+        search = search or HybridConfig(effort=config.effort)
         margins = dict.fromkeys((config.margin, 0.0))
+        deep = search.model_copy(update={"margin": config.margin, "effort": DEEP * search.effort})
+        self._deep = HybridPlanner(vehicle, deep)
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
 
     def cut(self, guide: Guide, surroundings: DistanceField, pose: Array, memory: Memory) -> Local | None:
@@ -71,7 +85,7 @@ class Surveyor:
             entered = int(np.argmin(apart(guide.poses, pose)))
             near = None
         else:
-            near = band.part(passed(band, pose), len(band.poses))
+            near = onward(band, pose)
         ahead = guide.part(entered, len(guide.poses)) if entered < len(guide.poses) else None
         count = 0 if ahead is None else self._seen(ahead, near, surroundings, pose)
         if ahead is not None and count:
@@ -111,10 +125,25 @@ class Surveyor:
             return path.length
         return float(samples.travelled[max(int(np.argmin(free)) - 1, 0)])
 
-    def search(self, surroundings: DistanceField, pose: Array, goal: Array) -> tuple[MotionPath | None, Reason]:
-        """Way to a pose by a small search, with the margin or at least without contact."""
+    def search(
+        self, surroundings: DistanceField, pose: Array, local: Local, failed: int
+    ) -> tuple[MotionPath | None, Reason]:
+        """Way to the end of the band by a small search, with the margin or at least without contact.
+
+        Args:
+            surroundings: obstacles.
+            pose: of the truck.
+            local: the band; where it does not end with the route, other headings will do there.
+            failed: searches in a row that found nothing.
+        """
+        goal = local.band.poses[-1].copy()
+        if not local.final:
+            goal[2] += TURNED[failed // PATIENCE % len(TURNED)]
         reason = Reason.PATH_BLOCKED
-        for planner in self._planners:
+        first, *others = self._planners
+        if failed % PATIENCE == 1:
+            first = self._deep
+        for planner in (first, *others):
             result = planner.plan(RouteMap(surroundings), pose, goal)
             if result.path is not None and len(result.path.rows):
                 return result.path, Reason.OK
@@ -128,16 +157,56 @@ class Surveyor:
         return self._planners[0].cost(RouteMap(surroundings), path)
 
     def partial(
-        self, memory: Memory, surroundings: DistanceField, rest: MotionPath | None, why: Reason, text: str
+        self, memory: Memory, surroundings: DistanceField, here: Array, rest: MotionPath | None, why: Reason
     ) -> DeformResult:
-        """The free beginning of the path so far, or failure with its reason."""
+        """What may be driven though there is no way on: the beginning of the path so far, or of the route."""
+        reason = why if why is Reason.START_BLOCKED else Reason.PATH_BLOCKED
+        text = f"the local search says: {why.text}"
         if rest is not None:
             length = self.free_length(surroundings, rest)
             length -= self.config.shortest if length < rest.length else 0.0
             if length >= self.config.shortest:
                 part = rest.part(0.0, length)
-                return DeformResult(Reason.PATH_PARTIAL, replace(memory, path=rest), part, text=text)
-        return DeformResult(why, replace(memory, path=None), text=text)
+                return DeformResult(
+                    Reason.PATH_PARTIAL, replace(memory, path=rest, failed=memory.failed + 1), part, text=text
+                )
+        if memory.band is not None and reason is Reason.PATH_BLOCKED:
+            way = self._approach(memory.band, surroundings, here)
+            if way is not None:
+                return DeformResult(
+                    Reason.PATH_PARTIAL, replace(memory, path=way, failed=memory.failed + 1), way, text=text
+                )
+        return DeformResult(reason, replace(memory, path=None, failed=memory.failed + 1), text=text)
+
+    def _approach(self, band: Guide, surroundings: DistanceField, here: Array) -> MotionPath | None:
+        """Motion along the band to some distance before what blocks it; None if the truck is there."""
+        free = surroundings.free(self.vehicle.footprint, band.poses, self.config.margin)
+        broken = len(free) if free.all() else int(np.argmin(free))
+        travelled = band.travelled
+        first_run = next(end for _, end in runs(band.directions))
+        near = np.flatnonzero(travelled[:first_run] <= travelled[max(broken - 1, 0)] - STANDOFF)
+        if not len(near) or travelled[near[-1]] < self.config.shortest:
+            return None
+        path = self.vehicle.steer().path(here, band.poses[near[-1]])
+        return path if path.cusps == 0 and self.free(surroundings, path) else None
+
+
+def costs_of(config: DeformConfig) -> HybridConfig:
+    """Costs of local searches and motions."""
+    return HybridConfig(
+        reverse_cost=config.reverse_cost, cusp_cost=config.cusp_cost, crab_cost=config.crab_cost, effort=config.effort
+    )
+
+
+def onward(band: Guide, pose: Array) -> Guide:
+    """The band from the truck on; a cusp that is reached belongs to what follows it."""
+    at = passed(band, pose)
+    rest = band.part(at, len(band.poses))
+    if len(rest.poses) > 1 and math.hypot(*(rest.poses[0] - pose)[:2]) <= CUSP_REACHED:
+        directions = rest.directions.copy()
+        directions[0] = directions[1]
+        return Guide(rest.poses, directions)
+    return rest
 
 
 def passed(band: Guide, pose: Array) -> int:

@@ -19,7 +19,7 @@ from monstertruck_planners.deform import bubbles
 from monstertruck_planners.deform.api import DeformResult, Guide, Memory
 from monstertruck_planners.deform.band import rules_of, stretch
 from monstertruck_planners.deform.config import BandConfig, PublishedConfig
-from monstertruck_planners.deform.local import Surveyor
+from monstertruck_planners.deform.local import Local, Surveyor
 from monstertruck_planners.deform.rsband import checked, ends_at
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
@@ -49,7 +49,9 @@ class Published:
     def __init__(self, vehicle: Vehicle, config: PublishedConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or PublishedConfig()
-        search = HybridConfig(improve=False, cusp_cost=0.0, swing_cost=0.0, clearance_cost=0.0)
+        search = HybridConfig(
+            improve=False, effort=self.config.effort, cusp_cost=0.0, swing_cost=0.0, clearance_cost=0.0
+        )
         config = self.config.model_copy(update={"margin": 0.0})
         states = Vehicle(DiscFootprint((0.0,), self.config.inflation), self.config.radius, 0.0, vehicle.steering)
         self._states = Surveyor(states, config, search)
@@ -101,7 +103,8 @@ class Published:
         path = self._steer.path(here, goal)
         if len(path.rows) and self._states.free(surroundings, path):
             return path
-        return self._states.search(surroundings, here, goal)[0]
+        end = Local(Guide(goal[None], np.ones(1)), 0, final=True)
+        return self._states.search(surroundings, here, end, 0)[0]
 
     def _joined(self, poses: Array, surroundings: DistanceField) -> MotionPath | None:
         """The path of the strategy."""

@@ -15,9 +15,8 @@ from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.deform.api import DeformResult, Guide, Memory, apart
 from monstertruck_planners.deform.band import rules_of, stretch
 from monstertruck_planners.deform.config import RsbandConfig
-from monstertruck_planners.deform.local import CUSP_REACHED, Local, Surveyor, rest_of, runs
+from monstertruck_planners.deform.local import CUSP_REACHED, RUN_ENDED, Local, Surveyor, costs_of, rest_of, runs
 from monstertruck_planners.route.api import Vehicle
-from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
@@ -51,7 +50,7 @@ class Rsband:
     def __init__(self, vehicle: Vehicle, config: RsbandConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or RsbandConfig()
-        costs = HybridConfig(cusp_cost=self.config.cusp_cost, crab_cost=self.config.crab_cost)
+        costs = costs_of(self.config)
         self._steer = vehicle.steer(costs)
         self._surveyor = Surveyor(vehicle, self.config, costs)
         self._rules = rules_of(self.config.band, self._surveyor.cover)
@@ -76,17 +75,17 @@ class Rsband:
         ended_there = rest is not None and ends_at(rest, guide.poses[-1])
         if (
             rest is not None
-            and self._good(rest, far, ended_there=ended_there)
+            and self._good(rest, far, to_end=ended_there or to_cusp(rest, local.band))
             and self._surveyor.free(surroundings, rest)
         ):
             kept = replace(memory, path=rest)
             return DeformResult(Reason.OK, kept, rest, ended_there, statistics={"kept": 1.0})
         return self._fresh(local, surroundings, here, memory, rest)
 
-    def _good(self, rest: MotionPath, far: float, *, ended_there: bool) -> bool:
+    def _good(self, rest: MotionPath, far: float, *, to_end: bool) -> bool:
         if far > self.config.off_path or not len(rest.rows):
             return False
-        return ended_there or rest.length > self.config.renew * self.config.sub_goal
+        return rest.length > (RUN_ENDED if to_end else self.config.renew * self.config.sub_goal)
 
     def _fresh(
         self, local: Local, surroundings: DistanceField, here: Array, memory: Memory, rest: MotionPath | None
@@ -103,16 +102,15 @@ class Rsband:
         if band.guide is not None:
             motion = self._strategy(band.guide, surroundings, here)
             if motion is not None:
-                after = replace(memory, band=band.guide.part(1, len(band.guide.poses)), path=motion.path)
+                after = replace(memory, band=band.guide.part(1, len(band.guide.poses)), path=motion.path, failed=0)
                 done = ends_at(motion.path, memory.guide.poses[-1])  # type: ignore[union-attr]
                 return DeformResult(Reason.OK, after, motion.path, done, statistics=statistics)
         statistics["searched"] = 1.0
-        path, why = self._surveyor.search(surroundings, here, local.band.poses[-1])
+        path, why = self._surveyor.search(surroundings, here, local, memory.failed)
         if path is None:
-            text = f"the local search says: {why.text}"
-            why = why if why is Reason.START_BLOCKED else Reason.PATH_BLOCKED
-            return replace(self._surveyor.partial(memory, surroundings, rest, why, text), statistics=statistics)
-        after = replace(memory, band=Guide.from_motion(path), path=path)
+            result = self._surveyor.partial(memory, surroundings, here, rest, why)
+            return replace(result, statistics=statistics)
+        after = replace(memory, band=Guide.from_motion(path), path=path, failed=0)
         return DeformResult(Reason.OK, after, path, local.final, statistics=statistics)
 
     def _join(self, surroundings: DistanceField, here: Array, goal: Array) -> MotionPath | None:
@@ -216,6 +214,16 @@ def with_robot(band: Guide, here: Array) -> Guide:
         if behind and band.directions[0] == band.directions[1]:
             band = band.part(1, len(band.poses))
     return Guide(here[None], band.directions[:1]).then(band)
+
+
+def to_cusp(path: MotionPath, band: Guide) -> bool:
+    """Whether a path leads to where its band changes direction, or the band has done so already."""
+    if not len(path.rows):
+        return False
+    if path.rows[-1, 0] * band.directions[0] < 0:
+        return True
+    cusps = band.poses[np.flatnonzero(np.diff(band.directions))]
+    return bool((apart(cusps, path.end) < 0.05).any())
 
 
 def ends_at(path: MotionPath, goal: Array) -> bool:

@@ -16,7 +16,7 @@ from monstertruck_planners.deform.api import DeformResult, Guide, Memory
 from monstertruck_planners.deform.band import rules_of, stretch
 from monstertruck_planners.deform.config import TebConfig
 from monstertruck_planners.deform.least_squares import Terms, settle
-from monstertruck_planners.deform.local import Local, Surveyor, rest_of, runs, ways
+from monstertruck_planners.deform.local import Local, Surveyor, costs_of, rest_of, runs, ways
 from monstertruck_planners.deform.rsband import checked, ends_at, with_robot
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
@@ -26,6 +26,12 @@ Array = NDArray[np.float64]
 
 AXLE_LIMIT = 0.4
 """Angle that belongs to the turning radius, for the steering rate of trucks that cannot crab, rad."""
+
+BEFORE_CUSP = 0.25
+"""A band that moved its cusp away from the truck for ever would never change direction, m."""
+
+WHOLE = 0.05
+"""A path that ends further from its band's end is only a part of it, m."""
 
 TAUT = 0.9
 """Share of the steering that the least squares may use: what they leave over has room."""
@@ -42,7 +48,7 @@ class Teb:
     def __init__(self, vehicle: Vehicle, config: TebConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or TebConfig()
-        self._surveyor = Surveyor(vehicle, self.config)
+        self._surveyor = Surveyor(vehicle, self.config, costs_of(self.config))
         self._rules = rules_of(self.config.band, self._surveyor.cover)
         self.terms = terms_of(vehicle, self.config)
 
@@ -60,25 +66,32 @@ class Teb:
             return DeformResult(Reason.PATH_BLOCKED, memory, text="no pose of the route in the window is free")
         memory = replace(memory, band=local.band, entered=local.entered)
         statistics = {"searched": 0.0, "poses": 0.0, "steps": 0.0, "kept": 0.0}
-        path = self._from_band(local, surroundings, here, statistics)
         rest = rest_of(memory.path, here)[0] if memory.path is not None else None
-        if path is None and rest is not None and self._usable(rest, surroundings):
+        path = None
+        if rest is None or not turns_soon(rest):
+            path = self._from_band(local, surroundings, here, statistics)
+        if path is None and rest is not None and self._usable(rest, local, surroundings):
             path = rest
             statistics["kept"] = 1.0
         if path is None:
             statistics["searched"] = 1.0
-            found, why = self._surveyor.search(surroundings, here, local.band.poses[-1])
+            found, why = self._surveyor.search(surroundings, here, local, memory.failed)
             if found is None:
-                text = f"the local search says: {why.text}"
-                why = why if why is Reason.START_BLOCKED else Reason.PATH_BLOCKED
-                return replace(self._surveyor.partial(memory, surroundings, rest, why, text), statistics=statistics)
+                result = self._surveyor.partial(memory, surroundings, here, rest, why)
+                return replace(result, statistics=statistics)
             path = self._settled(Guide.from_motion(found, self.config.spacing), surroundings, statistics) or found
         done = local.final and ends_at(path, guide.poses[-1])
-        after = replace(memory, band=Guide.from_motion(path, self.config.spacing), path=path)
+        end = local.band.poses[-1]
+        whole = math.hypot(*(path.end - end)[:2]) < WHOLE
+        band = Guide.from_motion(path, self.config.spacing) if whole else local.band
+        after = replace(memory, band=band, path=path, failed=0)
         return DeformResult(Reason.OK, after, path, done, statistics=statistics)
 
-    def _usable(self, rest: MotionPath, surroundings: DistanceField) -> bool:
-        return rest.length > self.config.shortest and self._surveyor.free(surroundings, rest)
+    def _usable(self, rest: MotionPath, local: Local, surroundings: DistanceField) -> bool:
+        """Whether the path so far may be kept: long enough, free, and not one that gave up before the band's end."""
+        long = rest.length > self.config.shortest
+        near = long and math.hypot(*(rest.end - local.band.poses[-1])[:2]) < self.config.reach / 3
+        return near and self._surveyor.free(surroundings, rest)
 
     def _from_band(
         self, local: Local, surroundings: DistanceField, here: Array, statistics: dict[str, float]
@@ -160,6 +173,13 @@ def drivable(vehicle: Vehicle, terms: Terms, band: Array, directions: Array) -> 
     curvature = np.cos(slip) * (front - rear) / reach
     rows = np.column_stack((length, curvature, slip))[np.abs(length) > 1e-4]
     return MotionPath(band[0, :3], rows, ways(vehicle, rows), vehicle.reference)  # type: ignore[arg-type]
+
+
+def turns_soon(path: MotionPath) -> bool:
+    """Whether the path changes direction within the next metres: there it stays as it is."""
+    signs = np.sign(path.rows[:, 0])
+    change = np.flatnonzero(np.diff(signs))
+    return bool(len(change)) and float(np.abs(path.rows[: change[0] + 1, 0]).sum()) < BEFORE_CUSP
 
 
 def resampled(guide: Guide, spacing: float) -> Guide:

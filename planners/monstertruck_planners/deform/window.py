@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import binary_dilation
 
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.errors import InputError
@@ -26,12 +27,15 @@ class WindowConfig(Schema):
     """Returns up to this distance are obstacles, m."""
     clear: Annotated[float, Field(gt=0)] = 4.0
     """Beams clear up to this distance, m."""
+    thickness: Annotated[float, Field(ge=0)] = 0.12
+    """Obstacles are taken to be this thick where nobody has looked behind them, m."""
 
 
 class Window:
     """Obstacles round the truck, in a grid whose axes are those of the frame.
 
-    Cells nobody has seen are free; what is out of sight stays as it was seen last.
+    Cells nobody has seen are free unless they lie just behind an obstacle; what is out of sight stays as it was seen
+    last.
 
     Args:
         config: size and resolution.
@@ -41,6 +45,7 @@ class Window:
         self.config = config or WindowConfig()
         count = round(self.config.size / self.config.resolution)
         self.cells: NDArray[np.bool_] = np.zeros((count, count), np.bool_)
+        self.seen: NDArray[np.bool_] = np.zeros((count, count), np.bool_)
         self._corner: tuple[int, int] | None = None
 
     def add_scan(
@@ -63,7 +68,7 @@ class Window:
         res = self.config.resolution
         corner = np.array(self.corner)
         start = (np.array(sensor) - corner) / res
-        _mark(self.cells, start, (ends - corner) / res, hit, self.config.mark / res, self.config.clear / res)
+        _mark(self.cells, self.seen, start, (ends - corner) / res, hit, self.config.mark / res, self.config.clear / res)
 
     @property
     def corner(self) -> tuple[float, float]:
@@ -80,6 +85,9 @@ class Window:
         x, y = self.corner
         res = self.config.resolution
         occupied = self.cells
+        layers = round(self.config.thickness / res)
+        if layers and occupied.any():
+            occupied = occupied | (binary_dilation(occupied, iterations=layers) & ~self.seen)
         if known is not None:
             rows, columns = occupied.shape
             px, py = np.meshgrid(x + (np.arange(columns) + 0.5) * res, y + (np.arange(rows) + 0.5) * res)
@@ -93,18 +101,30 @@ class Window:
         corner = tuple(math.floor(v / self.config.resolution) - count // 2 for v in base)
         if self._corner is not None and corner != self._corner:
             columns, rows = corner[0] - self._corner[0], corner[1] - self._corner[1]
-            fresh = np.zeros_like(self.cells)
-            if abs(columns) < count and abs(rows) < count:
-                old = self.cells[max(rows, 0) : count + min(rows, 0), max(columns, 0) : count + min(columns, 0)]
-                r, c = max(-rows, 0), max(-columns, 0)
-                fresh[r : r + old.shape[0], c : c + old.shape[1]] = old
-            self.cells = fresh
+            self.cells, self.seen = _moved(self.cells, rows, columns), _moved(self.seen, rows, columns)
         self._corner = (corner[0], corner[1])
+
+
+def _moved(cells: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool_]:
+    """What a window shows that has moved up by rows and right by columns."""
+    count = len(cells)
+    fresh = np.zeros_like(cells)
+    if abs(columns) < count and abs(rows) < count:
+        old = cells[max(rows, 0) : count + min(rows, 0), max(columns, 0) : count + min(columns, 0)]
+        r, c = max(-rows, 0), max(-columns, 0)
+        fresh[r : r + old.shape[0], c : c + old.shape[1]] = old
+    return fresh
 
 
 @njit(cache=True)
 def _mark(
-    cells: NDArray[np.bool_], start: Array, ends: Array, hit: NDArray[np.bool_], mark: float, clear: float
+    cells: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
+    start: Array,
+    ends: Array,
+    hit: NDArray[np.bool_],
+    mark: float,
+    clear: float,
 ) -> None:
     """Clear the cells along all beams, then mark where they met something; all in cells."""
     rows, columns = cells.shape
@@ -121,8 +141,10 @@ def _mark(
             if not (0 <= r < rows and 0 <= c < columns):
                 break
             cells[r, c] = False
+            seen[r, c] = True
     for i in range(len(ends)):
         c, r = math.floor(ends[i, 0]), math.floor(ends[i, 1])
         near = (ends[i, 0] - start[0]) ** 2 + (ends[i, 1] - start[1]) ** 2 <= mark * mark
         if hit[i] and near and 0 <= r < rows and 0 <= c < columns:
             cells[r, c] = True
+            seen[r, c] = True
