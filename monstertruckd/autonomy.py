@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
@@ -19,9 +19,15 @@ from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.goal_build import build_goals
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
+from monstertruckd.slam_service import SlamService
 
+SCANS: Final = 16
+"""Scans that may wait for the estimation worker."""
+ODOMETRIES: Final = 256
+"""Poses and angles that may wait for a scan."""
 SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 
@@ -48,13 +54,17 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
     joints = mounts.pop("stabiliser", None)
     if joints is not None and "lidar" in mounts:
         mounts["lidar"] = compose(invert(joints), mounts["lidar"])
+    slam = _build_slam(config, bus, clock)
     yield TransformService(
         list(mounts.values()),
         clock,
         bus.subscribe(topics.ODOMETRY, latest()),
         bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION),
         joints=None if joints is None else (joints, bus.subscribe(topics.STABILISER, latest())),
+        localised=tuple if slam is None else slam.frames,
     )
+    if slam is not None:
+        yield slam
     if config.missing_actuators() is not None:
         return
     yield OdometryService(
@@ -64,21 +74,45 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         steering=bus.subscribe(topics.STEERING, latest()) if body.chassis.linkage is not None else None,
         compass=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
         odometry=bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
-        pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+        pose=bus.publisher(topics.POSE, Writer.ESTIMATION) if slam is None else None,
         rate=config.odometry.rate,
+    )
+
+
+def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
+    devices = config.devices
+    if config.slam is None or devices.lidar is None:
+        return None
+    return SlamService(
+        config.slam,
+        devices.lidar.mount,
+        clock,
+        scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
+        odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
+        compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)) if devices.compass is not None else None,
+        joints=bus.subscribe(topics.STABILISER, fifo(ODOMETRIES)) if devices.stabiliser is not None else None,
+        pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+        whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
+        tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),
+        health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
+        events=bus.event_sink(),
     )
 
 
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
-        drawn = load_path(config.path.file, closed=config.path.closed) if config.path is not None else None
+        paths, wishes = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
+        frame = "odom" if config.slam is None else "map"
+        drawn = None
+        if config.path is not None:
+            drawn = load_path(config.path.file, closed=config.path.closed, frame=frame)
         yield PathService(
             drawn,
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),
             bus.subscribe(topics.GATE, latest()),
-            bus.publisher(topics.PATH, Writer.PLANNER),
+            paths,
             bus.event_sink(),
             config.gate.max_request_age,
         )
@@ -89,15 +123,17 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             steering=body.chassis.bicycle,
             footprint=body.footprint,
             lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
-            pose=bus.subscribe(topics.ODOMETRY, latest()),
+            pose=bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
             path=bus.subscribe(topics.PATH, latest()),
             gate=bus.subscribe(topics.GATE, latest()),
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             attitude=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
-            drive=bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER),
+            drive=wishes,
             tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
             events=bus.event_sink(),
         )
+        if config.planner is not None:
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield StabiliserService(
             config.levelling,

@@ -15,7 +15,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.gate.sources import OPERATORS, Sequences, freshness
+from monstertruckd.gate.sources import Sequences, refusal
 
 HEADER = ["x", "y", "yaw", "direction"]
 
@@ -23,8 +23,8 @@ MOVING: Final = frozenset({GateMode.DRIVING, GateMode.STOPPING})
 """Modes in which the path stays as it is."""
 
 
-def load_path(file: FilePath, *, closed: bool) -> Path:
-    """Read a path from CSV: header ``x,y,yaw,direction``; metres, metres, radians, +1 or -1.
+def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
+    """Read a path in ``frame`` from CSV: header ``x,y,yaw,direction``; metres, metres, radians, +1 or -1.
 
     Raises:
         InputError: naming file and line, and what was expected.
@@ -43,7 +43,7 @@ def load_path(file: FilePath, *, closed: bool) -> Path:
         stamp=0,
         received=0,
         seq=0,
-        frame="odom",
+        frame=frame,
         poses=values[:, :3].ravel(),
         directions=values[:, 3],
         closed=closed,
@@ -124,11 +124,7 @@ class PathService:
             InputError: the path cannot be tracked.
         """
         gate = self._gate.latest
-        reason = Reason.BAD_NONCE if gate is None else self._sequences.accept(request, gate.nonce)
-        if reason is Reason.OK:
-            reason = freshness(request, self._clock.now(), self._max_age)
-        if reason is Reason.OK and request.role not in OPERATORS:
-            reason = Reason.BAD_ROLE
+        reason = refusal(request, gate, self._sequences, self._clock.now(), self._max_age)
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
         if gate is not None and gate.mode in MOVING:

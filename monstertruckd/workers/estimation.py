@@ -44,7 +44,7 @@ class EstimationWorker:
         if inputs.scan is not None:
             refused = self._refusal(inputs.scan)
             if refused is None:
-                scan = prepared(inputs.scan, self._longest)
+                scan = prepared(inputs.scan, self._longest, estimator.twist)
                 if len(scan) < FEWEST:
                     refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
                 else:

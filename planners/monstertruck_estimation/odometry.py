@@ -223,7 +223,7 @@ class DeadReckoning:
 
 
 class OdometryService:
-    """Publishes dead reckoning on an absolute schedule, in odom and, unchanged, in map.
+    """Publishes dead reckoning on an absolute schedule, in odom and, unless something localises, unchanged in map.
 
     Args:
         reckoning: the filter.
@@ -232,7 +232,7 @@ class OdometryService:
         steering: servo feedback, of a body that steers.
         compass: headings, if there is a compass.
         odometry: ``state/odometry``.
-        pose: ``state/pose``.
+        pose: ``state/pose``; None = something else publishes it.
         rate: poses per second.
     """
 
@@ -247,7 +247,7 @@ class OdometryService:
         steering: Subscription[SteeringFeedback] | None,
         compass: Subscription[Attitude] | None,
         odometry: Publisher[Odometry],
-        pose: Publisher[Odometry],
+        pose: Publisher[Odometry] | None,
         rate: float = 50.0,
     ) -> None:
         self._reckoning = reckoning
@@ -273,7 +273,8 @@ class OdometryService:
             if estimate is not None:
                 message = _message(estimate, now, self._odometry.next_seq())
                 self._odometry.put(message)
-                self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
+                if self._pose is not None:
+                    self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
     def _take(self) -> None:
         steering = None if self._steering is None else self._steering.latest

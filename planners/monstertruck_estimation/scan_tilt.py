@@ -32,6 +32,21 @@ def plane_tilt(roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: 
     return math.acos(min(max(up, -1.0), 1.0))
 
 
+def plane_slopes(
+    roll: float, pitch: float, joint_pitch: float = 0.0, joint_roll: float = 0.0, yaw: float = 0.0
+) -> tuple[float, float]:
+    """Rise per metre along the x and y axis of a lidar mounted at ``yaw``; the other arguments as in ``plane_tilt``.
+
+    The columns of M = Ry(a) Rx(b) Rz(yaw), seen along the body's view of up.
+    """
+    up = -math.sin(pitch), math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch)
+    ca, sa, cb, sb = math.cos(joint_pitch), math.sin(joint_pitch), math.cos(joint_roll), math.sin(joint_roll)
+    along = up[0] * ca - up[2] * sa
+    across = up[0] * sa * sb + up[1] * cb + up[2] * ca * sb
+    c, s = math.cos(yaw), math.sin(yaw)
+    return along * c + across * s, across * c - along * s
+
+
 class Track:
     """Recent values of two angles, read at any instant between and shortly after them."""
 

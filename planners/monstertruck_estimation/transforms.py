@@ -5,7 +5,7 @@ A transform is the pose of ``child`` in ``parent``.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -212,6 +212,7 @@ class TransformService:
         rate: messages per second.
         joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Whatever it carries
             has it for parent; until the angles are known it counts as level.
+        localised: what a localisation knows of the frames above base; it outweighs odometry and the fixed map to odom.
     """
 
     name = "transforms"
@@ -224,12 +225,14 @@ class TransformService:
         out: Publisher[Transforms],
         rate: float = 10.0,
         joints: tuple[Transform, Subscription[StabiliserFeedback]] | None = None,
+        localised: Callable[[], Iterable[Transform]] = tuple,
     ) -> None:
         self._clock = clock
         self._odometry = odometry
         self._out = out
         self._rate = rate
         self._joints = joints
+        self._localised = localised
         self._tree = FrameTree([planar("map", "odom", FIXED, (0.0, 0.0, 0.0)), *mounts])
         if joints is not None:
             self._tree.put(joints[0])
@@ -255,6 +258,8 @@ class TransformService:
         if odometry is not None:
             pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
             self._tree.put(planar("odom", "base", odometry.stamp, pose))
+        for transform in self._localised():
+            self._tree.put(transform)
         if self._joints is None:
             return
         centre, feedback = self._joints[0], self._joints[1].latest

@@ -60,6 +60,51 @@ class RecorderHealth(Message):
     reason: Reason = Reason.OK
 
 
+class Standing(StrEnum):
+    """How much the pose in map is worth."""
+
+    MAPPING = "mapping"
+    """The scans fit the map that grows with them."""
+    LOCALISED = "localised"
+    """The scans fit the saved map."""
+    DEGENERATE = "degenerate"
+    """They fit, but say nothing along one direction, in which the pose is odometry."""
+    LOST = "lost"
+    """They have not fitted for a while: the pose is odometry."""
+    SEARCHING = "searching"
+    """Where on the saved map this is, is being searched for; the pose means nothing."""
+
+
+class SlamHealth(Message):
+    """How well the newest scan fitted the map, and what has happened since the start."""
+
+    standing: Standing
+    accepted: bool
+    """Whether the scan corrected the pose; otherwise odometry alone moved it."""
+    overlap: Annotated[float, Field(ge=0, le=1)]
+    """Share of the scan's points that fit the map."""
+    residual: Annotated[float, Field(ge=0)]
+    """Root mean square distance of those across the surfaces, m."""
+    degeneracy: Annotated[float, Field(ge=0)]
+    """Smaller over greater eigenvalue of what the scan knows of the position; near 0 in a corridor."""
+    direction: float
+    """Yaw in map along which it knows least, rad."""
+    scans: Annotated[int, Field(ge=0)] = 0
+    """Scans taken in."""
+    keys: Annotated[int, Field(ge=0)] = 0
+    """Scans the map is made of."""
+    closures: Annotated[int, Field(ge=0)] = 0
+    """Loops closed."""
+    rejected: Annotated[int, Field(ge=0)] = 0
+    """Matches that were not believed."""
+    left_out: Annotated[int, Field(ge=0)] = 0
+    """Scans that were too tilted, empty, late or of another geometry."""
+    drops: Annotated[int, Field(ge=0)] = 0
+    """Scans lost because the worker was too slow."""
+    offset: float | None = None
+    """Seconds by which odometry runs ahead of the scans, if it clearly does."""
+
+
 class LinkMedium(StrEnum):
     """What a network interface is."""
 

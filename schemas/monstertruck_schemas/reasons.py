@@ -90,6 +90,15 @@ class Reason(StrEnum):
     MESSAGES_DROPPED = "messages_dropped", 83, "a bounded queue overflowed"
     PATH_LOST = "path_lost", 84, "truck is too far from its path"
 
+    # Localisation and mapping
+    POSE_LOST = "pose_lost", 90, "the scans do not fit the map: the pose is odometry alone"
+    MATCH_DEGENERATE = "match_degenerate", 91, "the scans say nothing along one direction"
+    TIME_OFFSET = "time_offset", 92, "odometry and scans are stamped by clocks that disagree"
+    SCAN_LEFT_OUT = "scan_left_out", 93, "a scan cannot be used"
+    POSE_FOUND = "pose_found", 0, "the scans fit the map again"
+    LOOP_CLOSED = "loop_closed", 0, "a place was recognised and the map corrected"
+    MAP_SAVED = "map_saved", 0, "the map was saved"
+
     # USB
     HUB_LOST = "hub_lost", 100, "a USB hub vanished with everything behind it"
     HUB_RETURNED = "hub_returned", 0, "a USB hub is back, its devices start one after the other"

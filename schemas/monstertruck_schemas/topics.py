@@ -9,7 +9,7 @@ from typing import Final, Generic, TypeVar
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, LogRecord, Stop
-from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth
+from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth, SlamHealth
 from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
@@ -118,6 +118,13 @@ TRANSFORMS: Final = Topic(
     foxglove="foxglove.FrameTransforms",
 )
 MAP: Final = Topic("state/map", Grid, W.ESTIMATION, "Occupancy grid", 0.5, retained=True, foxglove="foxglove.Grid")
+MAP_TILES: Final = Topic(
+    "state/map_tiles",
+    Grid,
+    W.ESTIMATION,
+    "Tiles of the occupancy grid that have changed since the message of the whole grid, one each",
+    foxglove="foxglove.Grid",
+)
 GATE: Final = Topic(
     "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, 0.5, retained=True
 )
@@ -146,6 +153,7 @@ LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the contro
 RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, 3.0, retained=True)
 LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, 3.0)
 HOST: Final = Topic("health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, 3.0)
+SLAM: Final = Topic("health/slam", SlamHealth, W.ESTIMATION, "How well the scans fit the map", 10, 3.0)
 USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")

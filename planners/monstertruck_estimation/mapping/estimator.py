@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.config import GridConfig, SlamConfig
-from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Standing, Vector
+from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Vector
 from monstertruck_estimation.mapping.painter import Painter
 from monstertruck_estimation.mapping.storage import Graph, graph_of
 from monstertruck_estimation.mapping.time_offset import OffsetWatch
@@ -15,6 +15,7 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.frontend import FrontEnd, Match
 from monstertruck_estimation.slam.mapper import Event, Mapper
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_schemas.health import Standing
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,11 @@ class Estimator(Protocol):
 
     counts: dict[str, int]
     """Scans, key scans, closures, rejected matches."""
+
+    @property
+    def twist(self) -> Vector:
+        """Velocity of base by the last scans, m/s and rad/s."""
+        ...
 
     def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
         """Take a scan; None if it is not later than the one before."""
@@ -52,8 +58,14 @@ class Estimator(Protocol):
         ...
 
 
-def prepared(inputs: ScanInput, longest: float) -> Scan:
-    """Points of a scan in base: motion undone, levelled, without what hit the ground or the ceiling."""
+def prepared(inputs: ScanInput, longest: float, twist: Vector = (0.0, 0.0, 0.0)) -> Scan:
+    """Points of a scan in base: motion undone, levelled, without what hit the ground or the ceiling.
+
+    Args:
+        inputs: the scan.
+        longest: longer ranges are not used, m.
+        twist: of the base, m/s and rad/s, if odometry does not tell it.
+    """
     geometry = ScanGeometry(
         inputs.start_angle,
         inputs.angle_increment,
@@ -62,7 +74,7 @@ def prepared(inputs: ScanInput, longest: float) -> Scan:
         inputs.time_increment,
         inputs.mount,
     )
-    return prepare(levelled(inputs), geometry, inputs.twist, longest)
+    return prepare(levelled(inputs), geometry, twist if inputs.odom is None else inputs.twist, longest)
 
 
 def levelled(inputs: ScanInput) -> Array:
@@ -117,16 +129,21 @@ class MappingEstimator:
         self._misfits = 0
         self._offset = OffsetWatch()
 
+    @property
+    def twist(self) -> Vector:
+        """See ``Estimator``."""
+        return self.mapper.twist
+
     def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
         """See ``Estimator``."""
         odom = None if inputs.odom is None else np.array(inputs.odom)
         step = self.mapper.step(scan, inputs.stamp, odom)
         if step is None:
             return None
-        accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.keys) == 1)
+        accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.map) == 1)
         self._misfits = 0 if accepted else self._misfits + 1
         self.counts["scans"] += 1
-        self.counts["keys"] = len(self.mapper.keys)
+        self.counts["keys"] = len(self.mapper.map)
         self.counts["closures"] += Event.CLOSED in step.events
         self.counts["rejected"] += Event.REJECTED in step.events
         self._moved |= Event.CLOSED in step.events
@@ -161,9 +178,8 @@ class MappingEstimator:
 
     def finish(self) -> None:
         """See ``Estimator``."""
-        if len(self.mapper.keys) > 1:
-            self.mapper.finish()
-            self._moved = True
+        self.mapper.finish()
+        self._moved = True
 
     def _follow(self) -> None:
         if self._moved:

@@ -1,33 +1,19 @@
 """What goes into the estimation worker and what comes out; light, so that the daemon can hold it."""
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_schemas.health import Standing
+
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 UNKNOWN: Final = -1
 """Value of a cell nothing is known of."""
-
-
-class Standing(StrEnum):
-    """How much the pose in map is worth."""
-
-    MAPPING = "mapping"
-    """The scans fit the map that grows with them."""
-    LOCALISED = "localised"
-    """The scans fit the saved map."""
-    DEGENERATE = "degenerate"
-    """They fit, but say nothing along one direction, in which the pose is odometry."""
-    LOST = "lost"
-    """They have not fitted for a while: the pose is odometry."""
-    SEARCHING = "searching"
-    """Where on the saved map this is, is being searched for; the pose means nothing."""
 
 
 @dataclass(frozen=True, slots=True)

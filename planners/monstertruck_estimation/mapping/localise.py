@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.estimator import LOST_AFTER, estimate, standing_of
-from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Standing, Vector
-from monstertruck_estimation.mapping.storage import Graph, SavedMap
+from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Vector
+from monstertruck_estimation.mapping.storage import Graph, SavedMap, elements
 from monstertruck_estimation.mapping.time_offset import OffsetWatch
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import correlate
@@ -27,6 +27,7 @@ from monstertruck_estimation.slam.submap import Submap, merged
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import OCCUPIED
+from monstertruck_schemas.health import Standing
 
 Array = NDArray[np.float64]
 
@@ -69,7 +70,9 @@ def submap_of(saved: SavedMap) -> Submap:
     step = saved.grid.resolution
     points = np.stack((columns, rows), axis=-1) * step + step / 2 + np.array(saved.grid.origin)
     normals = np.tile((1.0, 0.0), (len(points), 1))
-    return Submap(Cloud.of(Scan(points, normals, np.full((len(points), 2), max(step, 0.03) ** 2))))
+    return Submap(
+        Cloud.of(elements(points, normals=normals, variances=np.full((len(points), 2), max(step, 0.03) ** 2)))
+    )
 
 
 class Searcher:
@@ -93,7 +96,7 @@ class Searcher:
         step = self._mapper.step(scan, stamp, odom)
         if step is None or Event.KEY not in step.events:
             return None
-        here = self._mapper.poses[-1]
+        here = self._mapper.map.poses[-1]
         query = self._query(here)
         found = self._look(query)
         if found is None:
@@ -105,9 +108,9 @@ class Searcher:
         return None
 
     def _query(self, here: Array) -> Scan:
-        mapper = self._mapper
-        numbers = mapper.around(len(mapper.keys) - 1, here, QUERY_KEYS)
-        return merged([mapper.keys[k].scan for k in numbers], between(here, mapper.poses[numbers]))
+        known = self._mapper.map
+        numbers = known.around(len(known) - 1, QUERY_KEYS)
+        return merged([known.keys[k].scan for k in numbers], between(here, known.poses[numbers]))
 
     def _look(self, query: Scan) -> tuple[Array, bool] | None:
         """Best pose of the query on the map, and whether it is the only one."""
@@ -160,6 +163,11 @@ class LocalisingEstimator:
         self._offset = OffsetWatch()
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0, "searches": int(start is None)}
 
+    @property
+    def twist(self) -> Vector:
+        """See ``Estimator``."""
+        return self._motion.twist
+
     def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
         """See ``Estimator``."""
         stamp = inputs.stamp
@@ -174,7 +182,7 @@ class LocalisingEstimator:
         self._stamp = stamp
         self.counts["scans"] += 1
         if self._searcher is None:
-            match, standing = self._track(scan, guess, covariance)
+            match, standing = self._track(scan, delta, guess, covariance)
             self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
             events: tuple[str, ...] = () if match.accepted else ("rejected",)
         else:
@@ -202,8 +210,8 @@ class LocalisingEstimator:
     def finish(self) -> None:
         """See ``Estimator``: there is nothing to fit."""
 
-    def _track(self, scan: Scan, guess: Array, covariance: Array) -> tuple[Match, Standing]:
-        match = self._front.locate(scan, guess, covariance, self._submap)
+    def _track(self, scan: Scan, delta: Array, guess: Array, covariance: Array) -> tuple[Match, Standing]:
+        match = self._front.locate(scan, delta, guess, covariance, self._submap)
         place, turn = deviations(match.covariance)
         fits = match.accepted and match.overlap >= DOUBTFUL
         # What stands where the map was free lowers the overlap; only a pose that may be anywhere is searched for.
@@ -225,7 +233,7 @@ class LocalisingEstimator:
         if pose is None:
             return rejected(guess, covariance, Verdict.EMPTY), Standing.SEARCHING, ()
         self._searcher, self._misfits = None, 0
-        match, standing = self._track(scan, pose, np.diag((FOUND[0] ** 2, FOUND[0] ** 2, FOUND[1] ** 2)))
+        match, standing = self._track(scan, np.zeros(3), pose, np.diag((FOUND[0] ** 2, FOUND[0] ** 2, FOUND[1] ** 2)))
         return match, standing, ("found",)
 
 

@@ -9,7 +9,7 @@ from monstertruck_estimation.mapping.config import GridConfig
 from monstertruck_estimation.mapping.exchange import Vector
 from monstertruck_estimation.mapping.grid import OccupancyGrid
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import between, transform
+from monstertruck_estimation.slam.se2 import between, interpolate, transform
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
@@ -62,13 +62,12 @@ class Painter:
         """Draw anew if the trajectory puts remembered scans elsewhere; tells whether it did.
 
         Args:
-            stamps: shape (n,), ns, rising, those of all remembered scans among them.
+            stamps: shape (n,), ns, rising; between them the way is taken as straight.
             poses: shape (n, 3), base in map.
         """
         if not self._stamps or not len(stamps):
             return False
-        at = np.clip(np.searchsorted(stamps, self._stamps), 0, len(stamps) - 1)
-        now = poses[at]
+        now = interpolate(stamps.astype(np.float64), poses, np.array(self._stamps, np.float64))
         off = between(np.array(self._poses), now)
         if (np.hypot(off[:, 0], off[:, 1]) < MOVED[0] * self._config.resolution).all() and (
             np.abs(off[:, 2]) < MOVED[1]

@@ -4,6 +4,7 @@ The graph holds key scans, their poses and the relations between them as plain a
 replaced whole, the YAML last.
 """
 
+import dataclasses
 import io
 import itertools
 import zipfile
@@ -25,6 +26,8 @@ Array = NDArray[np.float64]
 
 YAML, GRAPH = "map.yaml", "graph.npz"
 VERSION: Final = 1
+ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
+"""Arrays of a scan: of a file that was written before there were so many, the others are zeros."""
 OCCUPIED_FROM, FREE_TO = 65, 19
 """Percent, as in the thresholds of map_server."""
 _SHAPES: Final[dict[str, tuple[int, ...]]] = {
@@ -64,18 +67,25 @@ class SavedMap:
     """None for a map of others: grid only."""
 
 
+def elements(points: Array, **known: Array) -> Scan:
+    """Surface elements at ``points``, shape (n, 2); of what is not known of them, zeros."""
+    every = {name: known.get(name, np.zeros(len(points))) for name in ELEMENTS if name != "points"}
+    return Scan(points=points, **every)
+
+
 def graph_of(mapper: Mapper) -> Graph:
     """The mapper's graph as it is now."""
-    edges = mapper.edges.edges()
+    known = mapper.map
+    edges = known.edges.edges()
     return Graph(
-        np.array([key.stamp for key in mapper.keys], np.int64),
-        mapper.poses.copy(),
-        tuple(key.scan for key in mapper.keys),
+        np.array([key.stamp for key in known.keys], np.int64),
+        known.poses.copy(),
+        tuple(key.scan for key in known.keys),
         {
             "edge_ends": np.stack((edges.origin, edges.target), axis=-1),
             "edge_measured": np.array(edges.measured),
             "edge_information": np.array(edges.information),
-            "edge_spread": np.array(mapper.edges.spread),
+            "edge_spread": np.array(known.edges.spread),
             "edge_loop": np.array(edges.loop),
         },
     )
@@ -100,13 +110,10 @@ def save(folder: Path, patch: Patch, graph: Graph | None) -> None:
         msg = f"{folder}: nothing is mapped yet"
         raise InputError(msg)
     folder.mkdir(parents=True, exist_ok=True)
-    if graph is not None:
+    if graph is not None and graph.scans:
         counts = [len(scan) for scan in graph.scans]
         every: dict[str, Any] = {
-            name: np.concatenate([getattr(scan, name) for scan in graph.scans]).astype(np.float32)
-            if counts
-            else np.zeros((0, 2), np.float32)
-            for name in ("points", "normals", "variances")
+            name: np.concatenate([getattr(scan, name) for scan in graph.scans]).astype(np.float32) for name in ELEMENTS
         }
         every |= graph.edges
         data = io.BytesIO()
@@ -154,7 +161,9 @@ def _read_graph(path: Path) -> Graph:
     if not whole or starts[-1] != len(arrays["points"]) or len(arrays["stamps"]) != count:
         msg = f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}"
         raise InputError(msg)
-    points, normals, variances = (arrays[name].astype(np.float64) for name in ("points", "normals", "variances"))
-    scans = tuple(Scan(points[a:b], normals[a:b], variances[a:b]) for a, b in itertools.pairwise(starts))
+    every = {name: arrays[name].astype(np.float64) for name in ELEMENTS if name in arrays}
+    scans = tuple(
+        elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)
+    )
     edges = {name: values for name, values in arrays.items() if name.startswith("edge_")}
     return Graph(arrays["stamps"], arrays["poses"], scans, edges)

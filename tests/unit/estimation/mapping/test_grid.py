@@ -6,6 +6,7 @@ import pytest
 from monstertruck_estimation.mapping.config import GridConfig
 from monstertruck_estimation.mapping.grid import TILE, OccupancyGrid
 from monstertruck_estimation.mapping.painter import Painter
+from monstertruck_estimation.mapping.storage import elements
 from monstertruck_estimation.slam.scans import Scan
 
 ORIGIN = np.zeros(2)
@@ -21,7 +22,7 @@ def value(grid: OccupancyGrid, x: float, y: float) -> int:
 
 def scan_of(*points: tuple[float, float]) -> Scan:
     array = np.array(points, float)
-    return Scan(array, np.tile((1.0, 0.0), (len(array), 1)), np.full((len(array), 2), 1e-4))
+    return elements(array, normals=np.tile((1.0, 0.0), (len(array), 1)), variances=np.full((len(array), 2), 1e-4))
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 17))
