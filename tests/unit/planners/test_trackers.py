@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import TRACKERS, build_tracker
 from monstertruck_planners.track.config import TrackerConfig
@@ -216,3 +217,12 @@ def test_a_missing_solver_is_named(monkeypatch):
     monkeypatch.setitem(TRACKERS, "mpc", "monstertruck_planners.track.no_such:Mpc")
     with pytest.raises(InputError, match=r"needs the extra \[planning\]"):
         build_tracker(TRACKER.validate_python({"kind": "mpc"}), STEERING)
+
+
+def test_a_planned_crab_is_driven_as_planned():
+    rows = [[0.8, 0.0, 0.0], [0.9, 0.0, 0.3], [0.8, 1.2, 0.0], [-0.6, 0.0, -0.25]]
+    motion = MotionPath(np.zeros(3), np.array(rows))
+    truck = Follower(motion.message(stamp=0, frame="odom", step=0.025), kind="mpc")
+    assert truck.run() is Reason.GOAL_REACHED
+    assert truck.cross_track().max() < 0.05
+    assert truck.pose == pytest.approx(tuple(motion.end), abs=0.06)
