@@ -19,6 +19,7 @@ from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.goal_build import build_goals
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
 from monstertruckd.slam_service import SlamService
@@ -101,6 +102,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
+        paths, wishes = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
         drawn = None
         if config.path is not None:
@@ -110,7 +112,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),
             bus.subscribe(topics.GATE, latest()),
-            bus.publisher(topics.PATH, Writer.PLANNER),
+            paths,
             bus.event_sink(),
             config.gate.max_request_age,
         )
@@ -126,10 +128,12 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             gate=bus.subscribe(topics.GATE, latest()),
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             attitude=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
-            drive=bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER),
+            drive=wishes,
             tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
             events=bus.event_sink(),
         )
+        if config.planner is not None:
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield StabiliserService(
             config.levelling,

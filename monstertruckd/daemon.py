@@ -26,6 +26,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
+from monstertruckd import goal_rpc
 from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -39,6 +40,7 @@ from monstertruckd.devices import build_drivers, build_monitors
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.goal_service import GoalService
 from monstertruckd.health import ClockService, HealthBoard, MeterService
 from monstertruckd.journal import published
 from monstertruckd.notify import notify_from, status_line
@@ -100,7 +102,8 @@ class Daemon:
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.EVENT, self.gate.observe_event)
-        self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
+        if config.planner is None:
+            self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.rpc = self._build_rpc()
         self._attachments = self._describe()
         self.recorder = self._build_recorder()
@@ -136,6 +139,8 @@ class Daemon:
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body):
                 self._start(planners, service)
+                if isinstance(service, GoalService):
+                    goal_rpc.register(self.rpc, service, self.clock)
             if self._notify is not None:
                 self._notify.up()
             await stop.wait()

@@ -15,7 +15,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.gate.sources import OPERATORS, Sequences, freshness
+from monstertruckd.gate.sources import Sequences, refusal
 
 HEADER = ["x", "y", "yaw", "direction"]
 
@@ -124,11 +124,7 @@ class PathService:
             InputError: the path cannot be tracked.
         """
         gate = self._gate.latest
-        reason = Reason.BAD_NONCE if gate is None else self._sequences.accept(request, gate.nonce)
-        if reason is Reason.OK:
-            reason = freshness(request, self._clock.now(), self._max_age)
-        if reason is Reason.OK and request.role not in OPERATORS:
-            reason = Reason.BAD_ROLE
+        reason = refusal(request, gate, self._sequences, self._clock.now(), self._max_age)
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
         if gate is not None and gate.mode in MOVING:

@@ -22,6 +22,7 @@ from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_kinematics.chassis import Chassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
+from monstertruck_planners.manage.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
@@ -197,7 +198,7 @@ class MapRender(Schema):
 class TruckConfig(Schema):
     """Everything the daemon needs to know."""
 
-    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"),)
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"), ("planner", "map"))
     """Keys that name files which must exist; they are relative to the file that says them."""
 
     version: Literal[1]
@@ -216,6 +217,8 @@ class TruckConfig(Schema):
     gate: GateConfig = GateConfig()
     odometry: OdometryConfig = OdometryConfig()
     tracker: AnyTracker | None = None
+    planner: PlannerConfig | None = None
+    """How goals are reached; null = the robot follows paths only"""
     path: PathSource | None = None
     map: MapRender | None = None
     slam: SlamConfig | None = None
@@ -261,6 +264,7 @@ class TruckConfig(Schema):
     @model_validator(mode="after")
     def _complete(self) -> Self:
         self._check_actuators()
+        self._check_planner()
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:
@@ -287,6 +291,21 @@ class TruckConfig(Schema):
                 )
         for role, device in shafts.items():
             self._check_braking(role, device.driver)
+
+    def _check_planner(self) -> None:
+        planner = self.planner
+        if planner is None:
+            return
+        if self.tracker is None:
+            raise ValueError("a planner needs a tracker, which follows its routes")
+        if self.slam is None and planner.map is None:
+            raise ValueError("a planner needs a map: planner.map, or slam")
+        if planner.angle > self.tracker.angle:
+            raise ValueError(f"planner.angle {planner.angle} rad: expected at most tracker.angle, {self.tracker.angle}")
+        chassis = self.chassis()
+        for steering in DRIVEN[planner.steering]:
+            if why := chassis.refusal(*STEERING_MODES[steering]):
+                raise ValueError(f"planner.steering {planner.steering}: impossible for body {self.body.kind}: {why}")
 
     def _check_braking(self, role: str, drive: EposConfig) -> None:
         """The gate promises stopping distances; the drive controller must brake at least as hard."""

@@ -20,6 +20,7 @@ from typing import Final
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Request, Role
+from monstertruck_schemas.state import GateState
 from monstertruckd.gate.config import GateConfig
 
 PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
@@ -105,6 +106,24 @@ def freshness(request: Request, now: int, limit: float) -> Reason:
     """OK, or LEASE_EXPIRED for a request whose sender's newest gate state is older than ``limit`` s, or not told."""
     known = request.gate_stamp
     return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
+
+
+def refusal(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> Reason:
+    """OK, or why a request to the planners does not count: the authority is that of driving.
+
+    Args:
+        request: what was asked.
+        gate: newest state of the gate.
+        sequences: of this kind of requests.
+        now: ns.
+        max_age: greatest age of what its sender knew of the gate, s; None for what sets nothing in motion.
+    """
+    reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce)
+    if reason is Reason.OK and max_age is not None:
+        reason = freshness(request, now, max_age)
+    if reason is Reason.OK and request.role not in OPERATORS:
+        reason = Reason.BAD_ROLE
+    return reason
 
 
 class Sources:

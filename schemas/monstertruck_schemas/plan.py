@@ -1,10 +1,11 @@
 """Messages of the ``plan`` group: paths, tracker progress, and the planners' wishes to the gate."""
 
+from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Float64Array, Message
+from monstertruck_schemas.base import Float64Array, Message, Pose2D
 from monstertruck_schemas.reasons import Reason
 
 Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
@@ -40,6 +41,41 @@ class TrackerState(Message):
     """Metres of the whole path."""
     outcome: Reason
     """DRIVING, GOAL_REACHED, PATH_LOST ..."""
+
+
+class GoalPhase(StrEnum):
+    """What is being done about a goal."""
+
+    IDLE = "idle"
+    """Nothing: there is none, or ``outcome`` tells how the last one ended."""
+    PLANNING = "planning"
+    DRIVING = "driving"
+    BACKING_OUT = "backing_out"
+    WAITING = "waiting"
+    PAUSED = "paused"
+
+
+class GoalState(Message):
+    """Progress towards a goal, in ``frame``."""
+
+    number: Annotated[int, Field(ge=0)] = 0
+    """Counts the goals taken on since the start; 0 = none yet."""
+    source: str = ""
+    """Who asked for it."""
+    goal: Pose2D | None = None
+    phase: GoalPhase = GoalPhase.IDLE
+    outcome: Reason = Reason.OK
+    """DRIVING while it is pursued, then GOAL_REACHED, CANCELLED, or why it was given up."""
+    text: str = ""
+    """The outcome in words."""
+    remaining: Annotated[float, Field(ge=0)] = 0.0
+    """Metres left of the present path."""
+    elapsed: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds spent on it, pauses left out."""
+    routes: Annotated[int, Field(ge=0)] = 0
+    """Routes driven so far, the present one included."""
+    recoveries: Annotated[int, Field(ge=0)] = 0
+    """Steps of the recovery ladder taken so far."""
 
 
 class StabiliserCommand(Message):

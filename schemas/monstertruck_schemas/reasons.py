@@ -128,3 +128,14 @@ class Reason(StrEnum):
     ROUTE_TIMEOUT = "route_timeout", 34, "no route found in the time allowed"
     PATH_BLOCKED = "path_blocked", 35, "something stands on the route and there is no way round it nearby"
     PATH_PARTIAL = "path_partial", 0, "only the beginning of the path is free"
+
+    # Goals
+    GOAL_MISSED = "goal_missed", 36, "the truck stands, but not where it was to go"
+    GOAL_TIMEOUT = "goal_timeout", 37, "goal not reached in the time allowed"
+    STUCK = "stuck", 38, "the truck does not get on"
+    NO_MAP = "no_map", 39, "no map or no pose to plan with yet"
+    GOAL_ACCEPTED = "goal_accepted", 0, "a goal was taken on"
+    ROUTE_FOUND = "route_found", 0, "a route was planned"
+    RECOVERING = "recovering", 0, "a way out of trouble is tried"
+    PAUSED = "paused", 0, "the way to the goal is interrupted"
+    RESUMED = "resumed", 0, "the way to the goal goes on"

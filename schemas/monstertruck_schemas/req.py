@@ -72,6 +72,20 @@ class GoalRequest(Request):
     goal: Pose2D
 
 
+class GoalOrder(StrEnum):
+    """What can be asked about the present goal."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    CANCEL = "cancel"
+
+
+class GoalControl(Request):
+    """Interrupt, go on with or give up the present goal."""
+
+    order: GoalOrder
+
+
 class PathRequest(Request):
     """A path computed off board, to be tracked."""
 

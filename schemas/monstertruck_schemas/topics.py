@@ -10,8 +10,8 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, LogRecord, Stop
 from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth, SlamHealth
-from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
-from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, PathRequest
+from monstertruck_schemas.plan import GoalState, Path, StabiliserCommand, TrackerState
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
@@ -132,6 +132,7 @@ CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daem
 
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
 TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 10, 0.5)
+GOAL: Final = Topic("plan/goal", GoalState, W.PLANNER, "Progress towards the goal", 2, retained=True)
 PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The tracker's wish to the gate", 20, 0.3)
 PLAN_STABILISER: Final = Topic(
     "plan/stabiliser",
@@ -163,6 +164,7 @@ LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", fox
 REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, 0.3)
 REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")
 REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
+REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")
 REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off board")
 
 TOPICS: Final[tuple[Topic[Message], ...]] = tuple(

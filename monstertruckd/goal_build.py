@@ -1,0 +1,50 @@
+"""The goal service of a configuration, with its ends of the bus."""
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.manage.config import PlannerConfig
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import Publisher
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.topics import Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.goal_service import GoalService, Inputs, Outputs
+
+
+def build_goals(
+    config: TruckConfig,
+    planner: PlannerConfig,
+    bus: Bus,
+    clock: Clock,
+    chassis: Chassis,
+    footprint: Footprint,
+    path: Publisher[Path],
+    wish: Publisher[DriveRequest],
+) -> GoalService:
+    """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
+    lidar, mapped = config.devices.lidar, config.slam is not None
+    assert config.tracker is not None
+    return GoalService(
+        planner.model_copy(update={"map": None}) if mapped else planner,
+        clock,
+        geometry=chassis.bicycle,
+        footprint=footprint,
+        lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
+        deceleration=config.tracker.deceleration,
+        max_age=config.gate.max_request_age,
+        inputs=Inputs(
+            goals=bus.subscribe(topics.REQ_GOAL, fifo(4)),
+            controls=bus.subscribe(topics.REQ_GOAL_CONTROL, fifo(4)),
+            gate=bus.subscribe(topics.GATE, latest()),
+            pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
+            tracker=bus.subscribe(topics.TRACKER, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
+            grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
+        ),
+        outputs=Outputs(path, wish, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
+    )

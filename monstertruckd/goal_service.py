@@ -1,0 +1,449 @@
+"""Goals in the daemon: requests and facts to the state machine, its decisions to planner, tracker and events."""
+
+import asyncio
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, scan_points
+from monstertruck_planners.manage import mission as machine
+from monstertruck_planners.manage.config import PlannerConfig
+from monstertruck_planners.manage.escape import placed
+from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.manage.lookout import blocked, cut, way_ahead
+from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
+from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
+from monstertruck_runtime.errors import RequestRefusedError, WorkerError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, GoalControl, GoalOrder, GoalRequest, Request, Role
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
+from monstertruck_schemas.topics import ODOMETRY, SCAN
+from monstertruckd.gate.sources import Sequences, refusal
+from monstertruckd.workers.placement import Actor, make_actor
+
+Array = NDArray[np.float64]
+
+TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"
+PATIENCE: Final = 180.0
+"""Real seconds the worker may take to start: the first time it compiles."""
+ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
+AT_REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+LEASE: Final = 0.25
+"""Of the wish to stand still, s."""
+STUB: Final = 0.01
+"""Length of a path that leads nowhere, m."""
+REPORT: Final = SECOND // 2
+"""Between two reports without news, ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What the service reads."""
+
+    goals: Mailbox[GoalRequest]
+    controls: Mailbox[GoalControl]
+    gate: Subscription[GateState]
+    pose: Subscription[Odometry]
+    """In the paths' frame."""
+    tracker: Subscription[TrackerState]
+    path: Subscription[Path]
+    scan: Subscription[LaserScan] | None
+    grid: Subscription[Grid] | None
+    """None = the configured map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What it writes."""
+
+    path: Publisher[Path]
+    wish: Publisher[DriveRequest]
+    state: Publisher[GoalState]
+    events: EventSink
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The path being driven."""
+
+    message: Path
+    poses: Array
+    travelled: Array
+
+
+class GoalService:
+    """Drives to goals, one at a time; a new one takes the place of the old.
+
+    While it thinks and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
+
+    Args:
+        config: how.
+        clock: time.
+        geometry: the truck's.
+        footprint: its outline.
+        lidar: pose (x, y, yaw) of the lidar in base.
+        deceleration: with which the tracker brakes, m/s^2.
+        max_age: see ``GateConfig.max_request_age``.
+        inputs: topics read.
+        outputs: topics written.
+    """
+
+    name = "goals"
+
+    def __init__(
+        self,
+        config: PlannerConfig,
+        clock: Clock,
+        *,
+        geometry: FourWheelSteering,
+        footprint: Footprint,
+        lidar: Pose,
+        deceleration: float,
+        max_age: float,
+        inputs: Inputs,
+        outputs: Outputs,
+    ) -> None:
+        self._config, self._clock, self._in, self._out = config, clock, inputs, outputs
+        self._footprint, self._lidar, self._deceleration, self._max_age = footprint, lidar, deceleration, max_age
+        self._setup = Setup(config, geometry, footprint, timed=not isinstance(clock, VirtualClock))
+        self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
+        self._mission: Mission | None = None
+        self._number = 0
+        self._paths = 0
+        self._followed: Followed | None = None
+        self._told: GoalState | None = None
+        self._planning: asyncio.Task[PlanAnswer] | None = None
+        self._actor: Actor | None = None
+        self._tasks: asyncio.TaskGroup | None = None
+        self._fresh = True
+        self._sent_grid: Grid | None = None
+        self._scanned: LaserScan | None = None
+        self._points: Array = np.empty((0, 2))
+        self._changed = asyncio.Event()
+
+    async def run(self, ready: Ready) -> None:
+        """Serve goals until cancelled."""
+        actor = make_actor(
+            self._config.placement, "planning", TARGET, self._clock, latency=self._config.latency,
+            deadline=self._config.deadline, patience=PATIENCE,
+        )  # fmt: skip
+        async with actor:
+            await actor.start()
+            async with asyncio.TaskGroup() as tasks:
+                self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
+                self._report(self._clock.now())
+                ready()
+                await self._serve()
+
+    async def _serve(self) -> None:
+        schedule = Schedule(self._clock, self._config.rate)
+        while True:
+            await schedule.next()
+            self._listen()
+            self._tick(self._clock.now())
+
+    # Requests
+
+    def _listen(self) -> None:
+        for goal in self._in.goals.drain():
+            self._heed(lambda goal=goal: self.take(goal), goal, "goal")
+        for control in self._in.controls.drain():
+            self._heed(lambda control=control: self.control(control), control, control.order)
+
+    def _heed(self, what: Any, request: Request, name: str) -> None:
+        try:
+            what()
+        except RequestRefusedError as error:
+            self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
+
+    def take(self, request: GoalRequest) -> int:
+        """Take on a goal; returns its number. Whether a way leads there shows later.
+
+        Raises:
+            RequestRefusedError: the sender may not, or the goal is none.
+        """
+        self._examine(request, "goal", moves=True)
+        pose = self._in.pose.latest
+        if self._actor is None or pose is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no pose, or the planner is not up yet")
+        if request.frame not in (pose.frame, "map"):
+            raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {pose.frame!r}")
+        goal = (request.goal.x, request.goal.y, request.goal.yaw)
+        if not all(map(math.isfinite, goal)):
+            raise RequestRefusedError(Reason.NOT_FINITE, "goal: expected finite numbers")
+        if self._mission is not None and self._mission.active:
+            self._do(machine.order(self._mission, GoalOrder.CANCEL, request.source, self._seconds()))
+        self._number += 1
+        self._do(machine.begin(self._number, goal, request.source, self._seconds()))
+        return self._number
+
+    def control(self, request: GoalControl) -> None:
+        """Pause, resume or cancel the present goal.
+
+        Raises:
+            RequestRefusedError: the sender may not, or there is no goal.
+        """
+        self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
+        if self._mission is None or not self._mission.active:
+            raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
+        self._do(machine.order(self._mission, request.order, request.source, self._seconds()))
+
+    async def settled(self, number: int) -> GoalState:
+        """State of a goal once it is known whether a way leads there.
+
+        Raises:
+            RequestRefusedError: none does.
+        """
+        while self._told is None or (self._told.number == number and self._undecided(self._told)):
+            await self._changed.wait()
+        state = self._told
+        if state.number == number and state.routes == 0 and state.phase is GoalPhase.IDLE:
+            raise RequestRefusedError(state.outcome, state.text)
+        return state
+
+    @staticmethod
+    def _undecided(state: GoalState) -> bool:
+        return state.phase is GoalPhase.PLANNING and state.routes == 0 and state.recoveries == 0
+
+    def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
+        reason = refusal(
+            request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
+        )
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+
+    # Facts
+
+    def _tick(self, now: int) -> None:
+        mission = self._mission
+        if mission is not None and mission.active:
+            if self._followed is not None and self._in.path.latest is not self._followed.message:
+                self._do(machine.displaced(mission, "another path is followed now"))
+            else:
+                self._do(machine.tick(mission, self._facts(now), self._config))
+            self._stand_still(now)
+        self._report(now)
+
+    def _facts(self, now: int) -> Facts:
+        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._followed
+        answer = None
+        if self._planning is not None and self._planning.done():
+            answer, self._planning = self._planning.result(), None
+        report = self._in.tracker.latest
+        ours = followed is not None and report is not None and report.path == followed.message.name
+        along = report.along if ours and report is not None else 0.0
+        return Facts(
+            now=now / SECOND,
+            armed=gate is not None and gate.mode in ACTIVE and odometry is not None,
+            at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
+            pose=None if odometry is None else _pose(odometry),
+            answer=answer,
+            outcome=report.outcome if ours and report is not None else None,
+            along=along,
+            blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
+        )
+
+    def _odometry(self, now: int) -> Odometry | None:
+        odometry = self._in.pose.latest
+        return odometry if odometry is not None and now - odometry.received <= ODOMETRY.fresh_for() * SECOND else None
+
+    def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
+        points = self._scan(now)
+        if not len(points):
+            return False
+        pose = _pose(odometry)
+        way = way_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, np.array(pose))
+        return blocked(self._footprint, way, points, pose)
+
+    def _scan(self, now: int) -> Array:
+        """Returns of the newest scan in base; none if it is old."""
+        scan = None if self._in.scan is None else self._in.scan.latest
+        if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
+            return np.empty((0, 2))
+        if scan is not self._scanned:
+            self._scanned, self._points = scan, scan_points(scan, self._lidar)
+        return self._points
+
+    # Decisions
+
+    def _do(self, step: tuple[Mission, tuple[Action, ...]]) -> None:
+        self._mission, actions = step
+        for action in actions:
+            match action:
+                case Tell(reason, severity, text):
+                    self._out.events(reason, severity, self.name, text, goal=self._mission.number)
+                case Plan():
+                    self._plan(self._mission, action)
+                case Follow(answer):
+                    self._follow(answer)
+                case Halt():
+                    self._halt()
+        if actions:
+            self._report(self._clock.now())
+
+    def _plan(self, mission: Mission, plan: Plan) -> None:
+        now = self._clock.now()
+        odometry = self._odometry(now)
+        assert self._tasks is not None
+        if odometry is None:
+            self._planning = self._tasks.create_task(_known(PlanAnswer(Reason.NO_MAP, "no fresh pose")))
+            return
+        pose = _pose(odometry)
+        points = placed(np.column_stack((points := self._scan(now), np.zeros(len(points)))), pose)[:, :2]
+        grid = None if self._in.grid is None else self._in.grid.latest
+        task = PlanTask(
+            plan.what,
+            pose,
+            mission.goal,
+            points,
+            setup=self._setup if self._fresh else None,
+            grid=grid if grid is not self._sent_grid or self._fresh else None,
+            clear=plan.clear,
+        )
+        self._fresh, self._sent_grid = False, grid
+        self._planning = self._tasks.create_task(self._ask(task))
+
+    async def _ask(self, task: PlanTask) -> PlanAnswer:
+        """The planner's answer; of one that failed and begins anew: that it did."""
+        assert self._actor is not None
+        try:
+            answer: PlanAnswer = await self._actor.step(task)
+        except WorkerError as error:
+            self._fresh = True
+            self._out.events(error.reason, Severity.ERROR, self.name, str(error))
+            return PlanAnswer(error.reason, str(error).partition("\n")[0])
+        return answer
+
+    def _follow(self, answer: PlanAnswer) -> None:
+        assert answer.poses is not None
+        assert answer.directions is not None
+        steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
+        self._publish(answer.poses, answer.directions, steering, "goal")
+
+    def _halt(self) -> None:
+        """Let what is followed end as soon as the tracker can brake; at rest, here."""
+        odometry, followed = self._in.pose.latest, self._followed
+        self._followed = None
+        if odometry is None or followed is None:
+            return
+        speed, report = abs(odometry.twist.vx), self._in.tracker.latest
+        if speed > AT_REST and report is not None and report.path == followed.message.name:
+            way = speed * speed / (2 * self._deceleration) + STUB
+            count = cut(followed.poses, followed.travelled, report.along, way)
+            steering = followed.message.steering[:count]
+            self._publish(followed.poses[:count], followed.message.directions[:count], steering, "halt")
+        else:
+            ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
+            self._publish(placed(ahead, _pose(odometry)), np.ones(2), (), "halt")
+        self._followed = None
+
+    def _publish(self, poses: Array, directions: Array, steering: tuple[Any, ...], what: str) -> None:
+        now, odometry = self._clock.now(), self._in.pose.latest
+        assert odometry is not None
+        self._paths += 1
+        message = Path(
+            stamp=now,
+            received=now,
+            seq=self._out.path.next_seq(),
+            frame=odometry.frame,
+            poses=np.ascontiguousarray(poses).ravel(),
+            directions=np.array(directions),
+            steering=steering,
+            name=f"{what}-{self._number}.{self._paths}",
+        )
+        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        self._followed = Followed(message, poses, np.concatenate(([0.0], np.cumsum(steps))))
+        self._out.path.put(message)
+
+    def _stand_still(self, now: int) -> None:
+        """Keep the truck armed while a way is looked for."""
+        mission, gate = self._mission, self._in.gate.latest
+        thinking = mission is not None and mission.phase in (GoalPhase.PLANNING, GoalPhase.WAITING)
+        report, followed = self._in.tracker.latest, self._followed
+        driving = (
+            followed is not None
+            and report is not None
+            and report.path == followed.message.name
+            and report.outcome is Reason.DRIVING
+        )
+        if not thinking or driving or gate is None or gate.mode not in ACTIVE:
+            return
+        self._out.wish.put(
+            DriveRequest(
+                stamp=now,
+                received=now,
+                seq=self._out.wish.next_seq(),
+                source=self.name,
+                role=Role.TRACKER,
+                lease=LEASE,
+                nonce=gate.nonce,
+                gate_stamp=gate.stamp,
+                speed=0.0,
+                front=0.0,
+                rear=0.0,
+            )
+        )
+
+    def _report(self, now: int) -> None:
+        state = self._state(now)
+        same = ("phase", "outcome", "number", "routes", "recoveries")
+        told = self._told
+        unchanged = told is not None and all(getattr(told, name) == getattr(state, name) for name in same)
+        if told is not None and unchanged and (now - told.stamp < REPORT or state.phase is GoalPhase.IDLE):
+            return
+        self._told = state.model_copy(update={"seq": self._out.state.next_seq()})
+        self._out.state.put(self._told)
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()
+
+    def _state(self, now: int) -> GoalState:
+        odometry, mission = self._in.pose.latest, self._mission
+        frame = "map" if odometry is None else odometry.frame
+        if mission is None:
+            return GoalState(stamp=now, received=now, seq=0, frame=frame)
+        x, y, yaw = mission.goal
+        followed, report = self._followed, self._in.tracker.latest
+        remaining = 0.0
+        if followed is not None and mission.active:
+            ours = report is not None and report.path == followed.message.name
+            along = report.along if ours and report is not None else 0.0
+            remaining = max(float(followed.travelled[-1]) - along, 0.0)
+        return GoalState(
+            stamp=now,
+            received=now,
+            seq=0,
+            frame=frame,
+            number=mission.number,
+            source=mission.source,
+            goal=Pose2D(x=x, y=y, yaw=yaw),
+            phase=mission.phase,
+            outcome=mission.outcome,
+            text=mission.text,
+            remaining=remaining,
+            elapsed=mission.elapsed,
+            routes=mission.routes,
+            recoveries=mission.recoveries,
+        )
+
+    def _seconds(self) -> float:
+        return self._clock.now() / SECOND
+
+
+async def _known(answer: PlanAnswer) -> PlanAnswer:
+    return answer
+
+
+def _pose(odometry: Odometry) -> Pose:
+    return odometry.pose.x, odometry.pose.y, odometry.pose.yaw

@@ -1,0 +1,162 @@
+"""Goals of the whole daemon on the virtual clock: reached, refused, cancelled, paused."""
+
+import math
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+QUICK = {
+    "recorder": None,
+    "blackbox": None,
+    "planner": {"placement": "loop", "route": {"effort": 3000, "margin": 0.04}},
+}
+
+
+class Trip:
+    """A truck in the rooms, and somebody who asks it to go places."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.rig = rig
+        self.clock: VirtualClock = rig.clock
+        self.operator = LocalOperator(rig.bus, rig.clock)
+        self.states = rig.bus.subscribe(topics.GOAL, fifo(4096))
+        self.events = rig.bus.subscribe(topics.EVENT, fifo(4096))
+        self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
+        self._seq = 0
+
+    def header(self) -> dict[str, Any]:
+        gate, now = self._gate.latest, self.clock.now()
+        assert gate is not None
+        self._seq += 1
+        known = {"nonce": gate.nonce, "gate_stamp": gate.stamp}
+        who = {"seq": self._seq, "source": "tester", "role": "station", "lease": 1.0, "frame": "map"}
+        return {"stamp": now, "received": now, **who, **known}
+
+    async def goal(self, x: float, y: float, yaw: float) -> dict[str, Any]:
+        return await self.rig.daemon.rpc.call("goal", {**self.header(), "goal": {"x": x, "y": y, "yaw": yaw}})
+
+    async def order(self, order: str) -> None:
+        await self.rig.daemon.rpc.call("goal_control", {**self.header(), "order": order})
+
+    async def arm(self) -> None:
+        await self.operator.order(Order.ARM)
+
+    async def end(self, limit: float = 200.0) -> GoalState:
+        async with self.clock.deadline(limit):
+            while True:
+                state = await self.states.next()
+                if state.phase is GoalPhase.IDLE and state.outcome is not Reason.OK:
+                    return state
+
+    def reasons(self) -> list[Reason]:
+        drained = self.events.drain()
+        return [
+            event.reason for event in drained if event.source == "goals" and event.reason is not Reason.DEVICE_READY
+        ]
+
+
+def travel(story: Callable[[Trip], Awaitable[None]], **overlay: Any) -> VirtualRig:
+    base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
+    config = with_overlay(with_overlay(base, QUICK), overlay)
+
+    async def main(clock: VirtualClock) -> VirtualRig:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            trip = Trip(rig)
+            await clock.sleep(3.0)
+            await story(trip)
+        return rig
+
+    return run_virtual(main)
+
+
+def assert_at(rig: VirtualRig, x: float, y: float, yaw: float) -> None:
+    truth = rig.truth.array()
+    assert not truth[:, 5].any(), "collided"
+    assert math.dist(truth[-1, 1:3], (x, y)) < 0.2
+    assert abs(math.remainder(truth[-1, 3] - yaw, math.tau)) < 0.2
+
+
+def test_a_goal_in_another_room_is_reached():
+    async def story(trip: Trip) -> None:
+        answer = await trip.goal(2.4, 1.5, -1.57)
+        assert answer["planned"]
+        assert 3.0 < answer["length"] < 3.6
+        await trip.arm()
+        state = await trip.end()
+        assert (state.outcome, state.number, state.source) == (Reason.GOAL_REACHED, 1, "tester")
+        assert trip.reasons() == [Reason.GOAL_ACCEPTED, Reason.ROUTE_FOUND, Reason.GOAL_REACHED]
+
+    assert_at(travel(story), 2.4, 1.5, -1.57)
+
+
+def test_bad_goals_are_refused_with_the_reason_and_nothing_moves():
+    async def story(trip: Trip) -> None:
+        for goal, reason in (
+            ((4.7, 2.5, 0.0), Reason.GOAL_BLOCKED),
+            ((20.0, 1.0, 0.0), Reason.GOAL_OUTSIDE),
+            ((math.nan, 1.0, 0.0), Reason.NOT_FINITE),
+        ):
+            with pytest.raises(RequestRefusedError) as refused:
+                await trip.goal(*goal)
+            assert refused.value.refusal is reason
+        with pytest.raises(RequestRefusedError) as refused:
+            await trip.rig.daemon.rpc.call(
+                "goal", {**trip.header(), "nonce": "another", "goal": {"x": 4.0, "y": 3.9, "yaw": 0.0}}
+            )
+        assert refused.value.refusal is Reason.BAD_NONCE
+        with pytest.raises(RequestRefusedError) as refused:
+            await trip.order("cancel")
+        assert refused.value.refusal is Reason.NOT_FOUND
+
+    assert_at(travel(story), 1.0, 3.95, 0.0)
+
+
+def test_cancel_stops_and_pause_interrupts():
+    async def story(trip: Trip) -> None:
+        truth = trip.rig.truth
+        await trip.goal(6.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(8.0)
+        await trip.order("cancel")
+        assert (await trip.end()).outcome is Reason.CANCELLED
+        await trip.clock.sleep(4.0)
+        stopped = truth.array()[-1]
+        assert 1.5 < stopped[1] < 3.5
+        await trip.clock.sleep(2.0)
+        await trip.arm()
+        await trip.clock.sleep(4.0)
+        assert math.dist(truth.array()[-1][1:3], stopped[1:3]) < 0.01, "no goal, no motion"
+
+        await trip.goal(5.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(5.0)
+        await trip.order("pause")
+        await trip.clock.sleep(4.0)
+        paused = truth.array()[-1]
+        await trip.clock.sleep(3.0)
+        assert math.dist(truth.array()[-1][1:3], paused[1:3]) < 0.01
+        await trip.order("resume")
+        await trip.arm()
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+        assert {Reason.PAUSED, Reason.RESUMED, Reason.CANCELLED} <= set(trip.reasons())
+
+    assert_at(travel(story), 5.0, 3.9, 0.0)

@@ -1,0 +1,331 @@
+"""Decisions about goals, backing out, the way ahead, and the planning step."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, clearance_to_points
+from monstertruck_planners.manage import mission as machine
+from monstertruck_planners.manage.config import EscapeConfig, PlannerConfig
+from monstertruck_planners.manage.escape import blocked_sides, escape, placed, seen_from
+from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Setup
+from monstertruck_planners.manage.lookout import blocked, cut, way_ahead
+from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
+from monstertruck_planners.manage.planning import PlanningStep
+from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.plan import GoalPhase
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder
+from monstertruck_schemas.state import Grid
+
+GOAL = (2.0, 0.0, 0.0)
+CONFIG = PlannerConfig()
+WAY = PlanAnswer(Reason.OK, poses=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), directions=np.ones(2), length=2.0)
+
+
+class Story:
+    """A mission that is told facts; time passes by 0.1 s a fact."""
+
+    def __init__(self, config: PlannerConfig = CONFIG) -> None:
+        self.config = config
+        self.now = 0.0
+        self.mission, actions = machine.begin(1, GOAL, "tester", 0.0)
+        self.done: list[Action] = list(actions)
+
+    def tell(self, count: int = 1, **facts: Any) -> tuple[Action, ...]:
+        actions: list[Action] = []
+        for _ in range(count):
+            self.now += 0.1
+            known: dict[str, Any] = {"armed": True, "at_rest": True, "pose": (0.0, 0.0, 0.0), **facts}
+            self.mission, some = machine.tick(self.mission, Facts(now=self.now, **known), self.config)
+            actions += some
+        self.done += actions
+        return tuple(actions)
+
+    def order(self, what: GoalOrder) -> tuple[Action, ...]:
+        self.mission, actions = machine.order(self.mission, what, "tester", self.now)
+        return actions
+
+    @property
+    def phase(self) -> GoalPhase:
+        return self.mission.phase
+
+
+def told(actions: Iterable[Action]) -> list[Reason]:
+    return [action.reason for action in actions if isinstance(action, Tell)]
+
+
+def test_a_goal_is_planned_followed_and_reached():
+    story = Story()
+    assert story.done == [Tell(Reason.GOAL_ACCEPTED, machine.Severity.INFO, story.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
+    assert story.tell() == ()
+    actions = story.tell(answer=WAY)
+    assert (story.phase, actions[0], told(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
+    assert story.tell(10, along=1.0, at_rest=False) == ()
+    assert story.tell(outcome=Reason.GOAL_REACHED, at_rest=False, pose=GOAL) == (), "still rolling"
+    actions = story.tell(outcome=Reason.GOAL_REACHED, pose=(1.95, 0.02, 0.05 + math.tau))
+    assert (story.mission.outcome, story.mission.active) == (Reason.GOAL_REACHED, False)
+    assert (Halt() in actions, told(actions)) == (True, [Reason.GOAL_REACHED])
+    assert story.tell(answer=WAY) == ()
+
+
+@pytest.mark.parametrize("reason", [Reason.GOAL_BLOCKED, Reason.GOAL_OUTSIDE, Reason.GOAL_UNREACHABLE])
+def test_a_goal_without_a_way_is_refused_at_once(reason: Reason):
+    story = Story()
+    story.tell(answer=PlanAnswer(reason, "why"))
+    assert (story.mission.outcome, story.mission.text, story.mission.recoveries) == (reason, "why", 0)
+
+
+def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
+    story = Story()
+    for _ in range(machine.MISSES):
+        story.tell(answer=WAY)
+        assert told(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.8, 0.0, 0.0))) == [Reason.GOAL_MISSED]
+        assert story.phase is GoalPhase.PLANNING
+    story.tell(answer=WAY)
+    story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.2))
+    assert story.mission.outcome is Reason.GOAL_MISSED
+
+
+def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
+    story = Story()
+    story.tell(answer=WAY)
+    assert story.tell(CONFIG.sightings - 1, blocked=True, along=0.2) == ()
+    actions = story.tell(blocked=True, along=0.3)
+    assert (told(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
+
+
+def test_the_ladder_is_climbed_in_order_and_then_the_goal_is_given_up():
+    story = Story()
+    story.tell(answer=WAY)
+    stuck = round(CONFIG.stuck / 0.1) + 2
+    assert Plan(clear=True) in story.tell(stuck)
+    story.tell(answer=WAY)
+    assert Plan("escape") in story.tell(stuck)
+    story.tell(answer=WAY)
+    assert story.phase is GoalPhase.BACKING_OUT
+    assert Plan() in story.tell(outcome=Reason.GOAL_REACHED)
+    story.tell(answer=WAY)
+    story.tell(stuck)
+    assert story.phase is GoalPhase.WAITING
+    assert Plan() in story.tell(round(CONFIG.wait / 0.1) + 2)
+    story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    assert (story.phase, story.mission.recoveries) == (GoalPhase.PLANNING, 4)
+    story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    assert (story.mission.outcome, story.mission.text) == (Reason.GOAL_UNREACHABLE, "walled in")
+
+
+def test_the_ladder_begins_anew_once_the_truck_has_got_on():
+    story = Story()
+    story.tell(answer=WAY)
+    story.tell(round(CONFIG.stuck / 0.1) + 2)
+    story.tell(answer=WAY)
+    assert story.mission.rung == 1
+    for along in (0.1, 0.3, 0.55):
+        story.tell(along=along)
+    assert story.mission.rung == 0
+
+
+def test_a_failed_escape_is_the_next_rung():
+    story = Story(PlannerConfig(ladder=("back_out", "wait")))
+    story.tell(answer=PlanAnswer(Reason.START_BLOCKED))
+    story.tell(answer=PlanAnswer(Reason.STUCK, "both ends"))
+    assert story.phase is GoalPhase.WAITING
+
+
+def test_a_lost_path_is_planned_anew():
+    story = Story()
+    story.tell(answer=WAY)
+    assert Plan() in story.tell(outcome=Reason.PATH_LOST)
+
+
+def test_time_counts_only_while_the_truck_could_drive():
+    story = Story(PlannerConfig(timeout=5.0, unarmed_timeout=20.0))
+    story.tell(answer=WAY)
+    story.tell(190, armed=False)
+    assert story.mission.active
+    for i in range(60):
+        story.tell(along=0.05 * i)
+    assert story.mission.outcome is Reason.GOAL_TIMEOUT
+    waiting = Story(PlannerConfig(unarmed_timeout=20.0))
+    waiting.tell(answer=WAY)
+    waiting.tell(210, armed=False)
+    assert waiting.mission.outcome is Reason.DISARMED
+
+
+def test_orders_pause_resume_and_cancel():
+    story = Story()
+    story.tell(answer=WAY)
+    assert story.order(GoalOrder.RESUME) == ()
+    assert Halt() in story.order(GoalOrder.PAUSE)
+    assert story.tell(1000) == ()
+    assert Plan() in story.order(GoalOrder.RESUME)
+    assert story.phase is GoalPhase.PLANNING
+    assert Halt() in story.order(GoalOrder.CANCEL)
+    assert story.mission.outcome is Reason.CANCELLED
+    assert story.order(GoalOrder.CANCEL) == ()
+
+
+def test_somebody_elses_path_is_left_alone():
+    mission, _ = machine.begin(1, GOAL, "tester", 0.0)
+    ended, actions = machine.displaced(mission, "another path")
+    assert (ended.outcome, Halt() in actions) == (Reason.CANCELLED, False)
+
+
+def test_routes_are_limited():
+    story = Story(PlannerConfig(routes=2))
+    for _ in range(2):
+        story.tell(answer=WAY)
+        story.tell(outcome=Reason.PATH_LOST)
+    assert isinstance(story.mission, Mission)
+    assert story.mission.outcome is Reason.STUCK
+
+
+# Backing out
+
+BODY, TRUCK = Footprint(), FourWheelSteering()
+WALL_AHEAD = np.column_stack((np.full(21, 0.35), np.linspace(-0.3, 0.3, 21)))
+WALL_LEFT = np.column_stack((np.linspace(-0.3, 0.3, 21), np.full(21, 0.25)))
+
+
+@pytest.mark.parametrize(
+    ("points", "sides"),
+    [
+        (WALL_AHEAD, (True, False, False, False)),
+        (-WALL_AHEAD, (False, True, False, False)),
+        (WALL_LEFT, (False, False, True, False)),
+        (-WALL_LEFT, (False, False, False, True)),
+        (np.array([[0.35, 0.07]]), (True, False, False, False)),  # between the package's three samples of a side
+        (np.empty((0, 2)), (False, False, False, False)),
+    ],
+)
+def test_blocked_sides_are_found_anywhere_along_them(points, sides):
+    found = blocked_sides(BODY, points, 0.15)
+    assert (found.front, found.rear, found.left, found.right) == sides
+    assert found.any is any(sides)
+
+
+def test_it_backs_out_from_a_wall_ahead_and_crabs_away_from_one_beside():
+    back = escape(EscapeConfig(), TRUCK, BODY, WALL_AHEAD, crab=True, rear=True)
+    assert back is not None
+    assert (back.direction, back.poses[-1, 0]) == (-1, pytest.approx(-0.5))
+    for direction, walls in ((1, WALL_LEFT), (-1, np.vstack((WALL_LEFT, WALL_AHEAD)))):
+        aside = escape(EscapeConfig(), TRUCK, BODY, walls, crab=True, rear=True)
+        assert aside is not None
+        assert (aside.direction, aside.steering) == (direction, "crab")
+        assert aside.poses[-1, 1] < -0.1, "to the right"
+        assert np.all(aside.poses[:, 2] == 0.0)
+        beside = math.hypot(*aside.poses[-1, :2])
+        assert beside == pytest.approx(0.5), "the whole way: cos b, not sqrt(1 / (1 + tan b))"
+
+
+def test_the_way_out_ends_before_the_next_obstacle_and_both_ends_blocked_is_none():
+    behind = -WALL_AHEAD - [0.2, 0.0]
+    out = escape(EscapeConfig(), TRUCK, BODY, np.vstack((WALL_AHEAD, behind)), crab=False, rear=True)
+    assert out is not None
+    assert 0.1 < -out.poses[-1, 0] < 0.3
+    assert clearance_to_points(BODY, out.poses, behind).min() > 0.0
+    assert escape(EscapeConfig(), TRUCK, BODY, np.vstack((WALL_AHEAD, -WALL_AHEAD)), crab=True, rear=True) is None
+
+
+def test_frames_there_and_back():
+    at = (1.0, -2.0, 2.1)
+    points = np.array([[0.3, 0.4], [-1.0, 2.0]])
+    flat = np.column_stack((points, np.zeros(2)))
+    assert np.allclose(seen_from(placed(flat, at)[:, :2], at), points)
+
+
+def test_the_way_ahead_is_blocked_by_what_stands_on_it_only():
+    poses = np.column_stack((np.linspace(1.0, 5.0, 81), np.ones(81), np.zeros(81)))
+    travelled = poses[:, 0] - 1.0
+    at = (2.0, 1.0, 0.0)
+    way = way_ahead(poses, travelled, 1.0, 1.5, np.array(at))
+    assert way[0].tolist() == list(at)
+    assert way[-1, 0] == pytest.approx(3.5, abs=0.06)
+    assert blocked(BODY, way, np.array([[1.0, 0.1]]), at)
+    assert not blocked(BODY, way, np.array([[1.0, 0.3], [2.5, 0.0]]), at)
+    assert not blocked(BODY, way, np.empty((0, 2)), at)
+    assert travelled[cut(poses, travelled, 1.0, 0.2) - 1] == pytest.approx(1.2, abs=0.06)
+    assert cut(poses, travelled, 0.0, 0.0) == 2
+
+
+# Planning
+
+
+def hall(shut: bool = False) -> Grid:
+    cells = np.zeros((60, 120), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    if shut:
+        cells[:, 60] = 100
+    return Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=120, height=60,
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0), cells=cells.ravel(),
+    )  # fmt: skip
+
+
+def setup(**config: Any) -> Setup:
+    settings = {"route": HybridConfig(effort=2000, margin=0.04), **config}
+    return Setup(PlannerConfig(**settings), TRUCK, BODY, timed=False)
+
+
+def task(goal=(4.5, 1.5, 0.0), points=(), **fields: Any) -> PlanTask:
+    fields = {"what": "route", "pose": (1.0, 1.5, 0.0), **fields}
+    return PlanTask(goal=goal, points=np.array(points, dtype=np.float64).reshape(-1, 2), **fields)
+
+
+@pytest.mark.parametrize("route", [HybridConfig(effort=2000, margin=0.04), LatticeConfig(effort=2000, margin=0.04)])
+def test_routes_round_what_the_scan_shows_until_that_is_forgotten(route):
+    step = PlanningStep()
+    straight = step.step(task(setup=setup(route=route), grid=hall()))
+    assert straight.ok
+    assert straight.length == pytest.approx(3.5, abs=0.05)
+    post = [(2.75, y) for y in np.arange(1.3, 1.75, 0.05)]
+    assert straight.poses is not None
+    round_it = step.step(task(points=post))
+    assert round_it.length > straight.length + 0.02
+    assert round_it.poses is not None
+    assert clearance_to_points(BODY, round_it.poses, np.array(post)).min() > 0.0
+    assert step.step(task()).length > straight.length + 0.02, "remembered"
+    assert step.step(task(clear=True)).length == pytest.approx(straight.length, abs=0.05)
+
+
+def test_a_valid_route_is_kept():
+    step = PlanningStep()
+    assert not step.step(task(setup=setup(), grid=hall())).kept
+    again = step.step(task(pose=(1.5, 1.52, 0.02)))
+    assert again.kept
+    assert again.poses is not None
+    assert np.allclose(again.poses[0], (1.5, 1.52, 0.02))
+
+
+def test_goals_without_a_way_and_what_is_missing():
+    step = PlanningStep()
+    with pytest.raises(InputError, match="setup"):
+        step.step(task())
+    assert step.step(task(setup=setup())).reason is Reason.NO_MAP
+    assert step.step(task(grid=hall(shut=True))).reason is Reason.GOAL_UNREACHABLE
+    assert step.step(task((9.0, 1.5, 0.0))).reason is Reason.GOAL_OUTSIDE
+    assert step.step(task((5.95, 1.5, 0.0))).reason is Reason.GOAL_BLOCKED
+    assert step.step(task((math.nan, 1.5, 0.0))).reason is Reason.NOT_FINITE
+
+
+def test_a_truck_that_stands_within_the_margin_may_leave():
+    step = PlanningStep()
+    assert step.step(task(setup=setup(), grid=hall(), pose=(1.0, 0.25, 0.0))).ok
+
+
+def test_backing_out_sees_the_map_behind_the_truck_too():
+    step = PlanningStep()
+    wall = [(1.33, y) for y in np.arange(1.2, 1.8, 0.05)]
+    out = step.step(task(what="escape", setup=setup(), grid=hall(), points=wall))
+    assert out.ok
+    assert out.poses is not None
+    assert np.allclose(out.poses[-1], (0.5, 1.5, 0.0), atol=0.03)
+    near = step.step(task(what="escape", pose=(0.36, 1.5, 0.0), points=[(x - 0.65, y) for x, y in wall]))
+    assert (near.ok, near.reason) == (False, Reason.STUCK)
