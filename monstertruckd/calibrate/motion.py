@@ -39,6 +39,7 @@ AT_REST: Final = 0.5
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
+CLOSED: Final = frozenset({GateMode.DISARMED, GateMode.ESTOPPED})
 
 
 class Truck(Protocol):
@@ -130,6 +131,7 @@ class Mover:
             with suppress(TruckError):
                 await self._truck.order(Order.STOP)
                 await self._truck.order(Order.DISARM)
+        await run.disarmed()
 
 
 class _Run:
@@ -146,7 +148,6 @@ class _Run:
         self._truck = truck
         self._clock = clock
         self._feeds = feeds
-        self._armed = False
 
     def begin(self) -> None:
         """Forget what was read so far."""
@@ -166,7 +167,15 @@ class _Run:
                 await self._truck.order(Order.ARM)
             await self._clock.sleep(PERIOD)
             self._take()
-        self._armed = True
+
+    async def disarmed(self) -> None:
+        """Wait until the gate has done so: the state that says DRIVING shall not be taken for the next move's."""
+        end = self._clock.now() + round(ARMING * SECOND)
+        while self.state is None or self.state.mode not in CLOSED:
+            if self._clock.now() > end:
+                raise NoAnswerError(f"the gate does not tell within {ARMING:g} s that it disarmed the truck")
+            await self._clock.sleep(PERIOD)
+            self._take()
 
     async def hold(self, speed: float, front: float, rear: float, seconds: float) -> None:
         """Ask for one motion for so long.

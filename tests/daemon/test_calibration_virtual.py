@@ -265,6 +265,34 @@ def test_a_wizard_that_falls_silent_is_stopped_by_its_lease(tmp_path: Path):
     run_virtual(main)
 
 
+class Distant(LocalTruck):
+    """Orders take a while to arrive."""
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        late = asyncio.create_task(self._arrive(order, lease))
+        self.late = [*getattr(self, "late", []), late]
+
+    async def _arrive(self, order: Order, lease: float) -> None:
+        await self._clock.sleep(0.2)
+        await super().order(order, lease)
+
+
+def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path):
+    config, _ = yard(tmp_path, 1)
+
+    async def main(clock: VirtualClock) -> Result:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            await clock.sleep(3.0)
+            truck, panel = Distant(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
+            wizard = drive_wizard(DriveWizard(runs=3, metres=0.5))
+            result, _ = await calibrate(wizard, truck, panel, clock, config, {})
+            await asyncio.gather(*truck.late)
+            return result
+
+    assert len(run_virtual(main).estimates) == 4
+
+
 # What the daemon takes
 
 
