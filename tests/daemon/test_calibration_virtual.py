@@ -27,6 +27,7 @@ from monstertruckd.config.validate import load_config
 from monstertruckd.demo.operator import LocalOperator
 from monstertruckd.sim.calibration import LocalTruck, Session, SimulatedOperator, hidden, run_session, verdicts
 from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults_drill import with_overlay
 from monstertruckd.sim.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
@@ -67,6 +68,22 @@ def test_battery(seed: int, tmp_path: Path):
     current = store_of(config).current()
     assert current is not None
     assert current.number == 2
+
+
+def test_battery_by_a_converter_of_the_kernel(tmp_path: Path):
+    config, rng = yard(tmp_path, 5, "battery")
+    converter = with_overlay(
+        config,
+        {
+            "devices": {"steering": {"driver": {"battery": None}}},
+            "monitors": {"battery": {"kind": "iio", "channel": 5}},
+        },
+    )
+    gain, offset = run_session(converter, battery_wizard(), rng).result.estimates
+    assert (gain.key, offset.key) == ("monitors.battery.divider", "monitors.battery.offset")
+    assert gain.low is not None
+    assert gain.high is not None
+    assert gain.low < converter.sim.world.battery.divider < gain.high
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -58,6 +58,22 @@ def test_files_are_dated_numbered_and_all_kept(store: CalibrationStore):
     assert current.change == "battery calibrated"
 
 
+def test_a_partial_result_keeps_what_it_did_not_measure(store: CalibrationStore):
+    store.save(ratio(640.0), NOON)
+    sign = Estimate(name="inverted", value=True, samples=1, meaning="test")
+    store.save(Result(wizard="drive", measured="seen", estimates=(sign,), partial=True), NOON + 60 * SECOND)
+    current = store.current()
+    assert current is not None
+    dates = {estimate.name: estimate.date for estimate in current.results["drive"].estimates}
+    assert dates == {"inverted": "2026-11-21T12:01:00Z", "drive_ratio": "2026-11-21T12:00:00Z"}
+    store.save(ratio(650.0), NOON + 120 * SECOND)
+    current = store.current()
+    assert current is not None
+    assert [estimate.name for estimate in current.results["drive"].estimates] == ["drive_ratio"], "all was measured"
+    store.undo("drive", NOON)
+    assert value(store) is True
+
+
 def test_numbers_decide_not_dates(store: CalibrationStore):
     store.save(ratio(640.0), NOON)
     store.save(ratio(650.0), 0)  # a robot without a clock of its own
