@@ -99,19 +99,22 @@ class Surveyor:
     def _seen(self, ahead: Guide, near: Guide | None, surroundings: DistanceField, pose: Array) -> int:
         """Number of guide poses that come into the band: up to the last free one that is in the window and in reach."""
         begin = 0.0 if near is None else near.travelled[-1]
-        data = surroundings.data()
-        rows, columns = (n - 2 for n in data.occupied.shape)
-        size = np.array([columns, rows]) * surroundings.resolution
-        x, y, yaw = surroundings.origin
-        dx, dy = ahead.poses[:, 0] - x, ahead.poses[:, 1] - y
-        c, s = math.cos(yaw), math.sin(yaw)
-        places = np.column_stack((dx * c + dy * s, dy * c - dx * s))
-        inset = self.config.inset + self.vehicle.footprint.circumscribed_radius
-        inside = ((places > inset) & (places < size - inset)).all(axis=1)
+        inside = self._in_window(ahead.poses, surroundings, self.config.inset)
         inside &= begin + ahead.travelled <= self.config.reach
         stop = int(np.argmin(inside)) if not inside.all() else len(inside)
         free = surroundings.free(self.vehicle.footprint, ahead.poses[:stop], self.config.margin)
         return int(np.flatnonzero(free)[-1]) + 1 if free.any() else 0
+
+    def _in_window(self, poses: Array, surroundings: DistanceField, inset: float) -> NDArray[np.bool_]:
+        """Whether the circle round the footprint is ``inset`` inside the window, for each pose."""
+        rows, columns = (n - 2 for n in surroundings.data().occupied.shape)
+        size = np.array([columns, rows]) * surroundings.resolution
+        x, y, yaw = surroundings.origin
+        dx, dy = poses[:, 0] - x, poses[:, 1] - y
+        c, s = math.cos(yaw), math.sin(yaw)
+        places = np.column_stack((dx * c + dy * s, dy * c - dx * s))
+        inset += self.vehicle.footprint.circumscribed_radius
+        return np.asarray(((places > inset) & (places < size - inset)).all(axis=1))
 
     def free(self, surroundings: DistanceField, path: MotionPath) -> bool:
         """Whether a path keeps the margin all the way."""
@@ -127,17 +130,27 @@ class Surveyor:
 
     def search(
         self, surroundings: DistanceField, pose: Array, local: Local, failed: int
-    ) -> tuple[MotionPath | None, Reason]:
-        """Way to the end of the band by a small search, with the margin or at least without contact.
+    ) -> tuple[MotionPath | None, Guide | None, Reason]:
+        """Way along the band by a small search, with the margin or at least without contact.
+
+        It leads to the band's end, or if the truck has backed off so far that this is out of the window, to the last
+        free pose that is not: the band may hold the way found before.
 
         Args:
             surroundings: obstacles.
             pose: of the truck.
             local: the band; where it does not end with the route, other headings will do there.
             failed: searches in a row that found nothing.
+
+        Returns:
+            The path and the band that follows from it, or why there are none.
         """
-        goal = local.band.poses[-1].copy()
-        if not local.final:
+        band = local.band
+        free = surroundings.free(self.vehicle.footprint, band.poses, self.config.margin)
+        inside = np.flatnonzero(self._in_window(band.poses, surroundings, 0.0) & free)
+        last = int(inside[-1]) if len(inside) else len(band.poses) - 1
+        goal = band.poses[last].copy()
+        if last == len(band.poses) - 1 and not local.final:
             goal[2] += TURNED[failed // PATIENCE % len(TURNED)]
         reason = Reason.PATH_BLOCKED
         first, *others = self._planners
@@ -146,11 +159,13 @@ class Surveyor:
         for planner in (first, *others):
             result = planner.plan(RouteMap(surroundings), pose, goal)
             if result.path is not None and len(result.path.rows):
-                return result.path, Reason.OK
+                found = Guide.from_motion(result.path)
+                rest = band.part(last + 1, len(band.poses)) if last + 1 < len(band.poses) else None
+                return result.path, found if rest is None else found.then(rest), Reason.OK
             reason = result.reason
             if reason is not Reason.START_BLOCKED and reason is not Reason.GOAL_BLOCKED:
                 break
-        return None, reason
+        return None, None, reason
 
     def cost(self, surroundings: DistanceField, path: MotionPath) -> float:
         """What a path costs, m."""

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 FURTHER = (1.0, 1.5, 2.0, 3.0)
 """Sub-goals tried, as factors on their distance."""
 
+CRUMB = 0.05
+"""What is left of a path to a cusp when it is replaced, m."""
+
 ROUNDABOUT = 1.6
 """A motion between two band poses longer than this factor on their distance is none: it turns round."""
 
@@ -75,17 +78,19 @@ class Rsband:
         ended_there = rest is not None and ends_at(rest, guide.poses[-1])
         if (
             rest is not None
-            and self._good(rest, far, to_end=ended_there or to_cusp(rest, local.band))
+            and self._good(rest, far, to_end=ended_there, to_cusp=to_cusp(rest, local.band))
             and self._surveyor.free(surroundings, rest)
         ):
             kept = replace(memory, path=rest)
             return DeformResult(Reason.OK, kept, rest, ended_there, statistics={"kept": 1.0})
         return self._fresh(local, surroundings, here, memory, rest)
 
-    def _good(self, rest: MotionPath, far: float, *, to_end: bool) -> bool:
+    def _good(self, rest: MotionPath, far: float, *, to_end: bool, to_cusp: bool) -> bool:
         if far > self.config.off_path or not len(rest.rows):
             return False
-        return rest.length > (RUN_ENDED if to_end else self.config.renew * self.config.sub_goal)
+        if to_end or to_cusp:
+            return rest.length > (RUN_ENDED if to_end else CRUMB)
+        return rest.length > self.config.renew * self.config.sub_goal
 
     def _fresh(
         self, local: Local, surroundings: DistanceField, here: Array, memory: Memory, rest: MotionPath | None
@@ -106,12 +111,13 @@ class Rsband:
                 done = ends_at(motion.path, memory.guide.poses[-1])  # type: ignore[union-attr]
                 return DeformResult(Reason.OK, after, motion.path, done, statistics=statistics)
         statistics["searched"] = 1.0
-        path, why = self._surveyor.search(surroundings, here, local, memory.failed)
+        path, band_of_path, why = self._surveyor.search(surroundings, here, local, memory.failed)
         if path is None:
             result = self._surveyor.partial(memory, surroundings, here, rest, why)
             return replace(result, statistics=statistics)
-        after = replace(memory, band=Guide.from_motion(path), path=path, failed=0)
-        return DeformResult(Reason.OK, after, path, local.final, statistics=statistics)
+        after = replace(memory, band=band_of_path, path=path, failed=0)
+        done = ends_at(path, memory.guide.poses[-1])  # type: ignore[union-attr]
+        return DeformResult(Reason.OK, after, path, done, statistics=statistics)
 
     def _join(self, surroundings: DistanceField, here: Array, goal: Array) -> MotionPath | None:
         """Best motion between two poses if it is free."""

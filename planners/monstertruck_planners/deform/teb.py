@@ -75,11 +75,12 @@ class Teb:
             statistics["kept"] = 1.0
         if path is None:
             statistics["searched"] = 1.0
-            found, why = self._surveyor.search(surroundings, here, local, memory.failed)
+            found, way, why = self._surveyor.search(surroundings, here, local, memory.failed)
             if found is None:
                 result = self._surveyor.partial(memory, surroundings, here, rest, why)
                 return replace(result, statistics=statistics)
             path = self._settled(Guide.from_motion(found, self.config.spacing), surroundings, statistics) or found
+            local = replace(local, band=way or local.band)
         done = local.final and ends_at(path, guide.poses[-1])
         end = local.band.poses[-1]
         whole = math.hypot(*(path.end - end)[:2]) < WHOLE
