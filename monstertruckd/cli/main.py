@@ -11,6 +11,7 @@ from monstertruckd.cli import (
     doctor,
     drill,
     drive,
+    goto,
     kinematics,
     live,
     logs,
@@ -60,6 +61,8 @@ app.command("disarm")(orders.disarm)
 app.command("estop")(orders.estop)
 app.command("reset")(orders.reset)
 app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
+app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
+app.command("track")(goto.track)
 app.command("replay")(logs.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)

@@ -23,7 +23,7 @@ from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message, Pose2D, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalOrder, GoalRequest, Order, PathRequest, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import (
     GATE,
@@ -212,6 +212,25 @@ class TruckClient:
     async def goal(self, goal: Pose2D, frame: str = "map", lease: float = 1.0) -> None:
         """Ask to drive to a pose in ``frame``. Raises as ``drive`` does."""
         self._put(REQ_GOAL, GoalRequest(**await self._answered(lease), frame=frame, goal=goal))
+
+    async def go(self, goal: tuple[float, float, float], frame: str = "map") -> dict[str, Any]:
+        """Ask to drive to x, y (m), yaw (rad), and wait for the first route; returns the goal's ``number``.
+
+        Progress is ``plan/goal``. Numbers that are not finite reach the robot, which refuses them by name.
+
+        Raises:
+            RequestRefusedError: no way leads there, or why the robot does not go.
+            NotFoundError: the robot is not there, or has no planner.
+            NoAnswerError: no answer in time.
+        """
+        x, y, yaw = goal
+        return await self.call(
+            "goal", {**await self._answered(1.0), "frame": frame, "goal": {"x": x, "y": y, "yaw": yaw}}
+        )
+
+    async def goal_control(self, order: GoalOrder) -> None:
+        """Pause, resume or cancel the goal. Raises as ``go`` does."""
+        await self.call("goal_control", {**await self._answered(1.0), "order": order})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Ask to follow a path computed here. Raises as ``drive`` does."""

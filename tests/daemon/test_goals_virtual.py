@@ -1,5 +1,6 @@
 """Goals of the whole daemon on the virtual clock: reached, refused, cancelled, paused."""
 
+import asyncio
 import math
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -12,10 +13,13 @@ from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
+from monstertruck_schemas.req import GoalOrder, Order, PathRequest, Role
+from monstertruckd.cli.goto_session import drive_to, follow
 from monstertruckd.config.validate import load_config
 from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.paths import load_path
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.faults_drill import with_overlay
 from monstertruckd.sim.rig import VirtualRig
@@ -160,3 +164,50 @@ def test_cancel_stops_and_pause_interrupts():
         assert {Reason.PAUSED, Reason.RESUMED, Reason.CANCELLED} <= set(trip.reasons())
 
     assert_at(travel(story), 5.0, 3.9, 0.0)
+
+
+class LocalDriver(LocalOperator):
+    """What a client is to the commands, inside the daemon's process."""
+
+    source = "operator"
+
+    def __init__(self, trip: Trip) -> None:
+        super().__init__(trip.rig.bus, trip.clock)
+        self._trip = trip
+
+    async def get_retained(self, topic: Any) -> Any:
+        return self._trip.rig.bus.newest(topic)
+
+    async def go(self, goal: tuple[float, float, float], frame: str = "map") -> dict[str, Any]:
+        return await self._trip.goal(*goal)
+
+    async def goal_control(self, order: GoalOrder) -> None:
+        await self._trip.order(order)
+
+    async def path(self, path: DrivePath, lease: float = 1.0) -> None:
+        header = self._trip.header()
+        request = PathRequest.model_validate({**header, "role": Role.STATION, "source": self.source, "path": path})
+        self._trip.rig.bus.inject(topics.REQ_PATH, request)
+
+
+def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: Path):
+    file = tmp_path / "straight.csv"
+    file.write_text("x,y,yaw,direction\n" + "".join(f"{x / 10:.1f},3.95,0.0,1\n" for x in range(10, 26)))
+
+    async def story(trip: Trip) -> None:
+        driver = LocalDriver(trip)
+        arrival = await follow(driver, trip.clock, load_path(file, closed=False, frame="odom"), arm=True)
+        assert arrival.reason is Reason.GOAL_REACHED
+        assert arrival.length == pytest.approx(1.5)
+        arrival = await drive_to(driver, trip.clock, (3.0, 3.9, 0.0), arm=True)
+        assert (arrival.reason, arrival.routes, arrival.recoveries) == (Reason.GOAL_REACHED, 1, 0)
+        with pytest.raises(RequestRefusedError, match="off the map"):
+            await drive_to(driver, trip.clock, (30.0, 3.9, 0.0), arm=True)
+        trip.states.drain()
+        driving = asyncio.create_task(drive_to(driver, trip.clock, (6.0, 3.9, 0.0), arm=True))
+        await trip.clock.sleep(5.0)
+        driving.cancel()
+        await asyncio.wait([driving])
+        assert (await trip.end()).outcome is Reason.CANCELLED
+
+    assert not travel(story).truth.array()[:, 5].any()

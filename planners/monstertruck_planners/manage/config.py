@@ -57,10 +57,14 @@ class PlannerConfig(Schema):
     """map_server YAML file to plan on where there is no slam"""
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
     """Decisions per second."""
-    position_tolerance: Positive = 0.1
+    position_tolerance: Positive = 0.2
     """The goal is reached if the truck stands this near, m..."""
-    yaw_tolerance: Positive = 0.1
+    yaw_tolerance: Positive = 0.2
     """...and is turned away from it by no more than this, rad."""
+    aim: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Share of these beyond which it corrects its place first."""
+    corrections: Annotated[int, Field(ge=0)] = 1
+    """How often it does so."""
     timeout: Positive = 600.0
     """Seconds for a goal; those in which the truck is not armed or the goal is paused do not count."""
     unarmed_timeout: Positive = 300.0

@@ -226,7 +226,8 @@ def _arrived(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
     assert facts.pose is not None
     away, turned = apart(facts.pose, mission.goal)
     off = f"{away:.3f} m and {turned:.3f} rad away"
-    if away <= config.position_tolerance and turned <= config.yaw_tolerance:
+    error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
+    if error <= (config.aim if mission.misses < config.corrections else 1.0):
         return _end(mission, Reason.GOAL_REACHED, off, Severity.INFO)
     if mission.misses >= MISSES:
         return _end(mission, Reason.GOAL_MISSED, off)

@@ -86,11 +86,19 @@ def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
     story = Story()
     for _ in range(machine.MISSES):
         story.tell(answer=WAY)
-        assert told(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.8, 0.0, 0.0))) == [Reason.GOAL_MISSED]
+        assert told(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
         assert story.phase is GoalPhase.PLANNING
     story.tell(answer=WAY)
-    story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.2))
+    story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.3))
     assert story.mission.outcome is Reason.GOAL_MISSED
+
+
+def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
+    story = Story()
+    for outcome in (Reason.DRIVING, Reason.GOAL_REACHED):
+        story.tell(answer=WAY)
+        story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.15))
+        assert story.mission.outcome is outcome
 
 
 def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
