@@ -12,7 +12,7 @@ from monstertruck_planners.deform.band import cover_of
 from monstertruck_planners.deform.catalog import KINDS, make_deformer
 from monstertruck_planners.deform.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.deform.least_squares import cost_and_gradient
-from monstertruck_planners.deform.local import passed, rest_of
+from monstertruck_planners.deform.local import Local, Surveyor, onward, passed, rest_of
 from monstertruck_planners.deform.published import oriented
 from monstertruck_planners.deform.teb import resampled, terms_of
 from monstertruck_planners.route.api import Vehicle
@@ -186,6 +186,23 @@ def test_a_cusp_is_passed_only_when_it_is_reached():
     rest, far = rest_of(path, np.array([0.5, 0.02, 0.0]))
     assert rest.length == pytest.approx(1.5)
     assert far == pytest.approx(0.02)
+
+
+def test_what_follows_a_reached_cusp_no_longer_leads_back_to_it():
+    guide = Guide(np.array([[0, 0, 0], [1, 0, 0], [0.5, 0, 0], [0, 0, 0]]), np.array([1.0, 1, -1, -1]))
+    rest = onward(guide, np.array([0.96, 0.0, 0.0]))
+    assert rest.directions.tolist() == [-1.0, -1.0, -1.0]
+    assert len(onward(rest, np.array([0.5, 0.0, 0.0])).poses) == 2
+
+
+def test_the_way_found_is_kept_while_its_end_is_out_of_sight():
+    vehicle = CARS["4ws"]
+    surveyor = Surveyor(vehicle, RsbandConfig())
+    band = line(begin=1.0, end=6.0)
+    path, way, reason = surveyor.search(window(), np.array(START), Local(band, 99, final=False), 0)
+    assert reason is Reason.OK
+    assert path.end[0] < 4.0 - vehicle.footprint.circumscribed_radius
+    assert way.poses[-1].tolist() == band.poses[-1].tolist()
 
 
 def test_message_poses_are_those_of_the_base():
