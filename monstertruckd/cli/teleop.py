@@ -80,6 +80,9 @@ class Teleop:
     _throttle: int = 0
     _last: str = ""
     _until: int = 0
+    """What the driving keys ask for stands until then."""
+    _resting: int = 0
+    """Until then the truck is held at rest where no key stands."""
     _asking: bool = False
 
     @property
@@ -120,7 +123,7 @@ class Teleop:
         elif (order := ORDERS.get(key)) is not None:
             self.release()
             if order is Order.ARM:
-                self._stand(now, self.arm_hold)
+                self._resting = now + round(self.arm_hold * SECOND)
             return order
         return None
 
@@ -132,25 +135,23 @@ class Teleop:
             self._steer = self._drift = 0
         standing = now <= self._until
         self._throttle = THROTTLE.get(key, self._throttle if standing else 0)
-        self._stand(now, self.hold if standing and key == self._last else self.first_hold)
-        self._last = key
-
-    def _stand(self, now: int, seconds: float) -> None:
+        seconds = self.hold if standing and key == self._last else self.first_hold
         self._until = max(self._until, now + round(seconds * SECOND))
+        self._last = key
 
     def release(self) -> None:
         """All keys count as let go."""
-        self._until = self._throttle = 0
+        self._until = self._resting = self._throttle = 0
 
     def wish(self, now: int) -> Wish | None:
         """What to ask for now: the keys' motion, once a stop after it, then nothing."""
         front, rear = axles(self.mode, self.steer, self.drift)
         rear = math.copysign(min(abs(rear), self.angle), rear)
-        if now > self._until:
-            asked, self._asking, self._throttle = self._asking, False, 0
-            return Wish(0.0, front, rear) if asked else None
-        self._asking = True
-        return Wish(self._throttle * self.speed, front, rear)
+        if now <= self._until:
+            self._asking = True
+            return Wish(self._throttle * self.speed, front, rear)
+        asked, self._asking, self._throttle = self._asking, now <= self._resting, 0
+        return Wish(0.0, front, rear) if asked or self._asking else None
 
 
 def _stepped(steps: int, by: int) -> int:

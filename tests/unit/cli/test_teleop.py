@@ -161,3 +161,14 @@ def test_arming_holds_the_truck_at_rest_for_a_moment():
     assert teleop.wish(after(2.0)) == Wish(0.1, 0.0, 0.0)
     assert teleop.wish(after(2.6)) == Wish(0.0, 0.0, 0.0)
     assert teleop.wish(after(2.7)) is None
+
+
+def test_a_key_pressed_while_the_truck_is_held_at_rest_stands_no_longer_than_any_other():
+    teleop = Teleop(arm_hold=2.0)
+    teleop.press("enter", START)
+    teleop.press("w", after(0.3))
+    assert teleop.wish(after(0.35)) == Wish(0.1, 0.0, 0.0)
+    assert teleop.wish(after(0.95)) == Wish(0.0, 0.0, 0.0)
+    assert teleop.wish(after(1.9)) == Wish(0.0, 0.0, 0.0)
+    assert teleop.wish(after(2.1)) == Wish(0.0, 0.0, 0.0)
+    assert teleop.wish(after(2.2)) is None
