@@ -12,10 +12,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from monstertruck_estimation.slam.registration import Cloud
+
 Array = NDArray[np.float64]
 
 RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
+LONGEST: Final = 0.5
+"""An element is drawn to this half length at most, m."""
+MARGIN: Final = math.ceil(LONGEST / RESOLUTION) + 5
+"""Cells round the outermost points."""
 SMEAR: Final = 0.08
 """Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search."""
 DOUBT: Final = 0.002
@@ -34,15 +40,20 @@ class LikelihoodGrid:
     """Corner of the cell (0, 0), m."""
 
     @classmethod
-    def of(cls, points: Array, levels: int) -> "LikelihoodGrid":
-        """Likelihood of surfaces at ``points``, shape (n, 2), n > 0."""
-        pad = (1 << (levels - 1)) + 4
+    def of(cls, cloud: Cloud, levels: int) -> "LikelihoodGrid":
+        """Likelihood of the surfaces of ``cloud``, which is not empty.
+
+        Every element is drawn as long as it is: drawn as dots, far samples of a wall would match themselves best without
+        any motion.
+        """
+        points = cloud.points
+        pad = (1 << (levels - 1)) + MARGIN
         low = np.floor(points.min(axis=0) / RESOLUTION).astype(np.int64) - pad
         high = np.floor(points.max(axis=0) / RESOLUTION).astype(np.int64) + pad
         columns, rows = (high - low + 1).tolist()
         origin = (float(low[0] * RESOLUTION), float(low[1] * RESOLUTION))
         grid = np.zeros((levels, rows, columns), np.uint8)
-        _stamp(grid[0], points, origin[0], origin[1])
+        _stamp(grid[0], points, cloud.normals, cloud.extents, origin[0], origin[1])
         for level in range(1, levels):
             _pool(grid[level - 1], grid[level], 1 << (level - 1))
         return cls(grid, origin)
@@ -103,16 +114,25 @@ def correlate(
 
 
 @njit(cache=True)
-def _stamp(grid, points, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    half = 4
+def _stamp(grid, points, normals, extents, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     for i in range(points.shape[0]):
-        px, py = (points[i, 0] - x0) / RESOLUTION, (points[i, 1] - y0) / RESOLUTION
-        cx, cy = int(px), int(py)
-        for gy in range(cy - half, cy + half + 1):
-            for gx in range(cx - half, cx + half + 1):
-                dx, dy = (gx + 0.5 - px) * RESOLUTION, (gy + 0.5 - py) * RESOLUTION
-                value = np.uint8(255 * math.exp(-0.5 * (dx * dx + dy * dy) / (SMEAR * SMEAR)))
-                grid[gy, gx] = max(grid[gy, gx], value)
+        half = min(extents[i], LONGEST)
+        steps = int(half / RESOLUTION)
+        for k in range(-steps, steps + 1):
+            px = (points[i, 0] - normals[i, 1] * k * RESOLUTION - x0) / RESOLUTION
+            py = (points[i, 1] + normals[i, 0] * k * RESOLUTION - y0) / RESOLUTION
+            _dot(grid, px, py)
+
+
+@njit(cache=True)
+def _dot(grid, px, py):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    half = 4
+    cx, cy = int(px), int(py)
+    for gy in range(cy - half, cy + half + 1):
+        for gx in range(cx - half, cx + half + 1):
+            dx, dy = (gx + 0.5 - px) * RESOLUTION, (gy + 0.5 - py) * RESOLUTION
+            value = np.uint8(255 * math.exp(-0.5 * (dx * dx + dy * dy) / (SMEAR * SMEAR)))
+            grid[gy, gx] = max(grid[gy, gx], value)
 
 
 @njit(cache=True)

@@ -29,6 +29,8 @@ WIDEST: Final = (2.0, 1.6)
 """Most of that, m and rad."""
 CREDIBLE: Final = 6.0
 """A match further off the guess than this many standard deviations is not believed."""
+MODEST: Final = 3.0
+"""The same for a match that overlaps less than ``DOUBTFUL``."""
 DOUBTFUL: Final = 0.6
 """Matches that overlap less are compared with one from further away."""
 LEAST_AFAR: Final = 0.5
@@ -113,8 +115,9 @@ class Planar:
         match = self._locate(scan, guess, covariance, submap)
         if match.accepted and match.overlap >= DOUBTFUL:
             return match
+        least = match.overlap + CLEARLY if match.accepted else 0.0
         again = self._locate(scan, guess, covariance * WIDER**2, submap)
-        if again.accepted and again.overlap >= max(LEAST_AFAR, match.overlap + CLEARLY):
+        if again.accepted and again.overlap >= max(LEAST_AFAR, least):
             return again
         return match
 
@@ -142,7 +145,7 @@ def judge(fit: Fit, guess: Array, covariance: Array) -> Match:
         verdict = Verdict.EMPTY
     elif fit.overlap < LEAST_OVERLAP:
         verdict = Verdict.OVERLAP
-    elif float(off @ np.linalg.solve(covariance, off)) > CREDIBLE**2:
+    elif float(off @ np.linalg.solve(covariance, off)) > (CREDIBLE if fit.overlap >= DOUBTFUL else MODEST) ** 2:
         verdict = Verdict.FAR
     posterior = np.linalg.inv(fit.information + np.linalg.inv(covariance))
     if verdict is not Verdict.ACCEPTED:

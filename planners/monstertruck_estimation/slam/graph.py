@@ -21,6 +21,8 @@ Index = NDArray[np.int64]
 
 SWITCH: Final = 12.0
 """Squared Mahalanobis residual up to which a loop edge counts in full."""
+DOUBT: Final = 4.0
+"""Factor by which that shrinks from step to step to where it is."""
 LEVER: Final = 4.0
 """Distance at which an error of the yaw counts as one of the translation, m."""
 SETTLED: Final = 1e-4
@@ -73,46 +75,50 @@ def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
     return off, np.einsum("ni,nij,nj->n", off, edges.information, off)
 
 
-def trust(squares: Array, loop: NDArray[np.bool_]) -> Array:
+def trust(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Array:
     """Weight in (0, 1] of every edge by its squared residual: 1 for those that cannot be wrong."""
-    scale = np.minimum(1.0, 2 * SWITCH / (SWITCH + squares))
+    scale = np.minimum(1.0, 2 * switch / (switch + squares))
     return np.where(loop, scale**2, 1.0)
 
 
-def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 20) -> Array:
-    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; number ``fixed`` stays where it is."""
+def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -> Array:
+    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; number ``fixed`` stays where it is.
+
+    Loop edges are first taken at their word, however far off, and doubted step by step (graduated non-convexity: Yang,
+    Antonante, Tzoumas, Carlone 2020): a true closure of a long loop starts as far off as a false one.
+    """
     if not len(edges):
         return poses
     pattern = _Pattern(edges, len(poses), fixed)
     damping = 1e-6
     off, squares = residuals(poses, edges)
-    weights = trust(squares, edges.loop)
-    cost = _cost(squares, edges.loop)
+    switch = SWITCH * max(1.0, float(squares[edges.loop].max(initial=0.0)) / SWITCH)
+    cost = _cost(squares, edges.loop, switch)
     for _ in range(iterations):
-        step = pattern.solve(poses, edges, off, weights, damping)
+        step = pattern.solve(poses, edges, off, trust(squares, edges.loop, switch), damping)
         moved = poses + step
         moved[:, 2] = wrap(moved[:, 2])
         off_now, squares_now = residuals(moved, edges)
-        cost_now = _cost(squares_now, edges.loop)
+        cost_now = _cost(squares_now, edges.loop, switch)
         if cost_now > cost * (1 + 1e-9):
             damping = max(damping * 100, 1e-4)
             if damping > 1e6:
                 break
             continue
         poses, off, squares = moved, off_now, squares_now
-        weights = trust(squares, edges.loop)
         damping = max(damping / 10, 1e-9)
         settled = np.abs(step).max() < SETTLED or cost - cost_now < 1e-6 * cost
-        cost = cost_now
-        if settled:
+        if settled and switch == SWITCH:
             break
+        switch = max(SWITCH, switch / DOUBT)
+        cost = _cost(squares, edges.loop, switch)
     return poses
 
 
-def _cost(squares: Array, loop: NDArray[np.bool_]) -> float:
+def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
     """Sum of the robust costs belonging to ``trust``."""
-    scale = np.minimum(1.0, 2 * SWITCH / (SWITCH + squares))
-    robust = scale**2 * squares + SWITCH * (1 - scale) ** 2
+    scale = np.minimum(1.0, 2 * switch / (switch + squares))
+    robust = scale**2 * squares + switch * (1 - scale) ** 2
     return float(np.where(loop, robust, squares).sum())
 
 

@@ -38,6 +38,8 @@ class Cloud:
     """Shape (n, 2), towards the sensor that saw them."""
     variances: Array
     """Shape (n, 2): across and along the surface, m^2."""
+    extents: Array
+    """Shape (n,): half lengths, m."""
     starts: Index
     """Shape (2^k + 1,): first entry of ``order`` per bucket."""
     order: Index
@@ -46,7 +48,7 @@ class Cloud:
     @classmethod
     def of(cls, scan: Scan) -> "Cloud":
         """The elements of ``scan`` with their hash."""
-        return cls(scan.points, scan.normals, scan.variances, *_hashed(scan.points))
+        return cls(scan.points, scan.normals, scan.variances, scan.extents, *_hashed(scan.points))
 
     def __len__(self) -> int:
         return len(self.points)

@@ -20,9 +20,11 @@ RANGE_NOISE: Final = 0.012
 RELATIVE_NOISE: Final = 0.005
 """What is added per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
 REACH: Final = 0.2
-"""Neighbours up to this far away along the surface make its normal, m."""
-GRAZING: Final = 0.2
+"""Neighbours up to this far away along the surface make its normal, m; the next on either side does anyway."""
+GRAZING: Final = 0.12
 """Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad."""
+SLANTED: Final = 3.0
+"""Two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant."""
 SLIDE: Final = 5.0
 """Standard deviation along a line, m: none of what a scan knows."""
 
@@ -55,6 +57,8 @@ class Scan:
     """Shape (n, 2), unit vectors towards the sensor."""
     variances: Array
     """Shape (n, 2): across and along the surface, m^2."""
+    extents: Array
+    """Shape (n,): half of the length of surface each point stands for, m; 0 for lone points."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,7 +68,7 @@ class Scan:
         kept = spread(self.points, cell)
         if len(kept) > most:
             kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
-        return Scan(self.points[kept], self.normals[kept], self.variances[kept])
+        return Scan(self.points[kept], self.normals[kept], self.variances[kept], self.extents[kept])
 
 
 def prepare(
@@ -84,7 +88,7 @@ def prepare(
     values = np.ascontiguousarray(ranges, dtype=np.float64)
     limit = min(geometry.range_max, np.nextafter(longest, math.inf))
     xs, ys, yaw = geometry.mount
-    points, normals, variances = _prepare(
+    elements = _prepare(
         values,
         geometry.start_angle,
         geometry.angle_increment,
@@ -94,7 +98,7 @@ def prepare(
         np.array((xs, ys, yaw)),
         np.array(twist, dtype=np.float64),
     )
-    return Scan(points, normals, variances)
+    return Scan(*elements)
 
 
 @njit(cache=True)
@@ -131,9 +135,10 @@ def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twis
         k += 1
     normals = np.empty((n, 2))
     variances = np.empty((n, 2))
+    extents = np.zeros(n)
     for i in range(n):
-        _surface(points, origins, beams, reach, abs(increment), i, normals, variances)
-    return points, normals, variances
+        _surface(points, origins, beams, reach, abs(increment), i, normals, variances, extents)
+    return points, normals, variances, extents
 
 
 @njit(cache=True)
@@ -148,7 +153,7 @@ def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _surface(points, origins, beams, reach, increment, i, normals, variances):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _surface(points, origins, beams, reach, increment, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Normal and variances of point ``i`` from its neighbours in beam order."""
     n = points.shape[0]
     noise = RANGE_NOISE + RELATIVE_NOISE * reach[i]
@@ -157,7 +162,7 @@ def _surface(points, origins, beams, reach, increment, i, normals, variances):  
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
     count = 1
     px, py = points[i, 0], points[i, 1]
-    nearest = 1e9
+    nearest, furthest = 1e9, 0.0
     for side in (-1, 1):
         j = i
         while True:
@@ -167,7 +172,9 @@ def _surface(points, origins, beams, reach, increment, i, normals, variances):  
             dx, dy = points[k, 0] - px, points[k, 1] - py
             d = math.hypot(dx, dy)
             nearest = min(nearest, d)
-            if d > window:
+            if j == i:
+                furthest = max(furthest, d)
+            elif d > window:
                 break
             sx += dx
             sy += dy
@@ -180,7 +187,8 @@ def _surface(points, origins, beams, reach, increment, i, normals, variances):  
     length = math.hypot(bx, by)
     if length < 1e-9:
         bx, by, length = 1.0, 0.0, 1.0
-    if count >= 3:
+    # Two points far apart are the thin end of a wall along the beam; two close together may be a leg of a chair.
+    if count >= 3 or (count == 2 and furthest > SLANTED * spacing):
         mx, my = sx / count, sy / count
         cxx, cxy, cyy = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
         middle, half = (cxx + cyy) / 2, math.hypot((cxx - cyy) / 2, cxy)
@@ -192,6 +200,7 @@ def _surface(points, origins, beams, reach, increment, i, normals, variances):  
                 nx, ny = -nx, -ny
             normals[i, 0], normals[i, 1] = nx, ny
             variances[i, 0], variances[i, 1] = max(noise * noise, small), SLIDE * SLIDE
+            extents[i] = furthest / 2
             return
     normals[i, 0], normals[i, 1] = bx / length, by / length
     around = noise * noise + (min(nearest, window) / 2) ** 2 / 3

@@ -30,19 +30,20 @@ class Submap:
         """Likelihood pyramid of at least this many levels."""
         known = self._grids.get(levels)
         if known is None:
-            known = self._grids[levels] = LikelihoodGrid.of(self.cloud.points, levels)
+            known = self._grids[levels] = LikelihoodGrid.of(self.cloud, levels)
         return known
 
 
 def merged(scans: Sequence[Scan], poses: Array) -> Scan:
     """Elements of all ``scans`` at ``poses`` (shape (n, 3)), averaged where they are the same piece of surface."""
-    points, normals, variances = [], [], []
+    points, normals, variances, extents = [], [], [], []
     for scan, pose in zip(scans, poses, strict=True):
         turn = rotation(pose[2]).T
         points.append(scan.points @ turn + pose[:2])
         normals.append(scan.normals @ turn)
         variances.append(scan.variances)
-    every = np.concatenate(points), np.concatenate(normals), np.concatenate(variances)
+        extents.append(scan.extents)
+    every = np.concatenate(points), np.concatenate(normals), np.concatenate(variances), np.concatenate(extents)
     # Cell and octant of the normal tell the piece of surface.
     cells = np.floor(every[0] / MERGE).astype(np.int64)
     facing = np.floor(np.arctan2(every[1][:, 1], every[1][:, 0]) / (np.pi / 4) + 0.5).astype(np.int64) % 8
@@ -56,7 +57,7 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
 
 
 @njit(cache=True)
-def _average(points, normals, variances, keys, order):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _average(points, normals, variances, extents, keys, order):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Means of runs of equal keys; points are weighted by how well they lie on their surface."""
     n = keys.size
     runs = 0
@@ -64,6 +65,7 @@ def _average(points, normals, variances, keys, order):  # type: ignore[no-untype
         if i == 0 or keys[i] != keys[i - 1]:
             runs += 1
     p, m, v = np.zeros((runs, 2)), np.zeros((runs, 2)), np.zeros((runs, 2))
+    e = np.zeros(runs)
     r, total = -1, 0.0
     for i in range(n + 1):
         if i == n or i == 0 or keys[i] != keys[i - 1]:
@@ -81,5 +83,6 @@ def _average(points, normals, variances, keys, order):  # type: ignore[no-untype
         p[r] += w * points[k]
         m[r] += w * normals[k]
         v[r] += w * variances[k]
+        e[r] = max(e[r], extents[k])
         total += w
-    return p, m, v
+    return p, m, v, e

@@ -1,0 +1,82 @@
+"""A flat world of walls, a lidar in it, and wheels that drift."""
+
+import math
+
+import numpy as np
+
+from monstertruck_estimation.slam.mapper import Mapper, Step
+from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_estimation.slam.se2 import between, compose
+
+BEAMS = 240
+LIDAR = ScanGeometry(-math.radians(120), math.radians(240) / (BEAMS - 1), 0.02, 5.6)
+
+
+def box(x0, y0, x1, y1):
+    return [((x0, y0), (x1, y0)), ((x1, y0), (x1, y1)), ((x1, y1), (x0, y1)), ((x0, y1), (x0, y0))]
+
+
+ROOM = [
+    *box(-3.0, -2.0, 3.0, 2.5),
+    *box(-1.0, -0.6, 1.0, 0.7),
+    *box(2.2, 1.7, 3.0, 2.5),
+    *box(-3.0, -2.0, -2.4, -1.2),
+    *box(0.3, 2.2, 0.7, 2.5),
+]
+CORRIDOR = [((-50.0, -1.0), (50.0, -1.0)), ((-50.0, 1.0), (50.0, 1.0))]
+
+
+def ranges(walls, pose, geometry=LIDAR, beams=BEAMS, noise=0.0, rng=None):
+    """Exact ranges by intersection of every beam with every wall, inf where none is hit."""
+    sensor = compose(np.asarray(pose, float), np.array(geometry.mount))
+    angles = sensor[2] + geometry.start_angle + geometry.angle_increment * np.arange(beams)
+    ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    a = np.array([wall[0] for wall in walls]) - sensor[:2]
+    along = np.array([wall[1] for wall in walls]) - np.array([wall[0] for wall in walls])
+    cross = ways[:, None, 0] * along[None, :, 1] - ways[:, None, 1] * along[None, :, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (a[:, 0] * along[:, 1] - a[:, 1] * along[:, 0])[None] / cross
+        share = (a[None, :, 0] * ways[:, None, 1] - a[None, :, 1] * ways[:, None, 0]) / cross
+    hit = (np.abs(cross) > 1e-12) & (far > 0) & (share >= 0) & (share <= 1)
+    result = np.where(hit, far, np.inf).min(axis=1)
+    if rng is not None:
+        result = result + rng.normal(0.0, noise, beams)
+    return np.where(result < geometry.range_max, result, np.inf)
+
+
+def scan(walls, pose, **kwargs) -> Scan:
+    return prepare(ranges(walls, pose, **kwargs), LIDAR)
+
+
+def rounds(count, laps=1.0, width=2.0, height=1.4):
+    """Poses, shape (count, 3), along an ellipse about the middle of ROOM, facing ahead; the first is the start."""
+    angle = np.linspace(0, 2 * math.pi * laps, count) - math.pi / 2
+    x, y = width * np.cos(angle), height * np.sin(angle)
+    yaw = np.arctan2(height * np.cos(angle), -width * np.sin(angle))
+    return np.stack((x, y, yaw), axis=1)
+
+
+def drifting(truth, turn=0.02, scale=1.05):
+    """Odometry of ``truth``: ways too long by ``scale``, turned by ``turn`` rad per metre."""
+    poses = [np.zeros(3)]
+    for before, after in zip(truth[:-1], truth[1:], strict=True):
+        delta = between(before, after)
+        delta[:2] *= scale
+        delta[2] += turn * math.hypot(delta[0], delta[1])
+        poses.append(compose(poses[-1], delta))
+    return np.array(poses)
+
+
+def drive(mapper: Mapper, walls, truth, odom, *, noise=0.01, seed=1) -> list[Step | None]:
+    """Every pose's scan through the mapper, ten a second."""
+    rng = np.random.default_rng(seed)
+    return [
+        mapper.step(scan(walls, pose, noise=noise, rng=rng), int(k * 1e8), None if odom is None else odom[k])
+        for k, pose in enumerate(truth)
+    ]
+
+
+def errors(poses, truth):
+    """Distances, m, between poses told from the first one."""
+    off = between(truth[0], np.asarray(truth)) - between(poses[0], np.asarray(poses))
+    return np.hypot(off[:, 0], off[:, 1])

@@ -1,0 +1,184 @@
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.kiss import Kiss
+from monstertruck_estimation.slam.mapper import Event, Mapper
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_estimation.slam.se2 import between, compose
+from tests.unit.estimation.slam.kit import CORRIDOR, LIDAR, ROOM, box, drifting, drive, errors, ranges, rounds, scan
+
+# A ring of corridors too long for the lidar to see across, with something to see everywhere.
+BLOCKS = ((-5.0, 4.5), (-2.3, 4.7), (2.5, 4.4), (6.6, 1.5), (6.3, -3.0), (0.5, -4.6), (-3.2, -4.8), (-6.5, -1.0), (1.0, 1.6))
+RING = [
+    *box(-7.0, -5.0, 7.0, 5.0),
+    *box(-3.8, -1.8, 3.8, 1.8),
+    *(wall for x, y in BLOCKS for wall in box(x, y, x + 0.4 + 0.05 * abs(x), y + 0.35)),
+]
+
+
+@pytest.fixture(scope="module")
+def lap():
+    """One and a fifth laps of the ring, with wheels that drift."""
+    truth = rounds(330, 1.2, 5.7, 3.7)
+    mapper = Mapper()
+    steps = drive(mapper, RING, truth, drifting(truth))
+    return truth, mapper, steps
+
+
+def test_drifting_wheels_are_put_right(lap):
+    truth, mapper, steps = lap
+    assert errors(drifting(truth), truth).max() > 2.0
+    stamps, poses = mapper.trajectory()
+    assert len(stamps) == len(truth)
+    assert errors(poses, truth).max() < 0.12
+    assert not any(Event.REJECTED in step.events for step in steps)
+
+
+def test_the_loop_is_closed_and_related(lap):
+    _, mapper, _ = lap
+    edges = mapper.map.edges.edges()
+    assert (edges.target - edges.origin > len(mapper.map) // 2).any()
+
+
+def test_odom_does_not_jump_when_the_map_does(lap):
+    truth, _, steps = lap
+    odom = drifting(truth)
+    for step, pose in zip(steps, odom, strict=True):
+        assert compose(step.map_from_odom, pose) == pytest.approx(step.pose, abs=1e-9)
+
+
+def test_the_joint_registration_at_the_end_is_better_still_and_keeps_the_place():
+    truth = rounds(120, 1.0)
+    mapper = Mapper()
+    drive(mapper, ROOM, truth, drifting(truth))
+    before = errors(mapper.trajectory()[1], truth).mean()
+    mapper.finish()
+    poses = mapper.trajectory()[1]
+    assert errors(poses, truth).mean() < max(1.1 * before, 0.01)
+    step = mapper.step(scan(ROOM, truth[-1]), int(1e12), drifting(truth)[-1])
+    assert np.hypot(*(step.pose - poses[-1])[:2]) < 0.03
+
+
+def test_two_runs_agree_to_the_last_bit():
+    truth = rounds(60, 0.6)
+    results = []
+    for _ in range(2):
+        mapper = Mapper()
+        drive(mapper, ROOM, truth, drifting(truth))
+        mapper.finish()
+        results.append(mapper.trajectory()[1].tobytes())
+    assert results[0] == results[1]
+
+
+def test_without_wheels_the_motion_so_far_is_the_guess():
+    truth = rounds(120, 0.6)
+    mapper = Mapper()
+    steps = drive(mapper, ROOM, truth, None)
+    assert errors(mapper.trajectory()[1], truth).max() < 0.06
+    assert steps[-1].map_from_odom is None
+    assert mapper.twist[0] == pytest.approx(0.5, abs=0.15)
+
+
+def test_a_corridor_does_not_collapse():
+    truth = np.stack((np.linspace(0, 6, 150), np.full(150, 0.2), np.zeros(150)), axis=1)
+    mapper = Mapper()
+    steps = drive(mapper, CORRIDOR, truth, drifting(truth, turn=0.01, scale=1.0))
+    assert np.mean([step.match.degenerate for step in steps[1:]]) > 0.9
+    poses = mapper.trajectory()[1]
+    assert np.hypot(*(poses[-1] - poses[0])[:2]) == pytest.approx(6.0, abs=0.3)
+    assert steps[-1].match.covariance[0, 0] > 4 * steps[-1].match.covariance[1, 1]
+
+
+def test_kiss_serves_as_front_end():
+    truth = rounds(100, 0.5)
+    mapper = Mapper(front=Kiss())
+    steps = drive(mapper, ROOM, truth, drifting(truth))
+    assert errors(mapper.trajectory()[1], truth).max() < 0.15
+    assert np.mean([step.match.accepted for step in steps[1:]]) > 0.9
+
+
+def other_geometry(pose):
+    other = ScanGeometry(-math.pi / 2, math.pi / 90, 0.1, 30.0)
+    return prepare(ranges(ROOM, pose, other, 91), other)
+
+
+NOTHING = np.full(240, np.inf)
+THREE = np.where(np.arange(240) < 3, 1.0, np.inf)
+BAD = {
+    "empty": lambda pose: prepare(np.zeros(0), LIDAR),
+    "no return": lambda pose: prepare(NOTHING, LIDAR),
+    "three points": lambda pose: prepare(THREE, LIDAR),
+    "nan": lambda pose: prepare(np.full(240, np.nan), LIDAR),
+    "other geometry": other_geometry,
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_scans_in_between_neither_crash_nor_jump(kind):
+    truth = rounds(80, 0.5)
+    odom = drifting(truth)
+    mapper = Mapper()
+    for k, pose in enumerate(truth):
+        bad = k % 7 == 3 or k == 0
+        step = mapper.step(BAD[kind](pose) if bad else scan(ROOM, pose), int(k * 1e8), odom[k])
+        off = between(truth[1], pose), between(start, step.pose) if k > 1 else np.zeros(3)
+        if k == 1:
+            start = step.pose
+        if k > 1:
+            assert np.hypot(*(off[0] - off[1])[:2]) < (0.15 if bad else 0.06)
+
+
+def test_time_that_stands_or_goes_back_is_left_out():
+    mapper = Mapper()
+    first = scan(ROOM, (2.0, 0.0, 1.0))
+    assert mapper.step(first, 1000, np.zeros(3)) is not None
+    assert mapper.step(first, 1000, np.zeros(3)) is None
+    assert mapper.step(first, 10, np.ones(3)) is None
+    assert mapper.step(first, 2000, np.zeros(3)).pose == pytest.approx(np.zeros(3), abs=1e-3)
+
+
+def test_missing_and_doubled_scans_cost_nothing():
+    truth = rounds(120, 0.8)
+    odom = drifting(truth)
+    mapper = Mapper()
+    seen = []
+    for k in range(len(truth)):
+        if 40 <= k < 55:
+            continue
+        for again in range(2 if k % 5 == 0 else 1):
+            mapper.step(scan(ROOM, truth[k]), int(k * 1e8 + again * 1e6), odom[k])
+            seen.append(k)
+    assert errors(mapper.trajectory()[1], truth[seen]).max() < 0.08
+
+
+@pytest.mark.parametrize("lie", [(np.nan, 0.0, 0.0), (500.0, -80.0, 2.0)])
+def test_odometry_that_lies_once_does_no_harm(lie):
+    truth = rounds(80, 0.5)
+    odom = drifting(truth)
+    odom[40] = lie
+    mapper = Mapper()
+    drive(mapper, ROOM, truth, odom)
+    assert errors(mapper.trajectory()[1], truth).max() < 0.08
+
+
+def test_a_stale_odometry_does_not_spoil_the_map():
+    truth = rounds(60, 0.8)
+    odom = drifting(truth)
+    odom[30] = odom[29]
+    mapper = Mapper()
+    drive(mapper, ROOM, truth, odom)
+    assert errors(mapper.trajectory()[1], truth).max() < 0.08
+
+
+def test_the_map_stays_bounded_and_right():
+    truth = rounds(420, 3.0)
+    mapper = Mapper(MapperConfig(most_keys=90, thinning=0.1, most_scans=300))
+    steps = drive(mapper, ROOM, truth, drifting(truth))
+    assert any(Event.THINNED in step.events for step in steps)
+    assert len(mapper.map) <= 90
+    stamps, poses = mapper.trajectory()
+    assert len(stamps) <= 300
+    assert errors(poses, truth[(stamps / 1e8).round().astype(int)]).max() < 0.12

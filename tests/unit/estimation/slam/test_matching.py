@@ -1,0 +1,130 @@
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam.correlation import LikelihoodGrid, correlate
+from monstertruck_estimation.slam.frontend import Planar, Verdict
+from monstertruck_estimation.slam.kiss import Kiss
+from monstertruck_estimation.slam.registration import Cloud, register
+from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_estimation.slam.se2 import between, compose
+from monstertruck_estimation.slam.submap import Submap, merged
+from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, scan
+
+PLACE = np.array((1.8, 0.2, 1.2))
+WIDE = np.diag((0.3**2, 0.3**2, 0.2**2))
+
+
+def seen_from(walls, *poses):
+    poses = np.array(poses)
+    return Submap(Cloud.of(merged([scan(walls, pose) for pose in poses], poses)))
+
+
+def dots(points):
+    ones = np.ones((len(points), 2))
+    return Cloud.of(Scan(points, ones, ones, np.zeros(len(points))))
+
+
+def test_the_fine_fit_finds_the_place_and_knows_how_well():
+    submap = seen_from(ROOM, PLACE, PLACE + (0.1, 0.3, 0.4))
+    fit = register(scan(ROOM, PLACE + (0.05, 0.1, 0.1)), submap.cloud, PLACE)
+    assert fit.pose == pytest.approx(PLACE + (0.05, 0.1, 0.1), abs=0.004)
+    assert fit.overlap > 0.9
+    assert fit.residual < 0.012
+    assert np.linalg.eigvalsh(fit.information)[0] > 100
+
+
+def test_the_search_returns_the_greatest_score_of_its_window():
+    rng = np.random.default_rng(3)
+    grid = LikelihoodGrid.of(dots(rng.uniform(-2, 2, (60, 2))), 5)
+    points = rng.uniform(-2, 2, (40, 2))
+    guess = np.array((0.1, -0.2, 0.3))
+    peak = correlate(grid, points, guess, (0.5, 0.2), (1e3, 1e3), 0.0)
+    assert peak is not None
+    best = 0.0
+    # Every pose of the window, one by one: the smallest windows round the poses of the search's own lattice.
+    step = 0.05 / max(float(np.percentile(np.hypot(*points.T), 80)), 1.0)
+    for turn in np.arange(-math.ceil(0.2 / step), math.ceil(0.2 / step) + 1) * step:
+        for x in np.arange(-10, 11) * 0.05:
+            at = guess + (x, 0.0, turn)
+            column = correlate(grid, points, at, (0.5, 1e-9), (1e3, 1e3), 0.0)
+            best = max(best, column.score)
+    assert peak.score == pytest.approx(best, abs=0.02)
+
+
+def test_a_square_room_is_its_own_rival():
+    square = [((-2, -2), (2, -2)), ((2, -2), (2, 2)), ((2, 2), (-2, 2)), ((-2, 2), (-2, -2))]
+    submap = seen_from(square, (0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 4.0))
+    query = scan(square, (0.5, 0.3, 0.2)).points
+    peak = correlate(submap.grid(7), query, np.array((0.0, 0.0, 0.2)), (2.0, 3.0), (2.0, 3.0), 0.3, apart=1.0)
+    assert peak is not None
+    assert peak.rival > 0.9 * peak.score
+
+
+def test_nothing_scores_where_nothing_is():
+    grid = LikelihoodGrid.of(dots(np.array(((50.0, 50.0),))), 4)
+    assert correlate(grid, np.array(((1.0, 0.0),)), np.zeros(3), (0.5, 0.1), (0.1, 0.1), 0.1) is None
+    assert correlate(grid, np.zeros((0, 2)), np.zeros(3), (0.5, 0.1), (0.1, 0.1), 0.1) is None
+
+
+@pytest.mark.parametrize("off", [(0.3, -0.2, 0.25), (-0.5, 0.4, -0.3), (0.0, 0.0, 0.0)])
+def test_the_front_end_finds_the_scan_in_the_window_of_its_uncertainty(off):
+    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + off, WIDE, submap)
+    assert match.accepted
+    assert match.pose == pytest.approx(PLACE, abs=0.01)
+    assert not match.degenerate
+
+
+def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
+    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    tight = np.diag((0.03**2, 0.03**2, 0.08**2))
+    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + (0.02, 0.01, 0.45), tight, submap)
+    assert match.accepted
+    assert match.pose == pytest.approx(PLACE, abs=0.01)
+
+
+def test_a_corridor_is_told_and_leaves_the_way_along_it_to_the_wheels():
+    submap = seen_from(CORRIDOR, (0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
+    guess = np.array((0.9, 0.0, 0.03))
+    match = Planar().locate(scan(CORRIDOR, (0.6, 0.1, 0.0)), np.zeros(3), guess, np.diag((0.05**2, 0.05**2, 0.05**2)), submap)
+    assert match.accepted
+    assert match.degenerate
+    assert match.direction == pytest.approx(0.0, abs=0.1)
+    assert match.pose == pytest.approx((0.9, 0.1, 0.0), abs=0.02)
+    assert match.covariance[0, 0] > 10 * match.covariance[1, 1]
+
+
+def test_a_foreign_scan_is_rejected_and_the_guess_stands():
+    submap = seen_from(ROOM, PLACE)
+    hexagon = np.array([(math.cos(a), math.sin(a)) for a in np.arange(7) * math.pi / 3])
+    walls = [(tuple(a), tuple(b)) for a, b in zip(0.4 * hexagon[:-1], 0.4 * hexagon[1:], strict=True)]
+    match = Planar().locate(scan(walls, (0.0, 0.0, 0.0)), np.zeros(3), PLACE, np.diag((1e-3, 1e-3, 1e-3)), submap)
+    assert match.verdict in {Verdict.OVERLAP, Verdict.EMPTY}
+    assert match.pose == pytest.approx(PLACE)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_handful_of_points_is_no_scan(count):
+    values = np.full(181, np.inf)
+    values[:count] = 1.0
+    few = prepare(values, ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0))
+    match = Planar().locate(few, np.zeros(3), PLACE, WIDE, seen_from(ROOM, PLACE))
+    assert match.verdict is Verdict.EMPTY
+    assert match.pose == pytest.approx(PLACE)
+    assert np.array_equal(match.covariance, WIDE)
+
+
+def test_kiss_is_judged_like_the_other():
+    front = Kiss()
+    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    first = front.locate(scan(ROOM, PLACE), np.zeros(3), PLACE, WIDE, submap)
+    assert first.accepted
+    moved = np.array((0.1, 0.0, 0.05))
+    wrong = moved + (0.02, 0.01, -0.02)
+    second = front.locate(scan(ROOM, compose(PLACE, moved)), wrong, compose(PLACE, wrong), WIDE, submap)
+    assert second.accepted
+    assert np.hypot(*between(PLACE, second.pose)[:2] - moved[:2]) < 0.03
+    away = front.locate(scan(CORRIDOR, (0.0, 0.5, 0.6)), moved, compose(PLACE, moved), WIDE / 100, submap)
+    assert not away.accepted

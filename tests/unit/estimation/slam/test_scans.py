@@ -1,0 +1,70 @@
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges
+
+FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
+
+
+def test_what_is_no_return_gives_no_point():
+    values = np.full(181, 2.0)
+    values[:6] = np.inf, np.nan, 0.0, 0.05, 30.0, -1.0
+    assert len(prepare(values, FAN)) == 181 - 6
+    assert len(prepare(values, FAN, longest=1.0)) == 0
+    assert len(prepare(np.zeros(0), FAN)) == 0
+
+
+def test_points_lie_where_the_beams_ended():
+    points = prepare(np.full(181, 2.0), FAN).points
+    assert points[90] == pytest.approx((2.0, 0.0))
+    assert points[0] == pytest.approx((0.0, -2.0))
+    mounted = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0, mount=(0.1, 0.2, math.pi / 2))
+    assert prepare(np.full(181, 2.0), mounted).points[90] == pytest.approx((0.1, 2.2))
+
+
+def test_a_wall_has_its_normal_towards_the_sensor_and_says_nothing_along_itself():
+    angles = np.radians(np.arange(-90, 91))
+    wall = 2.0 / np.maximum(np.cos(angles), 1e-9)
+    scan = prepare(np.where(wall < 4.0, wall, np.inf), FAN)
+    inner = slice(1, -1)
+    assert scan.normals[inner] == pytest.approx(np.tile((-1.0, 0.0), (len(scan) - 2, 1)), abs=1e-6)
+    assert (scan.variances[inner, 1] > 1.0).all()
+    assert (scan.variances[inner, 0] < 0.04**2).all()
+
+
+def test_a_lone_point_says_the_same_in_all_directions():
+    values = np.full(181, np.inf)
+    values[90] = 2.0
+    scan = prepare(values, FAN)
+    assert scan.variances[0, 0] == scan.variances[0, 1]
+
+
+def test_motion_during_the_scan_is_undone():
+    still = prepare(ranges(ROOM, (2.0, 0.0, 1.5)), LIDAR)
+    beam_time = 0.067 / BEAMS
+    moving = ScanGeometry(LIDAR.start_angle, LIDAR.angle_increment, 0.02, 5.6, beam_time)
+    twist = (0.8, 0.1, 1.5)
+    values = np.empty(BEAMS)
+    for k in range(BEAMS):
+        dt = k * beam_time
+        turn = twist[2] * dt
+        c, s = math.cos(1.5 + turn / 2), math.sin(1.5 + turn / 2)
+        pose = (2.0 + (c * twist[0] - s * twist[1]) * dt, (s * twist[0] + c * twist[1]) * dt, 1.5 + turn)
+        values[k] = ranges(ROOM, pose)[k]
+
+    def off(scan):
+        gap = np.hypot(*(scan.points[:, None] - still.points[None]).transpose(2, 0, 1)).min(axis=1)
+        return np.percentile(gap, 90)
+
+    assert off(prepare(values, moving, twist)) < 0.5 * off(prepare(values, moving))
+
+
+def test_thinning_keeps_one_point_per_square_and_no_more_than_asked():
+    scan = prepare(ranges(ROOM, (2.0, 0.0, 1.5)), LIDAR)
+    thinned = scan.thinned(0.2, 1000)
+    cells = np.floor(thinned.points / 0.2)
+    assert len(np.unique(cells, axis=0)) == len(thinned)
+    assert len(scan.thinned(0.01, 50)) == 50
