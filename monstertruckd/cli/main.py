@@ -15,6 +15,7 @@ from monstertruckd.cli import (
     kinematics,
     live,
     logs,
+    maps,
     orders,
     plan,
     robot,
@@ -75,6 +76,7 @@ app.add_typer(config.app, name="config")
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
+app.add_typer(maps.app, name="map")
 
 
 def main() -> None:

@@ -143,7 +143,7 @@ def load(place: Path) -> SavedMap:
 
 def _read_graph(path: Path) -> Graph:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         msg = f"{path}: not a graph: {error}"
