@@ -12,12 +12,10 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.threads import ThreadHop
 from monstertruck_schemas.event import LogLevel, LogRecord
-from monstertruckd.logging_queue import redacted
+from monstertruckd.logging_queue import shown
 
 DEPTH: Final = 256
 """Records on their way to the loop; beyond that the oldest of the lowest level is lost and counted."""
-LONGEST: Final = 32_768
-"""Characters of one record; what is beyond is cut off."""
 
 _LEVELS: Final = (
     (logging.CRITICAL, LogLevel.FATAL),
@@ -67,9 +65,7 @@ class Journal(logging.Handler):
         here = threading.get_ident() == self._loop_thread
         if (here and self._publishing) or (self._reproducible and not here):
             return
-        text = redacted(self.format(record))
-        if len(text) > LONGEST:
-            text = f"{text[:LONGEST]} ... {len(text) - LONGEST} characters more"
+        text = shown(self.format(record))
         name = Path(record.pathname).name
         self._hop.put(_Line(self._clock.now(), record.levelno, record.name, text, name, record.lineno))
 

@@ -18,24 +18,47 @@ PATIENCE: Final = 1.0
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels of syslog, which journald reads from a line's head."""
 
+LONGEST: Final = 16_384
+"""Characters of one record; what is beyond is cut off."""
+MARGIN: Final = 1024
+"""Characters beyond the cut that are looked at, so that no secret stands there half."""
+
+_KEYS: Final = r"(?:password|passwd|passphrase|secret|token|authorization|(?<![a-z])psk|api[_-]?key)"
+_NAMES: Final = ("passw", "passphrase", "secret", "token", "authorization", "psk", "api")
+_VALUE: Final = r"(?:(?P<quote>[\"'])(?:(?!(?P=quote))[^\n])*|[^\s'\",;&]+)"
+_ASSIGNED: Final = r"[\\'\"]{0,2}\s{0,8}[=:]\s{0,8}\\?(?:(?:basic|bearer|digest)\s{1,8})?"
+_INSTEAD: Final = r"\g<head>\g<quote>***"
 _SECRETS: Final = (
-    (re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL), "<private key>"),
-    (re.compile(r"(?<=://)[^\s/@:]+:[^\s/@]+(?=@)"), "***"),
     (
-        re.compile(
-            r"(?i)\b((?:[a-z0-9]+[_-])*(?:password|passwd|secret|token|api[_-]?key))(['\"]?\s*[=:]\s*['\"]?)[^\s'\",;&]+"
-        ),
-        r"\1\2***",
+        ("-----begin",),
+        re.compile(r"-----BEGIN ([A-Z ]{0,40}PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL),
+        "<private key>",
     ),
+    (("@",), re.compile(r"(?<=/)(?:(?<=://)[^\s/'\"<>]+|[^\s/@'\"<>:]*:[^\s/'\"<>]+)(?=@)"), "***"),
+    (_NAMES, re.compile(rf"(?i)(?P<head>{_KEYS}{_ASSIGNED}){_VALUE}"), _INSTEAD),
+    (("--",), re.compile(rf"(?i)(?P<head>(?<![\w-])--[a-z-]{{0,40}}?{_KEYS}\s{{1,8}}){_VALUE}"), _INSTEAD),
 )
-"""What no log may show: private keys, credentials in addresses, values named like a secret."""
+"""What no log may show: private keys, credentials in addresses, values named like a secret.
+
+Each with words one of which, in lower case, is in whatever it matches. Every pattern looks at each character a bounded
+number of times: no record can hold up the process.
+"""
 
 
 def redacted(text: str) -> str:
     """``text`` without passwords, tokens and keys."""
-    for pattern, instead in _SECRETS:
-        text = pattern.sub(instead, text)
+    lower = text.lower()
+    for hints, pattern, instead in _SECRETS:
+        if any(hint in lower for hint in hints):
+            text = pattern.sub(instead, text)
     return text
+
+
+def shown(text: str) -> str:
+    """What of a record's ``text`` is shown: no secrets, and ``LONGEST`` characters at most."""
+    safe = redacted(text[: LONGEST + MARGIN])
+    beyond = len(safe) - LONGEST + max(0, len(text) - LONGEST - MARGIN)
+    return f"{safe[:LONGEST]} ... {beyond} characters more" if beyond > 0 else safe
 
 
 class LossyQueueHandler(logging.handlers.QueueHandler):
@@ -95,7 +118,7 @@ class PlainFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record's text; every line of a traceback keeps the priority."""
-        text = redacted(super().format(record))
+        text = shown(super().format(record))
         if not self._journal:
             return text
         head = f"<{PRIORITIES.get(record.levelno, 6)}>"

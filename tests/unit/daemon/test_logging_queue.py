@@ -4,16 +4,20 @@ import io
 import logging
 import os
 import threading
+import time
 from pathlib import Path
 
 import pytest
 
+from monstertruckd import logging_queue
 from monstertruckd.logging_queue import (
     DEPTH,
+    LONGEST,
     LossyQueueHandler,
     PlainFormatter,
     read_by_journal,
     redacted,
+    shown,
     start_logging,
 )
 
@@ -84,7 +88,21 @@ def test_the_journal_is_recognised_by_the_stream_it_named(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("tls/user:hunter2@host:7447", "tls/user:hunter2@host:7447"),
+        ("tcp/user:hunter2@host:7447", "tcp/***@host:7447"),
+        ("tcp/[::1]:7447 and tls/host:7447", "tcp/[::1]:7447 and tls/host:7447"),
+        ("http://user:hunt@er2/x", "http://***@er2/x"),
+        ("http://user:hunt@er2@host/x", "http://***@host/x"),
+        ("http://hunter2@host/x", "http://***@host/x"),
+        ("Authorization: Bearer hunter2", "Authorization: Bearer ***"),
+        ("{'Authorization': 'Basic hunter2'}", "{'Authorization': '***'}"),
+        ("authorization failed for ann", "authorization failed for ann"),
+        ("passphrase: hunter2", "passphrase: ***"),
+        ("psk=hunter2", "psk=***"),
+        ("dhcp --password hunter2 -v", "dhcp --password *** -v"),
+        ("--wifi-psk 'hunter 2' -v", "--wifi-psk '***' -v"),
+        ("--token-file x", "--token-file x"),
+        ('password = "two words" x', 'password = "***" x'),
+        (r'"{\"token\": \"hunter2\"}"', r'"{\"token\": \"***"}"'),
         ("https://user:hunter2@host/x", "https://***@host/x"),
         ("password=hunter2, retry", "password=***, retry"),
         ('{"api_key": "hunter2", "user": "ann"}', '{"api_key": "***", "user": "ann"}'),
@@ -97,6 +115,37 @@ def test_the_journal_is_recognised_by_the_stream_it_named(tmp_path: Path):
 )
 def test_secrets_are_not_shown(text: str, shown: str):
     assert redacted(text) == shown
+
+
+REPEATED = ("a-", "--", "--a", "/", "/a:", "/a:@", "://", "password", "password='", "api_", "-----BEGIN ", "\\")
+
+
+@pytest.mark.parametrize("text", REPEATED)
+def test_no_text_takes_more_than_time_in_proportion_to_its_length(text: str):
+    def seconds(length: int) -> float:
+        spent = []
+        for _ in range(3):
+            begin = time.thread_time()
+            redacted((text * length)[:length])
+            spent.append(time.thread_time() - begin)
+        return min(spent)
+
+    assert seconds(64_000) < 16 * seconds(16_000) + 0.05, "quadratic: seconds already at 8000"
+
+
+def test_what_is_long_is_cut_before_it_is_searched(monkeypatch: pytest.MonkeyPatch):
+    searched = []
+    monkeypatch.setattr(logging_queue, "redacted", lambda text: searched.append(len(text)) or text)
+    text = shown("x" * 10_000_000)
+    assert searched[0] < 2 * LONGEST
+    assert text == f"{'x' * LONGEST} ... {10_000_000 - LONGEST} characters more"
+    record = logging.LogRecord("x", logging.ERROR, "f", 1, "x" * 10_000_000, None, None)
+    assert len(PlainFormatter(journal=False).format(record)) < 2 * LONGEST
+
+
+def test_a_cut_leaves_no_half_of_a_secret():
+    text = "x" * (LONGEST - 20) + " http://user:hunter2hunter2hunter2@host"
+    assert "hunter" not in shown(text)
 
 
 def test_secrets_in_tracebacks_are_not_shown_either(clean_root: logging.Logger):
