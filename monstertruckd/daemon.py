@@ -108,7 +108,7 @@ class Daemon:
         self._attachments = self._describe()
         self.recorder = self._build_recorder()
         self.black_box = self._build_black_box()
-        self._notify = notify_from(environment, clock, self.gate.ticks, self._status)
+        self._notify = notify_from(environment, clock, self.gate.ticks, config.gate.rate, self._status)
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set, then end everything inside-out, neutral first.

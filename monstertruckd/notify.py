@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, stopping (protocol of sd_notify(3)). Alive: the control tick advanced."""
+"""What systemd is told: ready, alive, stopping (protocol of sd_notify(3)). Alive: the control tick keeps its pace."""
 
 import os
 import socket
@@ -14,6 +14,8 @@ PERIOD: Final = 1.0
 """Seconds between two looks without a watchdog."""
 POLL: Final = 0.02
 """Seconds between two looks until the first tick."""
+PACE: Final = 0.5
+"""Part of the nominal ticks between two looks without which the tick counts as hanging."""
 
 
 class Notify(Protocol):
@@ -49,29 +51,37 @@ def watchdog_seconds(environment: Mapping[str, str], pid: int) -> float | None:
 
 
 class NotifyService:
-    """Tells systemd READY once the daemon is up and the tick runs, then pings while the tick advances.
+    """Tells systemd READY once the daemon is up and the tick runs, then pings while the tick keeps its pace.
 
     Args:
         send: where lines go.
         watchdog: seconds; None = no pings, only the status.
         clock: time.
         ticks: control ticks so far.
+        rate: nominal ticks per second.
         status: state of the robot, one line.
     """
 
     name = "notify"
 
     def __init__(
-        self, send: Notify, watchdog: float | None, clock: Clock, ticks: Callable[[], int], status: Callable[[], str]
+        self,
+        send: Notify,
+        watchdog: float | None,
+        clock: Clock,
+        ticks: Callable[[], int],
+        rate: float,
+        status: Callable[[], str],
     ) -> None:
         self._send = send
         self._ping = ("WATCHDOG=1",) if watchdog is not None else ()
         self._period = PERIOD if watchdog is None else watchdog / 3
         self._clock = clock
         self._ticks = ticks
+        self._enough = PACE * rate * self._period
         self._status = status
         self._up = False
-        self._told_ticks = 0
+        self._seen_ticks = 0
         self._told_status = ""
 
     def up(self) -> None:
@@ -92,16 +102,21 @@ class NotifyService:
             self._tell()
 
     def _tell(self, *first: str) -> bool:
-        """Send what is news; what did not arrive is news again the next time."""
+        """Send what is news; a status that did not arrive is news again the next time.
+
+        Only the ticks since the last look count, told or not: a gate that limps must not save them up for a ping.
+        """
         ticks, status = self._ticks(), self._status()
+        kept_pace = ticks - self._seen_ticks >= self._enough
+        self._seen_ticks = ticks
         lines = [*first]
-        if ticks > self._told_ticks:
+        if first or kept_pace:
             lines += self._ping
         if status != self._told_status:
             lines.append(f"STATUS={status}")
         if not lines or not self._send(*lines):
             return False
-        self._told_ticks, self._told_status = ticks, status
+        self._told_status = status
         return True
 
 
@@ -112,11 +127,11 @@ def status_line(mode: GateMode, services: Iterable[ServiceHealth]) -> str:
 
 
 def notify_from(
-    environment: Mapping[str, str], clock: Clock, ticks: Callable[[], int], status: Callable[[], str]
+    environment: Mapping[str, str], clock: Clock, ticks: Callable[[], int], rate: float, status: Callable[[], str]
 ) -> NotifyService | None:
     """The service for the present process; None where no systemd waits for it."""
     address = environment.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return None
     watchdog = watchdog_seconds(environment, os.getpid())
-    return NotifyService(notify_socket(address), watchdog, clock, ticks, status)
+    return NotifyService(notify_socket(address), watchdog, clock, ticks, rate, status)

@@ -38,20 +38,21 @@ class Systemd:
 
 
 class Bench:
-    """A gate that ticks at 50 Hz unless ``stalled``, and the service."""
+    """A gate that should tick at 50 Hz and does so every ``pause`` seconds unless ``stalled``, and the service."""
 
     def __init__(self, clock: VirtualClock, watchdog: float | None) -> None:
         self.clock = clock
         self.systemd = Systemd(clock)
         self.ticks = 0
         self.stalled = False
+        self.pause = 0.02
         self.status = "disarmed"
-        self.service = NotifyService(self.systemd, watchdog, clock, lambda: self.ticks, lambda: self.status)
+        self.service = NotifyService(self.systemd, watchdog, clock, lambda: self.ticks, 50.0, lambda: self.status)
 
     async def tick(self) -> None:
         while True:
             self.ticks += not self.stalled
-            await self.clock.sleep(0.02)
+            await self.clock.sleep(self.pause)
 
 
 def play(scene: Callable[[Bench], Coroutine[Any, Any, None]], watchdog: float | None = 3.0) -> Bench:
@@ -88,14 +89,26 @@ def test_ready_waits_for_the_whole_daemon_and_for_the_tick():
 def test_a_third_of_the_watchdogs_time_between_pings_and_none_while_the_tick_stands():
     async def scene(bench: Bench) -> None:
         bench.service.up()
-        await bench.clock.sleep(4.5)
+        await bench.clock.sleep(4.7)
         bench.stalled = True
-        await bench.clock.sleep(4.0)
+        await bench.clock.sleep(3.6)
         bench.stalled = False
         await bench.clock.sleep(2.0)
 
-    # The look at 5 s still sees the ticks since the one at 4 s.
+    # The look at 5 s still sees most ticks since the one at 4 s.
     assert play(scene).systemd.times("WATCHDOG=1") == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 9.0, 10.0]
+
+
+@pytest.mark.parametrize(("pause", "alive"), [(1.0, False), (0.06, False), (0.025, True)])
+def test_a_gate_that_limps_at_less_than_half_its_pace_is_no_sign_of_life(pause: float, alive: bool):
+    async def scene(bench: Bench) -> None:
+        bench.service.up()
+        await bench.clock.sleep(2.5)
+        bench.pause = pause
+        await bench.clock.sleep(40.0)
+
+    late = [at for at in play(scene).systemd.times("WATCHDOG=1") if at > 3.5]
+    assert late == ([float(at) for at in range(4, 43)] if alive else [])
 
 
 def test_without_a_watchdog_only_changes_of_the_status_are_told():
@@ -173,7 +186,7 @@ def test_nothing_to_tell_without_a_socket(address: str | None):
 
 def _of(environment: dict[str, str]) -> Callable[[VirtualClock], Coroutine[Any, Any, NotifyService | None]]:
     async def main(clock: VirtualClock) -> NotifyService | None:
-        return notify_from(environment, clock, int, str)
+        return notify_from(environment, clock, int, 50.0, str)
 
     return main
 
