@@ -35,7 +35,9 @@ def test_a_daemon_that_hangs_or_dies_is_replaced_and_the_drive_stopped():
     assert unit["WatchdogSec"] == ["3"]
     assert unit["TimeoutAbortSec"] == ["1"], "a frozen process takes no SIGABRT"
     assert unit["TimeoutStartSec"] == ["30"], "the watchdog counts from READY on only"
+    assert unit["TimeoutStopSec"] == ["30"], "black box and recorder finish on a slow board"
     assert unit["Restart"] == ["always"]
+    assert "RestartPreventExitStatus" not in unit, "a refusal may pass: an address or a disk that is not there yet"
     assert unit["RestartSec"] == ["1"]
     assert unit["StartLimitIntervalSec"] == ["0"]
     assert unit["ExecStart"] == [
