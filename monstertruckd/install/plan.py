@@ -10,7 +10,7 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.install.configuration import FOLDER, files_of, load_real
 from monstertruckd.install.rules import rules_text
 from monstertruckd.install.shipped import filled
-from monstertruckd.install.unit import LINKS, Program, unit_text
+from monstertruckd.install.unit import LINKS, Program, unit_text, user_name
 
 USER: Final = "monstertruckd"
 SERVICE: Final = "monstertruckd.service"
@@ -73,8 +73,9 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
     Raises:
         NotFoundError: no configuration was named and none is installed.
         ConfigError: it was refused.
-        InputError: systemd could not use one of the paths.
+        InputError: systemd could not use the user's name or one of the paths.
     """
+    user_name(user)
     source = config_file or below(root, CONFIG)
     if config_file is None and not source.is_file():
         raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")

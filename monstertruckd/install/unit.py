@@ -17,6 +17,7 @@ HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the
 LINKS: Final = Path("/dev/truck")
 """Folder of the links that the udev rules make."""
 _PLAIN: Final = re.compile(r"/[A-Za-z0-9/._+=,:~-]*")
+_USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,31}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ def unit_text(config: TruckConfig, config_file: Path, user: str, program: Progra
         program: what is run.
 
     Raises:
-        InputError: systemd or its sandbox could not use one of the paths.
+        InputError: systemd or its sandbox could not use the user's name or one of the paths.
     """
     at_home = _at_home(program)
     return filled(
@@ -58,12 +59,23 @@ def unit_text(config: TruckConfig, config_file: Path, user: str, program: Progra
             "python": _plain(program.python),
             "config": _plain(config_file),
             "stop": _stop(config, program),
-            "user": user,
+            "user": user_name(user),
             "home": "tmpfs" if at_home else "yes",
-            "bind": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in at_home),
+            "bind": "\n".join(f"BindReadOnlyPaths={_plain(place, without=':')}" for place in at_home),
             "switch": "" if config.usb.power.method is None else "ReadWritePaths=-/sys/devices",
         },
     )
+
+
+def user_name(name: str) -> str:
+    """``name``, if a user may be called so.
+
+    Raises:
+        InputError: it may not; a line break in it would be a setting of its own.
+    """
+    if not _USER.fullmatch(name):
+        raise InputError(f"user {name!r}: expected a lower-case letter or _, then at most 31 of a-z 0-9 _ -")
+    return name
 
 
 def node_of(role: str, port: AnyPort) -> Path:
@@ -73,7 +85,7 @@ def node_of(role: str, port: AnyPort) -> Path:
 
 def _stop(config: TruckConfig, program: Program) -> str:
     drives = [
-        f"{_plain(node_of(role, device.port))}={device.driver.node}@{device.port.baud}"
+        f"{_plain(node_of(role, device.port), without='=')}={device.driver.node}@{device.port.baud}"
         for role, device in config.devices.shafts().items()
     ]
     # Without site: the script must run even when the environment's packages do not load.
@@ -92,12 +104,18 @@ def _at_home(program: Program) -> list[Path]:
     return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
 
 
-def _plain(path: Path) -> str:
+def _plain(path: Path, without: str = "") -> str:
     """``path`` for a unit file.
+
+    Args:
+        path: absolute.
+        without: a sign that ends a path at that place.
 
     Raises:
         InputError: it would need quoting.
     """
+    if without and without in str(path):
+        raise InputError(f"{path}: expected a path without {without}, which ends it in the unit")
     if not _PLAIN.fullmatch(str(path)):
         raise InputError(f"{path}: expected an absolute path of letters, digits and / . _ + = , : ~ - for systemd")
     return str(path)

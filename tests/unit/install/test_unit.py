@@ -11,6 +11,7 @@ import yaml
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.load import load_truck
+from monstertruckd.install.plan import plan
 from monstertruckd.install.shipped import filled
 from monstertruckd.install.unit import Program, unit_text
 from tests.unit.install.kit import PROGRAM, ROOT, TRUCK, settings, text_of, truck_plan
@@ -19,8 +20,8 @@ ANALYZE = shutil.which("systemd-analyze")
 CONFIG = Path("/etc/monstertruckd/truck.yaml")
 
 
-def unit_of(config: Path = TRUCK, program: Program = PROGRAM) -> str:
-    return unit_text(load_truck(config)[0], CONFIG, "monstertruckd", program)
+def unit_of(config: Path = TRUCK, program: Program = PROGRAM, user: str = "monstertruckd") -> str:
+    return unit_text(load_truck(config)[0], CONFIG, user, program)
 
 
 def overlay(folder: Path, **values: object) -> Path:
@@ -101,6 +102,49 @@ def test_a_temporary_program_is_refused(place: str):
 def test_a_path_systemd_would_split_is_refused():
     with pytest.raises(InputError, match="/opt/my truck/python: expected an absolute path"):
         unit_of(program=Program(Path("/opt/my truck/python"), PROGRAM.neutral, ()))
+
+
+@pytest.mark.parametrize(
+    "user",
+    [
+        "x\nExecStartPre=/bin/sh",
+        "x\n",
+        "",
+        "Truck",
+        "1st",
+        "a b",
+        "%i",
+        "-x",
+        "x" * 33,
+        "\N{LATIN SMALL LETTER E WITH ACUTE}",
+    ],
+)
+def test_a_user_who_cannot_be_called_so_is_refused(user: str, tmp_path: Path):
+    with pytest.raises(InputError, match="expected a lower-case letter"):
+        unit_of(user=user)
+    with pytest.raises(InputError, match="expected a lower-case letter"):
+        plan(TRUCK, user, PROGRAM, tmp_path)
+
+
+@pytest.mark.parametrize("user", ["pi", "_truck-1", "x" * 32])
+def test_users_names(user: str):
+    assert settings(unit_of(user=user))["User"] == [user]
+
+
+def test_paths_that_would_end_too_early_are_refused(tmp_path: Path):
+    home = Path("/home/pi/a:b")
+    with pytest.raises(InputError, match="/home/pi/a:b: expected a path without :"):
+        unit_of(program=Program(PROGRAM.python, PROGRAM.neutral, (home,)))
+    file = tmp_path / "truck.yaml"
+    file.write_text("version: 1\ndevices: {drive: {port: {path: /dev/a=b}, driver: {kind: epos}}}\n")
+    with pytest.raises(InputError, match="/dev/a=b: expected a path without ="):
+        unit_of(file)
+
+
+@pytest.mark.parametrize("sign", ["\n", " ", '"', "%", "$", "\\", ";", "@"])
+def test_no_sign_of_a_path_means_anything_to_systemd(sign: str):
+    with pytest.raises(InputError, match="expected an absolute path"):
+        unit_of(program=Program(Path(f"/opt/a{sign}b"), PROGRAM.neutral, ()))
 
 
 def test_ports_that_are_to_be_switched_can_be_written(tmp_path: Path):
