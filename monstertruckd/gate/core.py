@@ -35,7 +35,7 @@ from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.outages import Outages
 from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.pursuit import Pursuit
-from monstertruckd.gate.sources import OPERATORS, Sources
+from monstertruckd.gate.sources import OPERATORS, Source, Sources
 from monstertruckd.gate.states import States
 from monstertruckd.gate.steering_check import SteeringCheck
 from monstertruckd.gate.stops import StopBook
@@ -320,6 +320,8 @@ class Gate:
             if driver.key != states.holder_key:
                 self._sources.claim(driver.request.role)
             states.drive(now, driver)
+        elif states.holder is not None and not blocks and self._let_go(states.holder, now):
+            states.release(now)
         elif states.holder is not None:
             if not blocks:
                 self._tell_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {states.holder_name}")
@@ -327,6 +329,10 @@ class Gate:
             self._stop(now, self._evidence.causes(blocks, now, self._known) or lapsed)
         elif now - states.driven > self._config.disarm_after * SECOND:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
+
+    def _let_go(self, holder: Source, now: int) -> bool:
+        """Whether the silent holder's last word was standstill, and the truck stands since."""
+        return holder.neutral and self._motion.speed == 0 and self._watch.at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
         self._trip(now, GateMode.STOPPING, causes, ordered=ordered)

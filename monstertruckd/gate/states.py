@@ -77,6 +77,12 @@ class States:
         self._enter(GateMode.STOPPING, now)
         self._stopped_by = tuple(dict.fromkeys(reasons))
 
+    def release(self, now: int) -> None:
+        """The driver has let go of a truck that stands."""
+        text = f"{self.holder_name} let go"
+        self._enter(GateMode.ARMED, now)
+        self._events.tell(now, Reason.STOPPED, Severity.INFO, text)
+
     def rest(self, now: int) -> None:
         """It stands."""
         self._enter(GateMode.ARMED, now)

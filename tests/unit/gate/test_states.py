@@ -68,6 +68,43 @@ def test_a_lapsed_lease_stops_within_300_ms_and_stands_within_300_more():
     assert rig.told(Reason.STOPPED)
 
 
+def let_go(rig):
+    """Show a neutral request for a moment, then fall silent until the lease is over."""
+    rig.driver = {"speed": 0.0}
+    rig.tick(50)
+    assert rig.out.mode is GateMode.DRIVING
+    rig.driver = None
+    while rig.out.mode is GateMode.DRIVING:
+        rig.tick()
+
+
+def test_who_lets_go_of_a_truck_at_rest_does_not_stop_it():
+    rig = Rig().driving()
+    let_go(rig)
+    assert (rig.out.mode, rig.out.holder, rig.out.reasons) == (GateMode.ARMED, None, ())
+    assert (rig.out.action, rig.out.speeds[0]) == (DriveAction.RUN, 0.0)
+    assert rig.trips == []
+    (told,) = rig.told(Reason.STOPPED)
+    assert (told.severity, told.text) == (Severity.INFO, "ann let go")
+    assert not rig.told(Reason.LEASE_EXPIRED)
+    rig.driver = {"speed": 0.2}
+    rig.tick(5)
+    assert rig.out.mode is GateMode.DRIVING, "the same source goes on"
+    rig.driver = None
+    rig.tick(40)
+    assert [trip.reason for trip in rig.trips] == [Reason.LEASE_EXPIRED], "silence while driving is a stop"
+
+
+def test_who_falls_silent_while_the_truck_still_rolls_stops_it():
+    rig = Rig().driving()
+    for tick in range(70):
+        rig.driver = {"speed": 0.0} if tick < 50 else None
+        rig.speed = 0.1
+        rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    assert [trip.reason for trip in rig.trips] == [Reason.LEASE_EXPIRED]
+
+
 def test_nobody_for_a_while_disarms():
     rig = Rig().driving()
     rig.driver = None
