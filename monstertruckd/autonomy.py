@@ -10,11 +10,14 @@ from monstertruck_estimation.transforms import TransformService, compose, invert
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.stabiliser import StabiliserService
 from monstertruck_planners.collision import Footprint
+from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
+from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
@@ -22,12 +25,17 @@ from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.goal_build import build_goals
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
+from monstertruckd.placed_tracker import TARGET, PlacedTracker
 from monstertruckd.slam_service import SlamService
+from monstertruckd.workers.placement import Places
+from monstertruckd.workers.tracking import TrackSetup
 
 SCANS: Final = 16
 """Scans that may wait for the estimation worker."""
 ODOMETRIES: Final = 256
 """Poses and angles that may wait for a scan."""
+STEP_DEADLINE: Final = 1.0
+"""Seconds after which a tracker elsewhere is given up."""
 SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 
@@ -99,7 +107,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
     )
 
 
-def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, places: Places) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
         paths, wishes = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
@@ -116,24 +124,9 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             bus.event_sink(),
             config.gate.max_request_age,
         )
-        lidar = config.devices.lidar
-        yield TrackerService(
-            config.tracker,
-            clock,
-            steering=body.chassis.bicycle,
-            footprint=body.footprint,
-            lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
-            pose=bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
-            path=bus.subscribe(topics.PATH, latest()),
-            gate=bus.subscribe(topics.GATE, latest()),
-            scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
-            attitude=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
-            drive=wishes,
-            tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
-            events=bus.event_sink(),
-        )
+        yield _build_tracker(config, config.tracker, bus, clock, body, wishes, places)
         if config.planner is not None:
-            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes)
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes, places)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield StabiliserService(
             config.levelling,
@@ -152,6 +145,45 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> I
             tracker=bus.subscribe(topics.TRACKER, fifo(256)),
             events=bus.event_sink(),
         )
+
+
+def _build_tracker(
+    config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, wishes: Publisher[DriveRequest],
+    places: Places,
+) -> Service:  # fmt: skip
+    lidar, placement = config.devices.lidar, config.placement.tracker
+    mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
+    inputs: dict[str, Subscription[Any]] = {
+        "pose": bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
+        "path": bus.subscribe(topics.PATH, latest()),
+        "gate": bus.subscribe(topics.GATE, latest()),
+    }
+    if lidar is not None:
+        inputs["scan"] = bus.subscribe(topics.SCAN, latest())
+    if config.devices.compass is not None:
+        inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
+    told, events = bus.publisher(topics.TRACKER, Writer.PLANNER), bus.event_sink()
+    if placement != "loop":
+        setup = TrackSetup(
+            tracker, body.chassis.bicycle, body.footprint, mount, scan="scan" in inputs, attitude="attitude" in inputs
+        )
+        actor = places.actor(placement, "tracking", TARGET, latency=0.0, deadline=STEP_DEADLINE)
+        return PlacedTracker(setup, clock, actor, inputs=inputs, drive=wishes, tracker=told, events=events)
+    return TrackerService(
+        tracker,
+        clock,
+        steering=body.chassis.bicycle,
+        footprint=body.footprint,
+        lidar=mount,
+        pose=inputs["pose"],
+        path=inputs["path"],
+        gate=inputs["gate"],
+        scan=inputs.get("scan"),
+        attitude=inputs.get("attitude"),
+        drive=wishes,
+        tracker=told,
+        events=events,
+    )
 
 
 def calibration(config: TruckConfig, chassis: Chassis, tree: Tree | None = None) -> dict[str, Any]:

@@ -49,6 +49,9 @@ from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
 from monstertruckd.stall import StallWatch
 from monstertruckd.versions import running_versions
+from monstertruckd.workers.placement import Places
+from monstertruckd.workers.remote import RPC as REMOTE_STEP
+from monstertruckd.workers.remote import RemoteDesk
 
 ACTUATORS = (*SHAFTS, "steering")
 SENSORS = ("lidar", "compass", "stabiliser", "camera")
@@ -104,6 +107,8 @@ class Daemon:
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
+        self._desk = RemoteDesk()
+        self._places = Places(clock, self._desk)
         self.rpc = self._build_rpc()
         self._attachments = self._describe()
         self.recorder = self._build_recorder()
@@ -137,7 +142,7 @@ class Daemon:
                 self._start(sensors, service)
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
-            for service in build_planners(self.config, self.bus, self.clock, self._body):
+            for service in build_planners(self.config, self.bus, self.clock, self._body, self._places):
                 self._start(planners, service)
                 if isinstance(service, GoalService):
                     goal_rpc.register(self.rpc, service, self.clock)
@@ -237,6 +242,7 @@ class Daemon:
 
         rpc.register("config", config)
         rpc.register("versions", versions)
+        rpc.register(REMOTE_STEP, self._desk.serve)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(rpc, self.config, loaded, self.clock, self._events, self._offload)
         return rpc

@@ -1,5 +1,7 @@
 """The goal service of a configuration, with its ends of the bus."""
 
+from typing import Final
+
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.manage.config import PlannerConfig
@@ -13,6 +15,11 @@ from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.goal_service import GoalService, Inputs, Outputs
+from monstertruckd.workers.placement import Places
+
+TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"
+PATIENCE: Final = 180.0
+"""Real seconds the worker may take to start: the first time it compiles."""
 
 
 def build_goals(
@@ -24,6 +31,7 @@ def build_goals(
     footprint: Footprint,
     path: Publisher[Path],
     wish: Publisher[DriveRequest],
+    places: Places,
 ) -> GoalService:
     """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
     lidar, mapped = config.devices.lidar, config.slam is not None
@@ -31,6 +39,14 @@ def build_goals(
     return GoalService(
         planner.model_copy(update={"map": None}) if mapped else planner,
         clock,
+        places.actor(
+            config.placement.planner,
+            "planning",
+            TARGET,
+            latency=planner.latency,
+            deadline=planner.deadline,
+            patience=PATIENCE,
+        ),
         geometry=chassis.bicycle,
         footprint=footprint,
         lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),

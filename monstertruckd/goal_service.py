@@ -30,13 +30,10 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.gate.sources import Sequences, refusal
-from monstertruckd.workers.placement import Actor, make_actor
+from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]
 
-TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"
-PATIENCE: Final = 180.0
-"""Real seconds the worker may take to start: the first time it compiles."""
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
@@ -91,6 +88,7 @@ class GoalService:
     Args:
         config: how.
         clock: time.
+        actor: where it is planned.
         geometry: the truck's.
         footprint: its outline.
         lidar: pose (x, y, yaw) of the lidar in base.
@@ -106,6 +104,7 @@ class GoalService:
         self,
         config: PlannerConfig,
         clock: Clock,
+        actor: Actor,
         *,
         geometry: FourWheelSteering,
         footprint: Footprint,
@@ -116,6 +115,7 @@ class GoalService:
         outputs: Outputs,
     ) -> None:
         self._config, self._clock, self._in, self._out = config, clock, inputs, outputs
+        self._place = actor
         self._footprint, self._lidar, self._deceleration, self._max_age = footprint, lidar, deceleration, max_age
         self._setup = Setup(config, geometry, footprint, timed=not isinstance(clock, VirtualClock))
         self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
@@ -135,11 +135,7 @@ class GoalService:
 
     async def run(self, ready: Ready) -> None:
         """Serve goals until cancelled."""
-        actor = make_actor(
-            self._config.placement, "planning", TARGET, self._clock, latency=self._config.latency,
-            deadline=self._config.deadline, patience=PATIENCE,
-        )  # fmt: skip
-        async with actor:
+        async with self._place as actor:
             await actor.start()
             async with asyncio.TaskGroup() as tasks:
                 self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None

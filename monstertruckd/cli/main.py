@@ -18,6 +18,7 @@ from monstertruckd.cli import (
     maps,
     orders,
     plan,
+    plan_server,
     robot,
     service,
     usb,
@@ -64,6 +65,7 @@ app.command("reset")(orders.reset)
 app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
+app.command("plan-server")(plan_server.plan_server)
 app.command("replay")(logs.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)

@@ -195,6 +195,14 @@ class MapRender(Schema):
     """PNG file drawn whenever a path has come to its end"""
 
 
+class PlacementConfig(Schema):
+    """Where planner and tracker compute: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
+
+    planner: Literal["loop", "worker", "remote"] = "worker"
+    """In the loop only for studies: it stands still meanwhile"""
+    tracker: Literal["loop", "worker", "remote"] = "loop"
+
+
 class TruckConfig(Schema):
     """Everything the daemon needs to know."""
 
@@ -219,6 +227,7 @@ class TruckConfig(Schema):
     tracker: AnyTracker | None = None
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
+    placement: PlacementConfig = PlacementConfig()
     path: PathSource | None = None
     map: MapRender | None = None
     slam: SlamConfig | None = None

@@ -1,4 +1,4 @@
-"""Where a pure step runs: in the loop, or in a worker process. One word of the configuration changes it."""
+"""Where a pure step runs: in the loop, in a worker process, or on another machine; one word changes it."""
 
 import importlib
 from types import TracebackType
@@ -7,6 +7,9 @@ from typing import Any, Literal, Protocol, Self
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
 from monstertruckd.workers.actor import WorkerActor
 from monstertruckd.workers.agenda import agenda_of
+from monstertruckd.workers.remote import RemoteDesk
+
+Placement = Literal["loop", "worker", "remote"]
 
 
 class Actor(Protocol):
@@ -76,11 +79,26 @@ class LoopActor:
         self._step = None
 
 
-def make_actor(
-    placement: Literal["loop", "worker"], name: str, target: str, clock: Clock, *, latency: float, deadline: float,
-    patience: float = 30.0,
-) -> Actor:  # fmt: skip
-    """The actor of a placement; arguments as of ``WorkerActor``."""
-    if placement == "loop":
-        return LoopActor(target, clock, latency)
-    return WorkerActor(name, target, clock, latency=latency, deadline=deadline, patience=patience)
+class Places:
+    """Makes the actors of one daemon.
+
+    Args:
+        clock: time.
+        desk: where other machines call for work.
+    """
+
+    def __init__(self, clock: Clock, desk: RemoteDesk) -> None:
+        self._clock = clock
+        self._desk = desk
+
+    def actor(
+        self, placement: Placement, name: str, target: str, *, latency: float, deadline: float, patience: float = 30.0
+    ) -> Actor:
+        """An actor; arguments as of ``WorkerActor``, those of no use to a placement are left out."""
+        match placement:
+            case "loop":
+                return LoopActor(target, self._clock, latency)
+            case "worker":
+                return WorkerActor(name, target, self._clock, latency=latency, deadline=deadline, patience=patience)
+            case "remote":
+                return self._desk.actor(name, self._clock, deadline=deadline, patience=patience)

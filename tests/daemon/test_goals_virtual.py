@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
@@ -30,7 +31,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK = {
     "recorder": None,
     "blackbox": None,
-    "planner": {"placement": "loop", "route": {"effort": 3000, "margin": 0.04}},
+    "planner": {"route": {"effort": 3000, "margin": 0.04}},
+    "placement": {"planner": "loop"},
 }
 
 
@@ -211,3 +213,16 @@ def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: P
         assert (await trip.end()).outcome is Reason.CANCELLED
 
     assert not travel(story).truth.array()[:, 5].any()
+
+
+@pytest.mark.parametrize("where", ["worker"])
+def test_planner_and_tracker_drive_the_same_from_wherever_they_are_placed(where: str):
+    async def story(trip: Trip) -> None:
+        await trip.goal(1.8, 3.8, 0.2)
+        await trip.arm()
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+
+    here = travel(story).truth.array()
+    there = travel(story, placement={"planner": where, "tracker": where}).truth.array()
+    assert here.shape == there.shape
+    assert np.abs(here - there).max() < 1e-9

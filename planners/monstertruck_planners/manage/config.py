@@ -17,8 +17,6 @@ RouteKind = Annotated[HybridConfig | LatticeConfig, Field(discriminator="kind")]
 
 Rung = Literal["clear", "back_out", "wait", "replan"]
 
-Placement = Literal["loop", "worker"]
-
 DRIVEN: dict[Literal["2ws", "counter", "4ws"], tuple[Steering, ...]] = {
     "2ws": ("front",),
     "counter": ("counter",),
@@ -47,8 +45,6 @@ class PlannerConfig(Schema):
 
     route: RouteKind = HybridConfig(margin=0.04, unknown="blocked")
     """Route planner; its margin has to exceed what the gate keeps beside the truck"""
-    placement: Placement = "worker"
-    """Where it computes: in the daemon's own loop (for studies only), or in a process of its own"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.36
