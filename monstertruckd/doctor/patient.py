@@ -17,7 +17,7 @@ from monstertruckd.cabling import ROOT, Computer
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import AnyPort, TruckConfig
 from monstertruckd.doctor.accounts import Account, account_of
-from monstertruckd.install.plan import CONFIG, UNIT, below
+from monstertruckd.install.plan import UNIT, below, installed_config
 from monstertruckd.install.unit import Program
 
 STATE = Path("/var/lib/monstertruckd")
@@ -112,7 +112,7 @@ def admit(system: Path, program: Program, config_file: Path | None, uid: int, cl
         clock: time.
     """
     unit = text_of(below(system, UNIT)) or ""
-    file = config_file or _installed(system, unit)
+    file = config_file or installed_config(system)
     config, complaint = None, None
     if file is not None:
         try:
@@ -123,12 +123,6 @@ def admit(system: Path, program: Program, config_file: Path | None, uid: int, cl
     account = account_of(system, user[1] if user is not None else uid)
     machine = system if config is None or config.machine == ROOT else config.machine
     return Patient(system, Computer.at(machine, clock), program, file, config, complaint, account)
-
-
-def _installed(system: Path, unit: str) -> Path | None:
-    named = re.search(r"^ExecStart=.* --config (/\S+)$", unit, re.MULTILINE)
-    file = below(system, Path(named[1]) if named is not None else CONFIG)
-    return file if named is not None or file.is_file() else None
 
 
 def _runs_daemon(words: list[str]) -> bool:

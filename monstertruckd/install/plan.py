@@ -1,11 +1,13 @@
 """What an installation consists of: files, and programs to tell about them."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.small_files import text_of
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.install.configuration import FOLDER, files_of, load_real
 from monstertruckd.install.rules import rules_text
@@ -21,7 +23,7 @@ TMPFILES: Final = Path("/etc/tmpfiles.d/monstertruckd.conf")
 MODULES: Final = Path("/etc/modules-load.d/monstertruckd.conf")
 RULES: Final = Path("/etc/udev/rules.d/70-monstertruckd.rules")
 CONFIG: Final = FOLDER / "truck.yaml"
-"""Used where none is named."""
+"""Used where neither the user nor an installed unit names one."""
 
 Command = tuple[str, ...]
 
@@ -65,7 +67,7 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
     """What belongs to the service of a configuration.
 
     Args:
-        config_file: copied to /etc; None, or one that is there: the installed one, as it is.
+        config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
         user: the service runs as.
         program: what it runs.
         root: of the system that gets it.
@@ -76,7 +78,7 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
         InputError: systemd could not use the user's name or one of the paths.
     """
     user_name(user)
-    source = config_file or below(root, CONFIG)
+    source = config_file or installed_config(root) or below(root, CONFIG)
     if config_file is None and not source.is_file():
         raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")
     config = load_real(source)
@@ -93,6 +95,17 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
         ),
         tuple(_notes(config)),
     )
+
+
+def installed_config(root: Path) -> Path | None:
+    """The configuration the installed unit starts the daemon with, without one the usual; None if that is missing too.
+
+    A file the unit names is given even if it is not there.
+    """
+    unit = text_of(below(root, UNIT)) or ""
+    named = re.search(r"^ExecStart=.* --config (/\S+)$", unit, re.MULTILINE)
+    file = below(root, Path(named[1]) if named is not None else CONFIG)
+    return file if named is not None or file.is_file() else None
 
 
 def below(root: Path, path: Path) -> Path:

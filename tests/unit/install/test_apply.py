@@ -52,6 +52,20 @@ def test_the_second_time_nothing_changes(config: Path | None, tmp_path: Path):
     assert tree(tmp_path) == before
 
 
+def test_the_second_time_the_configuration_may_have_any_name(tmp_path: Path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(f"version: 1\ninclude: {TRUCK}\n")
+    root = tmp_path / "root"
+    install(truck_plan(root, mine), root)
+    assert not install(truck_plan(root, None), root).changed
+    (root / "etc/monstertruckd/truck.yaml").write_text("not the one\n")
+    assert not install(truck_plan(root, None), root).changed
+
+    (root / "etc/monstertruckd/mine.yaml").unlink()
+    with pytest.raises(NotFoundError, match=r"etc/monstertruckd/mine.yaml: no configuration is installed"):
+        truck_plan(root, None)
+
+
 def test_an_edited_configuration_is_kept_beside_and_its_change_reaches_the_rules(tmp_path: Path):
     install(truck_plan(tmp_path), tmp_path)
     installed = tmp_path / "etc/monstertruckd/truck.yaml"
