@@ -1,0 +1,54 @@
+"""SLAM on recorded logs, one configuration for all: accuracy beside wheels and kiss-icp, maps of the URG-04LX, and costs.
+
+    python benchmarks/slam.py --data DIR [--only LOG|PART ...] [--quick]
+
+DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first 1088 s),
+intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs. The trajectories judged are those
+after the joint registration at a log's end; ``online`` figures are before it. Two processes at most; times are processor
+time. Plots go to runs/slam. The last line is JSON.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from slam_parts import accuracy
+from slam_parts.logs import verified
+
+OUT = Path(__file__).resolve().parents[1] / "runs" / "slam"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", choices=(*accuracy.LOGS, "exp2", "costs"))
+    parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(accuracy.QUICK)}")
+    arguments = parser.parse_args()
+    verified(arguments.data)
+    OUT.mkdir(parents=True, exist_ok=True)
+    chosen = arguments.only or (accuracy.QUICK if arguments.quick else (*accuracy.LOGS, "exp2", "costs"))
+    parts = []
+    logs = tuple(name for name in accuracy.LOGS if name in chosen)
+    if logs:
+        parts.append(accuracy.run(arguments.data, OUT, logs))
+    if "exp2" in chosen:
+        parts.append(importlib.import_module("slam_parts.exp2").run(OUT / "exp2.png"))
+    if "costs" in chosen:
+        parts.append(importlib.import_module("slam_parts.costs").run(arguments.data / "urg04lx_exp2.dat.gz"))
+    figures = {key: value for part in parts for key, value in part[0].items()}
+    goals = {key: value for part in parts for key, value in part[1].items()}
+    met = all(part[2] for part in parts)
+    result = {"bench": "slam", "figures": figures, "goals": goals, "met": met}
+    (OUT / "slam.json").write_text(json.dumps(result, indent=1))
+    print(json.dumps(result))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

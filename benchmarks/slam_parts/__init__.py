@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/slam.py``: each adds figures and goals of its own."""
