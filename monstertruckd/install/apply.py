@@ -1,6 +1,7 @@
 """Puts a plan into a system, or takes it out; what is already so is left alone."""
 
 import os
+import shlex
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from monstertruck_runtime.errors import CommandFailedError, NotFoundError, NotPermittedError
+from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotPermittedError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.install.configuration import FOLDER
 from monstertruckd.install.plan import (
@@ -19,6 +20,7 @@ from monstertruckd.install.plan import (
     ENABLED,
     MODULES,
     RULES,
+    SERVICE,
     SYSUSERS,
     TMPFILES,
     UNIT,
@@ -43,6 +45,8 @@ class Change(StrEnum):
     CHANGED = "changed"
     SAME = "same"
     REMOVED = "removed"
+    MASKED = "masked"
+    """A link to /dev/null is in its place: somebody has switched it off."""
 
 
 @dataclass(slots=True)
@@ -88,6 +92,7 @@ def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command
     """Write what differs, then tell the running system; one that does not run is only written.
 
     Raises:
+        InputError: a file is masked, is none, or is behind a link out of ``root``; nothing has been written then.
         NotPermittedError: not allowed to write there.
         NotFoundError, CommandFailedError: see ``run_command``; running it again goes on from there.
     """
@@ -98,10 +103,11 @@ def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command
         report.commands += AFTER_INSTALL
     if dry or not report.changed:
         return report
+    _refuse_masked(root, report)
     with _permission():
         if here:
             unfinished.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(unfinished, "")
+            replace_file(unfinished, "", follow_links=False)
         for file in plan.files:
             if report.changes[file.path] is not Change.SAME:
                 _write(root, file, report)
@@ -115,10 +121,11 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Repor
     """Stop the service and take its files away.
 
     Raises:
+        InputError: a file is behind a link out of ``root``.
         NotPermittedError: not allowed to.
         NotFoundError, CommandFailedError: see ``run_command``.
     """
-    report = Report({path: Change.REMOVED for path in FILES if os.path.lexists(below(root, path))})
+    report = Report({path: Change.REMOVED for path in FILES if os.path.lexists(_place(root, path))})
     here = runs_here(root) and report.changed
     before = BEFORE_REMOVAL if here and UNIT in report.changes else ()
     after = AFTER_REMOVAL if here else ()
@@ -135,27 +142,61 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Repor
     return report
 
 
+def _place(root: Path, path: Path) -> Path:
+    """Where a file is.
+
+    Raises:
+        InputError: a link on the way there leads out of ``root``.
+    """
+    place = below(root, path)
+    folder = place.parent.resolve()
+    if not folder.is_relative_to(root.resolve()):
+        raise InputError(f"{place}: would be in {folder}, outside {root}; make the link on the way a relative one")
+    return place
+
+
 def _change(root: Path, file: Planned) -> Change:
-    place = below(root, file.path)
+    place = _place(root, file.path)
     if not os.path.lexists(place):
         return Change.NEW
+    if place.is_symlink() and os.path.normpath(file.path.parent / place.readlink()) == os.devnull:
+        return Change.MASKED
+    if not (place.is_symlink() or place.is_file()):
+        raise InputError(f"{place}: expected a file; move away what is there")
     if file.target is not None:
         return Change.SAME if place.is_symlink() and place.readlink() == file.target else Change.CHANGED
     return Change.SAME if not place.is_symlink() and place.read_text(errors="replace") == file.text else Change.CHANGED
 
 
+def _refuse_masked(root: Path, report: Report) -> None:
+    for path, change in report.changes.items():
+        if change is Change.MASKED:
+            elsewhere = [] if root == Path("/") else [f"--root={root}"]
+            unit = path == UNIT
+            mend = ["systemctl", *elsewhere, "unmask", SERVICE] if unit else ["rm", str(below(root, path))]
+            raise InputError(f"{path}: is masked by a link to {os.devnull}; to have it again: {shlex.join(mend)}")
+
+
 def _write(root: Path, file: Planned, report: Report) -> None:
-    place = below(root, file.path)
+    place = _place(root, file.path)
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.target is not None:
         place.unlink(missing_ok=True)
         place.symlink_to(file.target)
         return
-    if file.keep_previous and report.changes[file.path] is Change.CHANGED:
-        previous = place.with_name(f"{place.name}~")
-        place.replace(previous)
-        report.previous.append(file.path.with_name(previous.name))
-    replace_file(place, file.text)
+    # The file behind a link stays where it is anyway.
+    if file.keep_previous and report.changes[file.path] is Change.CHANGED and not place.is_symlink():
+        report.previous.append(file.path.with_name(_keep(place).name))
+    replace_file(place, file.text, follow_links=False)
+
+
+def _keep(place: Path) -> Path:
+    """Give a file a second name, with a ~, under which it stays when it is replaced; the first one is never gone."""
+    previous = place.with_name(f"{place.name}~")
+    if previous.is_symlink() or not previous.is_file() or previous.read_bytes() != place.read_bytes():
+        previous.unlink(missing_ok=True)
+        previous.hardlink_to(place)
+    return previous
 
 
 @contextmanager

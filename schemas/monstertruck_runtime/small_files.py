@@ -1,6 +1,8 @@
 """Small files: such of /proc and /sys, made up by the kernel and often not there, and such that are replaced whole."""
 
+import errno
 import os
+import stat
 import tempfile
 from pathlib import Path
 
@@ -22,25 +24,31 @@ def number_of(file: Path) -> int | None:
         return None
 
 
-def replace_file(path: Path, content: str | bytes, mode: int = 0o644) -> None:
+def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_links: bool = True) -> None:
     """Give the file its ``content``, as a whole or not at all; one that was there keeps its mode.
 
     Args:
-        path: the file, or a link to it, which stays a link.
+        path: the file, or a link to it.
         content: new content; text becomes UTF-8.
         mode: of a new file.
+        follow_links: a link stays one and its file gets the content; otherwise the file takes the link's place.
 
     Raises:
-        OSError: it could not be written; nothing has changed then.
+        OSError: it could not be written, or is a folder, a device or the like; nothing has changed then.
     """
-    place = path.resolve()
+    place = path.resolve() if follow_links else path
+    before = place.lstat().st_mode if os.path.lexists(place) else None
+    if before is not None and not stat.S_ISREG(before):
+        if follow_links or not stat.S_ISLNK(before):
+            raise OSError(errno.EINVAL, "Not a regular file", str(place))
+        before = None
     handle, scratch = tempfile.mkstemp(dir=place.parent, prefix=place.name)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(handle)
-        Path(scratch).chmod(place.stat().st_mode if place.exists() else mode)
+        Path(scratch).chmod(mode if before is None else stat.S_IMODE(before))
         Path(scratch).replace(place)
     except BaseException:
         Path(scratch).unlink(missing_ok=True)

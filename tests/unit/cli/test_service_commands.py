@@ -47,7 +47,7 @@ def test_a_port_that_no_rule_makes_is_pointed_out(tmp_path: Path):
 def test_who_may_not_install_is_told_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from monstertruckd.install import apply
 
-    def refuse(path: Path, _: str) -> None:
+    def refuse(path: Path, _: str, **_options: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(apply, "replace_file", refuse)

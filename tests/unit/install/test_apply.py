@@ -163,7 +163,7 @@ def test_what_a_program_says_becomes_the_error():
 
 
 def test_who_may_not_write_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def refuse(path: Path, _: str) -> None:
+    def refuse(path: Path, _: str, **_options: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(apply, "replace_file", refuse)

@@ -1,8 +1,10 @@
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.small_files import number_of, text_of
+from monstertruck_runtime.small_files import number_of, replace_file, text_of
 
 
 @pytest.mark.parametrize(("content", "number"), [("42\n", 42), ("-1", -1), ("", None), ("4.2", None), ("abc", None)])
@@ -20,3 +22,37 @@ def test_what_cannot_be_read_is_none(tmp_path: Path):
 def test_any_bytes_are_text(tmp_path: Path):
     (tmp_path / "file").write_bytes(b" \xff\n")
     assert text_of(tmp_path / "file") == "\ufffd"
+
+
+def test_a_replaced_file_keeps_its_mode_and_a_link_to_it_stays(tmp_path: Path):
+    file, link = tmp_path / "file", tmp_path / "link"
+    replace_file(file, "a", mode=0o600)
+    assert file.stat().st_mode & 0o777 == 0o600
+    link.symlink_to(file)
+    replace_file(link, b"b")
+    assert link.is_symlink()
+    assert (file.read_text(), file.stat().st_mode & 0o777) == ("b", 0o600)
+
+
+def test_a_file_may_take_the_place_of_a_link(tmp_path: Path):
+    file, link = tmp_path / "file", tmp_path / "link"
+    replace_file(file, "a", mode=0o600)
+    link.symlink_to(file)
+    replace_file(link, "b", follow_links=False)
+    assert not link.is_symlink()
+    assert (link.read_text(), link.stat().st_mode & 0o777) == ("b", 0o644)
+    assert file.read_text() == "a"
+
+
+@pytest.mark.parametrize("follow_links", [True, False])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_only_regular_files_are_replaced(tmp_path: Path, make: Callable[[Path], None], follow_links: bool):
+    special = tmp_path / "special"
+    make(special)
+    with pytest.raises(OSError, match="Not a regular file"):
+        replace_file(special, "x", follow_links=follow_links)
+    (tmp_path / "link").symlink_to(special)
+    with pytest.raises(OSError, match="Not a regular file"):
+        replace_file(tmp_path / "link", "x")
+    assert not special.is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "special"], "nothing is left behind"
