@@ -21,7 +21,7 @@ from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.boxes import BoxFolder
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
 from monstertruckd.recorder.file import Entry, LogFile, disk_reason
-from monstertruckd.recorder.ring import Ring, Span
+from monstertruckd.recorder.ring import Ring, Snapshot, Span
 
 log = logging.getLogger(__name__)
 
@@ -190,10 +190,10 @@ class BlackBox:
     def _failed(self, error: OSError, what: str) -> None:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
-    def _write(self, name: str, entries: list[Entry], metadata: Mapping[str, str]) -> None:
+    def _write(self, name: str, entries: Snapshot, metadata: Mapping[str, str]) -> None:
         """In a thread, with pauses for the control loop, unless the daemon waits for it to end."""
         part = self._folder.begin(name)
-        start = entries[0].log_time if entries else 0
+        start = next((entry.log_time for entry in entries), 0)
         try:
             file = LogFile(part, Compression.ZSTD, CHUNK, self._attachments, metadata, start)
             try:

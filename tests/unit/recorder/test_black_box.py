@@ -4,6 +4,7 @@ import asyncio
 import errno
 import json
 import threading
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -336,7 +337,7 @@ def test_memory_is_bounded_and_pictures_go_first():
         ring.add(picture(now))
         ring.add(command(now))
         assert ring.size <= limit
-    entries = ring.snapshot()
+    entries = list(ring.snapshot())
     assert ring.size == sum(len(entry.payload) + OVERHEAD for entry in entries)
     assert sum(entry.topic is t.CMD_DRIVE for entry in entries) < 600
     assert sum(entry.topic is t.CAMERA for entry in entries) == 1, "the newest one"
@@ -346,4 +347,32 @@ def test_memory_is_bounded_and_pictures_go_first():
 
 
 def test_an_empty_ring_gives_nothing():
-    assert Ring(SPAN, 1000).snapshot() == []
+    snapshot = Ring(SPAN, 1000).snapshot()
+    assert (len(snapshot), list(snapshot)) == (0, [])
+
+
+def test_a_snapshot_copies_nothing_and_stays_as_it_was():
+    ring = Ring(SPAN, 1 << 30)
+    for number in range(6000):
+        ring.add(command(number * SECOND // 100))
+    snapshot = ring.snapshot()
+    assert len(snapshot) == 6000
+    assert sum(len(view.segments) for view in snapshot._views) < 60, "references to segments, not to entries"
+    iterator = iter(snapshot)
+    first = [next(iterator) for _ in range(10)]
+    for number in range(6000, 18_000):
+        ring.add(command(number * SECOND // 100))
+    times = [entry.log_time for entry in (*first, *iterator)]
+    assert times == [number * SECOND // 100 for number in range(6000)]
+    assert len(ring.snapshot()) == 6501
+
+
+def test_what_is_no_longer_kept_is_freed():
+    ring = Ring(SPAN, 4_000_000)
+    tracemalloc.start()
+    for number in range(400):
+        ring.add(picture(number * SECOND // 15, 50_000))
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert ring.lost
+    assert used < 4_400_000
