@@ -26,7 +26,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.sensor import Attitude, LaserScan
+from monstertruck_schemas.sensor import Attitude, LaserScan, Vector3
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 from monstertruckd.workers.tracking import Told, TrackInput, TrackOutput, TrackSetup
 
@@ -34,7 +34,7 @@ _CLASSES: Final[dict[str, type[Any]]] = {
     cls.__name__: cls
     for cls in (
         *(PlanTask, PlanAnswer, Setup, PlannerConfig, EscapeConfig, HybridConfig, LatticeConfig, Grid, Pose2D),
-        *(TrackInput, TrackOutput, TrackSetup, Told, Odometry, Twist2D, Path, GateState, LaserScan, Attitude),
+        *(TrackInput, TrackOutput, TrackSetup, Told, Odometry, Twist2D, Path, GateState, LaserScan, Attitude, Vector3),
         *(DriveRequest, TrackerState, FuzzyConfig, LqrConfig, MpcConfig, PurePursuitConfig, StanleyConfig),
         *(FourWheelSteering, Footprint),
     )

@@ -1,8 +1,10 @@
 """Steps on another machine give what they give here, and say so when they cannot."""
 
 import asyncio
+import dataclasses
 import json
-from typing import Any
+from enum import Enum
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -16,11 +18,11 @@ from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.track.config import LqrConfig
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
-from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
-from monstertruckd.workers import plan_server
+from monstertruckd.workers import codec, plan_server
 from monstertruckd.workers.codec import from_json, to_json
 from monstertruckd.workers.remote import RemoteDesk
 from monstertruckd.workers.tracking import TrackingWorker, TrackInput, TrackSetup
@@ -174,3 +176,20 @@ def test_what_travels_comes_back_as_it_was():
     )
     with pytest.raises(InputError, match="object"):
         to_json(object())
+
+
+def parts(annotation: Any) -> list[Any]:
+    """Every type named in an annotation."""
+    return [annotation, *(part for inner in get_args(annotation) for part in parts(inner))]
+
+
+def test_whatever_the_travelling_classes_hold_travels_too():
+    known = {*codec._CLASSES.values(), *codec._ENUMS.values()}
+    held = {
+        part
+        for cls in codec._CLASSES.values()
+        for annotation in get_type_hints(cls).values()
+        for part in parts(annotation)
+        if isinstance(part, type) and (issubclass(part, Schema | Enum) or dataclasses.is_dataclass(part))
+    }
+    assert {cls.__name__ for cls in held - known} == {"TrackerConfig"}, "the base of those that travel"
