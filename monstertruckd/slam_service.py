@@ -189,7 +189,9 @@ class SlamService:
         if not task.done():
             await task
         if self._config.save is not None and self._config.mode == "mapping" and task.exception() is None:
+            # First as it is, for the joint fit takes seconds that there may not be.
             self._told_saved(await worker.step(WorkerInput(save=self._config.save)))
+            self._told_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
 
     def _unusable(self, scan: LaserScan) -> str | None:
         if scan.tilt is not None and scan.tilt > self._config.max_tilt:
