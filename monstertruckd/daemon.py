@@ -244,7 +244,9 @@ class Daemon:
         rpc.register("versions", versions)
         rpc.register(REMOTE_STEP, self._desk.serve)
         loaded = self._tree.calibration if self._tree is not None else None
-        calibration_rpc.register(rpc, self.config, loaded, self.clock, self._events, self._offload)
+        calibration_rpc.register(
+            rpc, self.config, loaded, self.clock, self._events, self._offload, lambda: self.gate.mode
+        )
         return rpc
 
     def _refuse_goal(self, request: GoalRequest) -> None:

@@ -26,6 +26,8 @@ LEASE: Final = 0.5
 """Asked for, s; the gate grants what it thinks right."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
+TAKING: Final = 3
+"""Requests for rest that go before the order to arm."""
 STEERING: Final = 1.0
 """Seconds the wheels get for turning while the truck stands."""
 STUCK: Final = 3.0
@@ -128,9 +130,9 @@ class Mover:
             yield
         finally:
             # A lost link needs no order: without requests the gate's lease ends.
-            with suppress(TruckError):
-                await self._truck.order(Order.STOP)
-                await self._truck.order(Order.DISARM)
+            for order in (Order.STOP, Order.DISARM):
+                with suppress(TruckError):
+                    await self._truck.order(order)
         await run.disarmed()
 
 
@@ -154,8 +156,19 @@ class _Run:
         self.track = Track()
 
     async def arm(self) -> None:
-        """Show a stick at rest, so that nobody of a lower role drives off, and arm."""
+        """Show a stick at rest for a moment, so that nobody of a lower role drives off, and arm.
+
+        Raises:
+            RequestRefusedError: the gate would not, or somebody has armed the truck already.
+        """
         end = self._clock.now() + round(ARMING * SECOND)
+        while self.state is None and self._clock.now() <= end:
+            await self._clock.sleep(PERIOD)
+            self._take()
+        if self.state is not None and self.state.mode not in CLOSED:
+            holder = f", {self.state.holder} drives" if self.state.holder else ""
+            raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
+        taken = 0
         while self.state is None or self.state.mode is not GateMode.DRIVING or self.state.holder != self._truck.source:
             if self._clock.now() > end:
                 reasons = self.state.reasons if self.state is not None else ()
@@ -163,7 +176,8 @@ class _Run:
                 refusal = next((r for r in reasons if r is not Reason.DISARMED), Reason.DISARMED)
                 raise RequestRefusedError(refusal, f"the truck could not be armed: {why or 'no reason given'}")
             await self._truck.drive(0.0, 0.0, 0.0, LEASE)
-            if self.state is None or self.state.mode is GateMode.DISARMED:
+            taken += 1
+            if taken >= TAKING and self.state is not None and self.state.mode is GateMode.DISARMED:
                 await self._truck.order(Order.ARM)
             await self._clock.sleep(PERIOD)
             self._take()
@@ -196,6 +210,8 @@ class _Run:
         still = -1
         while self._clock.now() < end:
             await self.hold(0.0, front, rear, PERIOD)
+            if not self.track.drive:
+                continue
             newest = self.track.drive[-1]
             moved = [r.stamp for r in self.track.drive if abs(r.position - newest.position) > STILL]
             if newest.stamp - max(moved, default=newest.stamp) > AT_REST * SECOND:

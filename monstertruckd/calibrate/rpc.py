@@ -1,17 +1,19 @@
 """The daemon's side: it alone writes the calibration, where its user may, and tells which file it runs on."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, get_args
 
 from pydantic import ValidationError
 
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.calibrate.apply import store_of, with_values
 from monstertruckd.calibrate.record import Result, WizardName
@@ -23,7 +25,13 @@ UNDO: Final = "calibration_undo"
 
 
 def register(
-    rpc: Rpc, config: TruckConfig, loaded: Path | None, clock: Clock, events: EventSink, offload: Offload
+    rpc: Rpc,
+    config: TruckConfig,
+    loaded: Path | None,
+    clock: Clock,
+    events: EventSink,
+    offload: Offload,
+    mode: Callable[[], GateMode],
 ) -> None:
     """Serve ``calibration``, ``calibration_save`` and ``calibration_undo``.
 
@@ -34,6 +42,7 @@ def register(
         clock: dates the files.
         events: told of every new file.
         offload: where files are read and written.
+        mode: the gate's present one; nothing is written while the truck may move.
     """
     store = store_of(config)
 
@@ -43,6 +52,12 @@ def register(
     def tell(path: Path, what: str, by: Any) -> dict[str, Any]:
         events(Reason.OK, Severity.INFO, "calibration", f"{path}: {what}; counts from the next start", by=str(by))
         return {"file": str(path)}
+
+    def at_rest() -> None:
+        if mode() not in (GateMode.DISARMED, GateMode.ESTOPPED):
+            raise RequestRefusedError(
+                Reason.BUSY, f"the truck is {mode()}: calibrations are written while it is disarmed"
+            )
 
     async def show(_: dict[str, Any]) -> dict[str, Any]:
         def read() -> dict[str, Any]:
@@ -58,6 +73,7 @@ def register(
         return await offload(read)
 
     async def save(payload: dict[str, Any]) -> dict[str, Any]:
+        at_rest()
         result = _result(payload.get("result"))
         await offload(lambda: with_values(config, [result], "result"))
         path = await offload(lambda: store.save(result, real_time()))
@@ -68,6 +84,7 @@ def register(
         if wizard is None:
             known = ", ".join(get_args(WizardName))
             raise InputError(f"wizard: expected one of {known}, got {payload.get('wizard')!r}")
+        at_rest()
         path = await offload(lambda: store.undo(wizard, real_time()))
         return tell(path, f"calibration of {wizard} undone", payload.get("by"))
 
