@@ -125,6 +125,7 @@ class Mover:
     @asynccontextmanager
     async def _armed(self, run: "_Run") -> AsyncIterator[None]:
         """Armed inside; stopped and disarmed afterwards, whatever happens."""
+        await run.free()
         try:
             await run.arm()
             yield
@@ -155,19 +156,30 @@ class _Run:
         """Forget what was read so far."""
         self.track = Track()
 
+    async def free(self) -> None:
+        """Make sure that nobody uses the truck.
+
+        Raises:
+            RequestRefusedError: somebody has armed it.
+            NoAnswerError: the gate does not tell.
+        """
+        end = self._clock.now() + round(ARMING * SECOND)
+        while self.state is None:
+            if self._clock.now() > end:
+                raise NoAnswerError(f"the gate does not tell its state within {ARMING:g} s")
+            await self._clock.sleep(PERIOD)
+            self._take()
+        if self.state.mode not in CLOSED:
+            holder = f", {self.state.holder} drives" if self.state.holder else ""
+            raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
+
     async def arm(self) -> None:
         """Show a stick at rest for a moment, so that nobody of a lower role drives off, and arm.
 
         Raises:
-            RequestRefusedError: the gate would not, or somebody has armed the truck already.
+            RequestRefusedError: the gate would not.
         """
         end = self._clock.now() + round(ARMING * SECOND)
-        while self.state is None and self._clock.now() <= end:
-            await self._clock.sleep(PERIOD)
-            self._take()
-        if self.state is not None and self.state.mode not in CLOSED:
-            holder = f", {self.state.holder} drives" if self.state.holder else ""
-            raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
         taken = 0
         while self.state is None or self.state.mode is not GateMode.DRIVING or self.state.holder != self._truck.source:
             if self._clock.now() > end:

@@ -310,6 +310,25 @@ def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path
     assert len(run_virtual(main).estimates) == 4
 
 
+def test_a_truck_that_somebody_has_armed_is_left_alone(tmp_path: Path):
+    config, _ = yard(tmp_path, 1)
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            await clock.sleep(3.0)
+            await LocalOperator(rig.daemon.bus, clock).order(Order.ARM)
+            await clock.sleep(0.2)
+            truck, panel = LocalTruck(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
+            with pytest.raises(RequestRefusedError, match="armed already") as refusal:
+                await calibrate(drive_wizard(), truck, panel, clock, config, {})
+            assert refusal.value.refusal is Reason.BUSY
+            with pytest.raises(RequestRefusedError, match="while it is disarmed"):
+                await truck.call("calibration_undo", {"wizard": "drive"})
+
+    run_virtual(main)
+
+
 # What the daemon takes
 
 
