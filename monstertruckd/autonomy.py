@@ -34,8 +34,8 @@ SCANS: Final = 16
 """Scans that may wait for the estimation worker."""
 ODOMETRIES: Final = 256
 """Poses and angles that may wait for a scan."""
-STEP_DEADLINE: Final = 1.0
-"""Seconds after which a tracker elsewhere is given up."""
+STEP_DEADLINE: Final = 5.0
+"""Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
 SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 
