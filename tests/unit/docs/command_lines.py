@@ -55,6 +55,7 @@ INSTEAD = {
     "monstertruckd probe lidar --port /dev/ttyACM0": Instead(
         None, "needs the device; tests/daemon/test_commands_wall.py probes its emulator"
     ),
+    "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd calibrate battery": Instead(
         "monstertruckd calibrate battery --yes --answer meter=24.2 --answer another=no", "asks somebody"
     ),
