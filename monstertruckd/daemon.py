@@ -19,7 +19,7 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
-from monstertruck_runtime.threads import Offload, in_thread, inline
+from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -124,8 +124,8 @@ class Daemon:
         """
         async with (
             self._outside(),
-            self._recording(),
             self._remembering(),
+            self._recording(),
             scope("actuators") as actuators,
             scope("gate") as gate,
             scope("sensors") as sensors,
@@ -193,7 +193,7 @@ class Daemon:
 
     @asynccontextmanager
     async def _remembering(self) -> AsyncIterator[None]:
-        """Inside the recording, which then holds the news of a box that is written at the very end."""
+        """Outside the recording, whose file is finished before a box that is written at the very end."""
         if self.black_box is None:
             yield
             return
@@ -327,7 +327,7 @@ class Daemon:
             self._events,
             attachments=self._attachments,
             metadata={"robot": self.config.robot},
-            offload=self._offload,
+            offload=in_daemon_thread if self._seed is None else inline,
         )
 
     def _describe(self) -> dict[str, Any]:

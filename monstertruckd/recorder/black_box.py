@@ -1,11 +1,13 @@
 """The black box: the minute before every trip of the gate, and a few seconds after it, as one MCAP file."""
 
 import asyncio
+import errno
 import logging
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -13,7 +15,7 @@ from typing import Any, Final, Self
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.stops import sentence
-from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_runtime.threads import Offload, in_daemon_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
@@ -33,19 +35,35 @@ CHUNK: Final = 64 * 1024
 """Bytes compressed at once; more takes longer."""
 
 
+BACKLOG: Final = 2
+"""Boxes that may wait for a slow disk, with the memory they take."""
+LAST_SECONDS: Final = 5.0
+"""What is not on the disk so long after the end is given up."""
+
+
 @dataclass(slots=True)
 class _Pending:
     """A box that will be written once its time has come."""
 
     name: str
+    reason: Reason
     due: int
     trips: list[Trip] = field(default_factory=list)
+
+    @property
+    def what(self) -> str:
+        """What it holds."""
+        if len(self.trips) == 1:
+            return f"the minute before stop {self.trips[0].number} is"
+        return f"stops {', '.join(str(trip.number) for trip in self.trips)} are"
 
 
 class BlackBox:
     """Keeps the newest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
 
-    A box that is due when the body ends is written before the context is left. A disk that is full or refuses costs
+    Every trip lies in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
+    less than ``interval`` ago, in one that is written later. A box that waits when the body ends is written before the
+    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow costs
     the box, is told, and nothing else happens.
 
     Args:
@@ -69,7 +87,7 @@ class BlackBox:
         *,
         attachments: Mapping[str, Any],
         metadata: Mapping[str, str],
-        offload: Offload = in_thread,
+        offload: Offload = in_daemon_thread,
     ) -> None:
         self._config = config
         self._clock = clock
@@ -84,28 +102,42 @@ class BlackBox:
             config.memory_bytes,
         )
         self._sequences = {topic.name: 0 for topic in TOPICS}
-        self._written: dict[Reason, int] = {}
-        """When the gate last tripped for a box of this reason."""
-        self._pending: _Pending | None = None
+        self._last: dict[Reason, int] = {}
+        """When the newest box with a trip of this reason is due."""
+        self._pending: list[_Pending] = []
+        self._taken: asyncio.Queue[tuple[_Pending, Snapshot] | None] = asyncio.Queue()
         self._wake = asyncio.Event()
-        self._closing = asyncio.Event()
+        self._closing = False
         self._hurry = threading.Event()
+        self._given_up = threading.Event()
+        self._loop_thread: int | None = None
 
     async def __aenter__(self) -> Self:
+        self._loop_thread = threading.get_ident()
         try:
             await self._offload(self._folder.look)
         except OSError as error:
             self._failed(error, "no black boxes yet")
-        self._serving = asyncio.create_task(self._serve(), name=self.name)
+        self._taking = asyncio.create_task(self._take(), name=f"{self.name} taking")
+        self._saving = asyncio.create_task(self._save_all(), name=f"{self.name} saving")
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._closing.set()
+        self._closing = True
         self._wake.set()
         self._hurry.set()
-        await asyncio.shield(self._serving)
+        try:
+            async with self._clock.deadline(LAST_SECONDS):
+                await asyncio.shield(self._saving)
+        except TimeoutError:
+            log.error("black box: the last box is lost, its disk takes longer than %g s", LAST_SECONDS)
+        finally:
+            self._given_up.set()
+            for task in (self._taking, self._saving):
+                task.cancel()
+            await asyncio.wait((self._taking, self._saving))
 
     def record(self, topic: Topic[Any], stamp: int, payload: bytes) -> None:
         """Remember one encoded message.
@@ -123,42 +155,62 @@ class BlackBox:
         """Note a trip of the gate.
 
         Returns:
-            The name its box will have, which a trip shares with one shortly before it; None if there will be none:
-            for this reason boxes are not wanted, or there was one a moment ago.
+            The name its box will have, which it may share with other trips; None if for this reason boxes are not
+            wanted.
         """
         if trip.reason in self._config.unless:
             return None
-        if self._pending is None:
-            last = self._written.get(trip.reason)
-            if last is not None and trip.at - last < self._config.interval * SECOND:
-                return None
-            self._pending = _Pending(self._folder.next_name(trip.reason), trip.at + round(self._config.after * SECOND))
-        self._written[trip.reason] = trip.at
-        self._pending.trips.append(trip)
+        soon = trip.at + round(self._config.after * SECOND)
+        pending = next((it for it in self._pending if it.reason is trip.reason or it.due <= soon), None)
+        if pending is None:
+            pending = _Pending(self._folder.next_name(trip.reason), trip.reason, max(soon, self._allowed(trip)))
+            self._pending.append(pending)
+        self._last[trip.reason] = pending.due
+        pending.trips.append(trip)
         self._wake.set()
-        return self._pending.name
+        return pending.name
 
-    async def _serve(self) -> None:
-        while True:
-            await self._wake.wait()
-            self._wake.clear()
-            if self._pending is not None:
-                await self._until(self._pending.due)
-                due, self._pending = self._pending, None
-                await self._save(due)
-            if self._closing.is_set():
-                return
+    def _allowed(self, trip: Trip) -> int:
+        """From when on there may be another box of this trip's reason; never so late that it would miss the trip."""
+        last = self._last.get(trip.reason)
+        if last is None:
+            return trip.at
+        interval, before = (round(it * SECOND) for it in (self._config.interval, self._config.before))
+        return min(last + interval, trip.at + before)
 
-    async def _until(self, due: int) -> None:
-        """Wait for that instant, or for the end."""
+    async def _take(self) -> None:
+        """Take each box's content at the instant it is due, whatever the disk is doing."""
+        while self._pending or not self._closing:
+            pending = min(self._pending, key=attrgetter("due"), default=None)
+            if not await self._is_due(pending) or pending is None:
+                continue
+            self._pending.remove(pending)
+            if self._taken.qsize() < BACKLOG or self._closing:
+                self._taken.put_nowait((pending, self.ring.snapshot()))
+            else:
+                slow = TimeoutError(errno.ETIMEDOUT, "the disk is too slow")
+                self._failed(slow, f"{pending.name} is lost")
+        self._taken.put_nowait(None)
+
+    async def _is_due(self, pending: _Pending | None) -> bool:
+        """Wait until ``pending`` is due (True), or there is news (False)."""
+        if self._closing:
+            return True
+        self._wake.clear()
+        if pending is None:
+            return not await self._wake.wait()
         try:
-            async with self._clock.deadline(max(0, due - self._clock.now()) / SECOND):
-                await self._closing.wait()
+            async with self._clock.deadline(max(0, pending.due - self._clock.now()) / SECOND):
+                await self._wake.wait()
         except TimeoutError:
-            return
+            return True
+        return False
 
-    async def _save(self, pending: _Pending) -> None:
-        entries = self.ring.snapshot()
+    async def _save_all(self) -> None:
+        while (taken := await self._taken.get()) is not None:
+            await self._save(*taken)
+
+    async def _save(self, pending: _Pending, entries: Snapshot) -> None:
         first = pending.trips[0]
         metadata = {
             **self._metadata,
@@ -181,7 +233,7 @@ class BlackBox:
                 Reason.BLACK_BOX_SAVED,
                 Severity.INFO,
                 self.name,
-                f"the minute before stop {first.number} is in {pending.name}",
+                f"{pending.what} in {pending.name}",
                 file=pending.name,
                 stop=first.number,
                 messages=len(entries),
@@ -191,14 +243,17 @@ class BlackBox:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
     def _write(self, name: str, entries: Snapshot, metadata: Mapping[str, str]) -> None:
-        """In a thread, with pauses for the control loop, unless the daemon waits for it to end."""
+        """In a thread with pauses for the control loop, unless the daemon waits for it to end."""
+        offloaded = threading.get_ident() != self._loop_thread
         part = self._folder.begin(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
             file = LogFile(part, Compression.ZSTD, CHUNK, self._attachments, metadata, start)
             try:
                 for count, entry in enumerate(entries):
-                    if count % BATCH == 0:
+                    if self._given_up.is_set():
+                        raise TimeoutError(errno.ETIMEDOUT, "given up")
+                    if offloaded and count % BATCH == 0:
                         self._hurry.wait(PAUSE)
                     file.add(entry)
                 file.finish()

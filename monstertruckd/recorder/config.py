@@ -62,6 +62,6 @@ class BlackBoxConfig(Schema):
     quota_bytes: Bytes = 512 * 1024 * 1024
     """Size of all boxes in the folder above which the oldest are removed; the newest of each reason stays."""
     interval: Annotated[float, Field(ge=0)] = 60.0
-    """Least seconds between two boxes of one reason."""
+    """Least seconds between two boxes of one reason; a trip meanwhile waits for it, at most ``before``."""
     unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
     """Reasons without a box: by default what somebody ordered."""

@@ -4,6 +4,9 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
+from functools import partial
 from typing import Generic, Protocol, TypeVar
 
 T = TypeVar("T")
@@ -84,6 +87,24 @@ async def in_thread(function: Callable[[], T]) -> T:
     except asyncio.CancelledError:
         await asyncio.wait([work])
         raise
+
+
+async def in_daemon_thread(function: Callable[[], T]) -> T:
+    """Run a blocking ``function`` beside the loop; neither a cancelled caller nor the process's end waits for it."""
+    work: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            result = function()
+        except BaseException as error:  # noqa: BLE001 - it belongs to whoever waits
+            outcome = partial(work.set_exception, error)
+        else:
+            outcome = partial(work.set_result, result)
+        with suppress(RuntimeError, InvalidStateError):  # the loop was closed meanwhile, or the caller cancelled
+            outcome()
+
+    threading.Thread(target=run, name="offloaded", daemon=True).start()
+    return await asyncio.wrap_future(work)
 
 
 async def inline(function: Callable[[], T]) -> T:

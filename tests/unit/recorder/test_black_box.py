@@ -7,6 +7,7 @@ import threading
 import tracemalloc
 from itertools import pairwise
 from pathlib import Path
+from types import MethodType
 
 import pytest
 
@@ -171,19 +172,42 @@ def test_a_trip_soon_after_another_shares_its_box(tmp_path: Path):
     on_bench(tmp_path, scenario)
 
 
-def test_repeated_trips_of_one_reason_are_rate_limited_others_are_not(tmp_path: Path):
+def test_boxes_of_one_reason_are_rate_limited_but_every_trip_lies_in_one(tmp_path: Path):
     async def scenario(bench):
-        names = []
+        names, instants = [], []
         for number in range(5):
             await bench.drive(7)
+            instants.append(bench.clock.now())
             names.append(bench.trip(Reason.TILT_STOP if number == 3 else Reason.SCAN_STALE, number))
-        assert [name is not None for name in names] == [True, False, False, True, False]
-        await bench.drive(62)
-        assert bench.trip() is not None
+        assert [name[9:-5] for name in names] == [
+            "000001-scan_stale",
+            *["000002-scan_stale"] * 2,
+            "000003-tilt_stop",
+            "000002-scan_stale",
+        ]
+        await bench.drive(36)
+        assert len(bench.files) == 2, "the second waits"
+        await bench.drive(2)
+        assert len(bench.files) == 3
+        stops = [open_log(tmp_path / name).metadata()["run"]["stops"] for name in bench.files]
+        assert stops == ["0", "1,2,4", "3"]
+        first, last = seconds(list(open_log(tmp_path / names[1])))
+        assert first < instants[1] / SECOND < instants[4] / SECOND < last
         assert bench.trip(Reason.STOPPED) is None, "an order is no accident"
 
     bench = on_bench(tmp_path, scenario)
-    assert [name[16:-5] for name in bench.files] == ["scan_stale", "tilt_stop", "scan_stale"]
+    assert [text for _, text, _ in bench.told][-1] == "stops 1, 2, 4 are in blackbox-000002-scan_stale.mcap"
+
+
+def test_no_trip_waits_until_the_minute_before_it_is_forgotten(tmp_path: Path):
+    async def scenario(bench):
+        bench.trip()
+        await bench.drive(10)
+        bench.trip(number=2)
+        await bench.drive(21)
+        assert len(bench.files) == 2
+
+    on_bench(tmp_path, scenario, before=20.0, interval=3600.0)
 
 
 def test_what_is_due_at_the_end_is_written_before_it(tmp_path: Path):
@@ -273,12 +297,12 @@ def test_the_oldest_boxes_go_but_the_newest_of_each_reason_stays(tmp_path: Path)
     assert [name[9:-5] for name in bench.files] == ["000001-tilt_stop", "000004-drive_stale", "000005-scan_stale"]
     assert (tmp_path / "notes.txt").exists()
     another = on_bench(tmp_path, scenario, quota_bytes=10**9)
-    assert another.files[-1][9:15] == "000008", "numbers go on over runs"
+    assert another.files[-1][9:15] == "000009", "numbers go on over runs"
 
 
 def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(tmp_path: Path):
     async def main():
-        bench = Bench(WallClock(), tmp_path, offload=module.in_thread, after=0.05)
+        bench = Bench(WallClock(), tmp_path, offload=module.in_daemon_thread, after=0.05)
         writing = []
         original = bench.box._write
 
@@ -287,6 +311,7 @@ def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(t
             original(*arguments)
 
         bench.box._write = write
+        bench.box._hurry = pauses = Pauses()
         async with bench.box:
             for seq in range(640):
                 bench.put(t.CMD_STEERING, steering(bench.clock.now(), seq))
@@ -295,9 +320,102 @@ def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(t
                 await asyncio.sleep(0.01)
         assert writing
         assert threading.main_thread() not in writing
+        assert pauses.count == 640 // module.BATCH
         assert len(list(open_log(tmp_path / bench.files[0]))) == 640
 
     asyncio.run(main())
+
+
+class Pauses(threading.Event):
+    """Counts the pauses."""
+
+    count = 0
+
+    def wait(self, timeout=None):
+        self.count += 1
+        return super().wait(timeout)
+
+
+def test_on_the_loop_itself_nothing_waits(tmp_path: Path):
+    async def scenario(bench):
+        bench.box._hurry = pauses = Pauses()
+        await bench.drive(1)
+        bench.trip()
+        await bench.drive(6)
+        assert len(bench.files) == 1
+        assert pauses.count == 0
+
+    on_bench(tmp_path, scenario)
+
+
+class Disk:
+    """Holds up everything that is written until it is released."""
+
+    def __init__(self):
+        self.released = asyncio.Event()
+
+    async def __call__(self, function):
+        if not isinstance(function, MethodType):
+            await self.released.wait()
+        return function()
+
+
+def test_a_box_holds_what_was_there_when_it_was_due_however_long_the_one_before_took(tmp_path: Path):
+    async def main(clock):
+        disk = Disk()
+        bench = Bench(clock, tmp_path, offload=disk)
+        async with bench.box:
+            bench.trip(number=1)
+            await bench.drive(6)
+            bench.trip(Reason.TILT_STOP, 2)
+            await bench.drive(100)
+            assert bench.files == []
+            disk.released.set()
+            await bench.drive(0.1)
+            first, last = seconds(list(open_log(tmp_path / bench.files[1])))
+            assert (first, last) == (pytest.approx(1.0, abs=0.1), pytest.approx(12.0, abs=0.1))
+
+    run_virtual(main)
+
+
+def test_boxes_do_not_pile_up_before_a_slow_disk(tmp_path: Path):
+    async def main(clock):
+        disk = Disk()
+        bench = Bench(clock, tmp_path, offload=disk)
+        async with bench.box:
+            for reason in (Reason.SCAN_STALE, Reason.TILT_STOP, Reason.DRIVE_STALE, Reason.BATTERY_CRITICAL):
+                bench.trip(reason)
+                await bench.drive(6)
+            assert bench.told == [
+                (Reason.RECORDING_FAILED, "blackbox-000004-battery_critical.mcap is lost: the disk is too slow", {})
+            ]
+            disk.released.set()
+
+    run_virtual(main)
+
+
+def test_a_disk_that_hangs_does_not_hold_up_the_end(tmp_path: Path, caplog):
+    async def main(clock):
+        bench = Bench(clock, tmp_path, offload=Disk())
+        async with bench.box:
+            bench.trip()
+            ended = clock.now()
+        assert (clock.now() - ended) / SECOND == pytest.approx(module.LAST_SECONDS, abs=0.01)
+
+    run_virtual(main)
+    assert "takes longer than 5 s" in caplog.text
+
+
+def test_a_box_that_is_given_up_leaves_nothing_behind(tmp_path: Path):
+    async def scenario(bench):
+        await bench.drive(1)
+        bench.box._given_up.set()
+        bench.trip()
+        await bench.drive(6)
+        assert bench.told.reasons == [Reason.RECORDING_FAILED]
+        assert list(tmp_path.iterdir()) == []
+
+    on_bench(tmp_path, scenario)
 
 
 # The ring
