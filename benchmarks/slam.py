@@ -1,11 +1,11 @@
-"""SLAM on recorded logs, one configuration for all: accuracy beside wheels and kiss-icp, maps of the URG-04LX, and costs.
+"""SLAM on recorded logs, one configuration for all: accuracy beside wheels and kiss-icp, URG-04LX maps, and costs.
 
     python benchmarks/slam.py --data DIR [--only LOG|PART ...] [--quick]
 
-DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first 1088 s),
-intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs. The trajectories judged are those
-after the joint registration at a log's end; ``online`` figures are before it. Two processes at most; times are processor
-time. Plots go to runs/slam. The last line is JSON.
+DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
+1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs. The trajectories
+judged are those after the joint registration at a log's end; ``online`` figures are before it. Two processes at most;
+times are processor time. Plots go to runs/slam. The last line is JSON.
 """
 
 import argparse

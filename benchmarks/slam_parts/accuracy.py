@@ -1,4 +1,4 @@
-"""Where each of three methods says the robot was: wheels, kiss-icp seeded by them, and ours; all with one configuration."""
+"""Where each of three methods says the robot was: wheels, kiss-icp seeded by them, and ours, in one configuration."""
 
 import time
 from concurrent.futures import ProcessPoolExecutor

@@ -2,6 +2,7 @@
 
 import gzip
 import hashlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,7 +53,7 @@ class Log:
     """Shape (n, 3)."""
     geometry: ScanGeometry
     reference: np.ndarray
-    """Relations, shape (m, 5): both times (s from the first scan), x, y, yaw; or poses, shape (m, 4): time, x, y, yaw."""
+    """Relations, shape (m, 5): both times (s from the first scan), x, y, yaw; or poses, (m, 4): time, x, y, yaw."""
 
     @property
     def by_relations(self) -> bool:
@@ -84,7 +85,7 @@ def load(folder: Path, name: str) -> Log:
     step = np.pi / 360 if beams == 361 else np.pi / 180
     geometry = ScanGeometry(-np.pi / 2, step, 0.05, 4.0 if name == "intel4" else none)
     if file == "intel":
-        rows = np.loadtxt(gzip.open(folder / "intel.relations.gz"))
+        rows = np.loadtxt(io.BytesIO(gzip.decompress((folder / "intel.relations.gz").read_bytes())))
         inside = (rows[:, :2] >= times[0]).all(axis=1) & (rows[:, :2] <= times[kept][-1]).all(axis=1)
         reference = np.column_stack((rows[:, :2] - times[0], rows[:, [2, 3, 7]]))[inside]
     else:

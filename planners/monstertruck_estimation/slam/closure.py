@@ -1,10 +1,10 @@
 """Loop closure: where the robot may have come back to, whether it has, and whether that agrees with everything else.
 
-Candidates are key scans that the drift bound lets lie near though the graph is not sure of them: the likeliest by place,
-and the most alike by descriptor. The robot's own surroundings (not one scan: a corridor looks like itself everywhere) are
-searched for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at once; in a wide
-one it waits until others, found from different places, agree with it (pairwise consistency: Mangelson et al. 2018). After
-the optimisation a closure that the graph resists is taken back.
+Candidates are key scans that the drift bound lets lie near though the graph is not sure of them: the likeliest by
+place, and the most alike by descriptor. The robot's own surroundings (not one scan: a corridor looks like itself
+everywhere) are searched for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at
+once; in a wide one it waits until others, found from different places, agree with it (pairwise consistency: Mangelson
+et al. 2018). After the optimisation a closure that the graph resists is taken back.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Coarse registration by exhaustive correlation with a likelihood grid, made fast by branch and bound.
 
-Every level of the grid holds the maximum over squares of 2^level cells, so that a block of translations is bounded by one
-look-up per point (Hess, Kohler, Rapp, Andor 2016; Olson 2009). The search returns the true maximum in its window.
+Every level of the grid holds the maximum over squares of 2^level cells, so that a block of translations is bounded by
+one look-up per point (Hess, Kohler, Rapp, Andor 2016; Olson 2009). The search returns the true maximum in its window.
 """
 
 import math
@@ -43,8 +43,8 @@ class LikelihoodGrid:
     def of(cls, cloud: Cloud, levels: int) -> "LikelihoodGrid":
         """Likelihood of the surfaces of ``cloud``, which is not empty.
 
-        Every element is drawn as long as it is: drawn as dots, far samples of a wall would match themselves best without
-        any motion.
+        Every element is drawn as long as it is: drawn as dots, far samples of a wall would match themselves best
+        without any motion.
         """
         points = cloud.points
         pad = (1 << (levels - 1)) + MARGIN
@@ -142,7 +142,7 @@ def _pool(source, target, step):  # type: ignore[no-untyped-def] # noqa: ANN001,
         y2 = min(y + step, rows - 1)
         for x in range(columns):
             x2 = min(x + step, columns - 1)
-            target[y, x] = max(max(source[y, x], source[y, x2]), max(source[y2, x], source[y2, x2]))
+            target[y, x] = max(source[y, x], source[y, x2], source[y2, x], source[y2, x2])
 
 
 @njit(cache=True)
@@ -154,8 +154,8 @@ def _rotated(points, guess, turns, x0, y0):  # type: ignore[no-untyped-def] # no
         for i in range(points.shape[0]):
             x = guess[0] + c * points[i, 0] - s * points[i, 1]
             y = guess[1] + s * points[i, 0] + c * points[i, 1]
-            result[k, i, 0] = int(math.floor((x - x0) / RESOLUTION))
-            result[k, i, 1] = int(math.floor((y - y0) / RESOLUTION))
+            result[k, i, 0] = math.floor((x - x0) / RESOLUTION)
+            result[k, i, 1] = math.floor((y - y0) / RESOLUTION)
     return result
 
 

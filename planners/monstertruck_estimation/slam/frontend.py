@@ -104,8 +104,8 @@ class FrontEnd(Protocol):
 class Planar:
     """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
 
-    What does not fit there is searched for once more in a window ``WIDER`` times as wide, because wheels slip further than
-    any covariance says; a place found that way must fit better (``LEAST_AFAR``).
+    What does not fit there is searched for once more in a window ``WIDER`` times as wide, because wheels slip further
+    than any covariance says; a place found that way must fit better (``LEAST_AFAR``).
     """
 
     def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
@@ -124,7 +124,7 @@ class Planar:
     def _locate(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> Match:
         deviation = deviations(covariance)
         window = min(WINDOW * deviation[0] + MARGIN, WIDEST[0]), min(WINDOW * deviation[1], WIDEST[1])
-        prior = np.linalg.inv(covariance)
+        prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), COARSE_POINTS)).astype(np.intp)]
         peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, LEAST_SCORE)
         fit = register(scan, submap.cloud, guess, prior)
@@ -166,7 +166,7 @@ def deviations(covariance: Array) -> tuple[float, float]:
 
 
 def degeneracy(information: Array) -> tuple[float, float]:
-    """Ratio of the eigenvalues of the information on the position (the yaw unknown), and yaw of the weakest direction."""
+    """Ratio of the eigenvalues of the information on the position (the yaw unknown); yaw of the weakest direction."""
     by_yaw = max(float(information[2, 2]), 1e-9)
     position = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / by_yaw
     values, vectors = np.linalg.eigh(position)

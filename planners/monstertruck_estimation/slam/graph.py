@@ -1,7 +1,7 @@
 """Pose graph in the plane: sparse Levenberg-Marquardt over relative poses, robust where a relation may be wrong.
 
 Residual of an edge: the pose of ``target`` in the frame of ``origin`` minus its measurement. Loop edges are weighted by
-dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013), the closed form of switchable constraints.
+dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): switchable constraints in closed form.
 """
 
 from dataclasses import dataclass
@@ -49,9 +49,7 @@ class Edges:
 
     def chosen(self, kept: NDArray[np.bool_]) -> "Edges":
         """The marked relations."""
-        return Edges(
-            self.origin[kept], self.target[kept], self.measured[kept], self.information[kept], self.loop[kept]
-        )
+        return Edges(self.origin[kept], self.target[kept], self.measured[kept], self.information[kept], self.loop[kept])
 
     def renumbered(self, number: Index) -> "Edges":
         """The same between poses that are now called ``number[k]``."""
@@ -205,7 +203,9 @@ def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array
     low, high = low[first], high[first]
     shape = (count, count)
     graph = csr_matrix((variance[kept], (low, high)), shape=shape)
-    far, before = dijkstra(graph, directed=False, indices=source, return_predecessors=True)
+    far, before = dijkstra(  # type: ignore[call-overload]  # its stubs know no sparse arrays of a fixed type
+        graph, directed=False, indices=source, return_predecessors=True
+    )
     numbers = low * count + high
     parents = before.astype(np.int64)
     nodes = np.arange(count)

@@ -58,7 +58,7 @@ class KeyMap:
         """The way from the last key scan but one to the last."""
         new = len(self) - 1
         place, turn = deviations(covariance)
-        information = np.linalg.inv(covariance + 1e-6 * np.eye(3))
+        information: Array = np.asarray(np.linalg.inv(covariance + 1e-6 * np.eye(3)), dtype=np.float64)
         self.edges.add(new - 1, new, delta, information, (place**2, turn**2), odometry=True)
 
     def relate_by_scans(self, local: Numbers) -> None:
@@ -82,7 +82,7 @@ class KeyMap:
             return False
         place = config.drift_distance[0] + config.drift_distance[1] * math.hypot(guess[0], guess[1])
         turn = config.drift_turn[0] + config.drift_turn[1] * abs(float(guess[2]))
-        covariance = np.linalg.inv(fit.information + np.eye(3))
+        covariance: Array = np.asarray(np.linalg.inv(fit.information + np.eye(3)), dtype=np.float64)
         weakest, _ = deviations(covariance)
         information = np.linalg.inv(covariance + np.diag(np.square(FLOOR)))
         spread = (place**2 + weakest**2, turn**2)
@@ -124,8 +124,8 @@ class KeyMap:
         """Leave out key scans that others stand in for.
 
         Returns:
-            For every former key scan whether it is kept, (n,), the number by which it is known now, (n,), and its pose in
-            the frame of the key scan of that number, (n, 3).
+            For every former key scan whether it is kept, (n,), the number by which it is known now, (n,), and its pose
+            in the frame of the key scan of that number, (n, 3).
         """
         gone, stand_in, edges, spread, odometry = thinned(
             self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.thinning

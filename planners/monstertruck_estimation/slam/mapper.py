@@ -76,7 +76,7 @@ class Mapper:
 
     @property
     def twist(self) -> tuple[float, float, float]:
-        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s): undoes the next one's motion distortion."""
+        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), for the next one's motion distortion."""
         return self._motion.twist
 
     def step(self, scan: Scan, stamp: int, odom: Array | None = None) -> Step | None:
@@ -101,7 +101,7 @@ class Mapper:
         self._doubts = self._doubts + 1 if doubtful else 0
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
-        events = () if match.accepted or not len(self.map) else (Event.REJECTED,)
+        events: tuple[Event, ...] = () if match.accepted or not len(self.map) else (Event.REJECTED,)
         if self._key_is_due(scan):
             events += self._extend(scan, stamp, match)
         if len(self.map):

@@ -27,8 +27,8 @@ FIT_NOISE: Final = 0.01
 class MotionModel:
     """Predicts the motion between two scans, and learns from the matches how good odometry is.
 
-    Wheels slip, and many logs stamp odometry and scans by clocks that disagree; no constant covers both a good and a bad
-    one. The factor follows the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972).
+    Wheels slip, and many logs stamp odometry and scans by clocks that disagree; no constant covers both a good and a
+    bad one. The factor follows the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972).
 
     Args:
         config: noise before anything is learned.
@@ -87,6 +87,6 @@ class MotionModel:
         if self._odom is None or not match.accepted or match.degeneracy < CLEAR[0] or match.overlap < CLEAR[1]:
             return
         off = between(delta, moved)
-        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE ** 2)
+        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE**2)
         innovation = min(place, OUTLIER**2) * self.factor**2
         self._square += (innovation - self._square) / MEMORY

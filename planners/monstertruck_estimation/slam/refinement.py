@@ -48,7 +48,7 @@ def partners(poses: Array) -> NDArray[np.int64]:
 
 
 def refine(keys: list[Key], poses: Array, steady: Edges, rounds: int = 8) -> Array:
-    """Poses, shape (n, 3), at which all scans fit each other best; ``steady`` are relations that hold anyway (odometry)."""
+    """Poses, shape (n, 3), at which all scans fit each other best; ``steady`` relations (odometry) hold anyway."""
     pairs = partners(poses)
     for turn in range(rounds):
         reach = CELL if turn < rounds // 2 else CELL / 2
@@ -75,4 +75,3 @@ def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: 
         measured[k], information[k], kept[k] = places[k] + step, h, True
     measured[:, 2] = wrap(measured[:, 2])
     return Edges(pairs[:, 0], pairs[:, 1], measured, information, pairs[:, 1] - pairs[:, 0] > NEIGHBOURS).chosen(kept)
-

@@ -1,7 +1,8 @@
 """Iterated fine registration of a scan to a cloud of surface elements (generalised ICP in the plane).
 
-Residual of a pair: the vector d from the moved scan point to its nearest map point, weighted by the inverse of the sum of
-both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional prior that has heavy (Cauchy) tails.
+Residual of a pair: the vector d from the moved scan point to its nearest map point, weighted by the inverse of the sum
+of both elements' covariances, under a Geman-McClure kernel; Gauss-Newton over (x, y, yaw) with an optional prior of
+heavy (Cauchy) tails.
 """
 
 import math

@@ -1,8 +1,8 @@
 """From ranges to points that know how well they lie on a surface.
 
-Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor) and
-the variances along and across it: a point among neighbours on a line says nothing along that line, a lone point says
-the same in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
+Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor)
+and the variances along and across it: a point among neighbours on a line says nothing along that line, a lone point
+says the same in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
 """
 
 import math

@@ -32,12 +32,12 @@ def thinned(
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], Edges, Array, NDArray[np.bool_]]:
     """Leave out the most dispensable ``share`` of the poses, no two of them related, never the first.
 
-    Every relation of one left out is composed with its surest relation, so that it holds for the neighbour at its other end
-    (marginalisation along one edge; what the others knew in common is counted twice by no one).
+    Every relation of one left out is composed with its surest relation, so that it holds for the neighbour at that
+    one's other end: marginalisation along one edge.
 
     Returns:
-        Marks of those left out (n,), the neighbour that stands in for each (itself if it stays) (n,), and the relations of
-        the rest with their ``spread`` and ``odometry`` marks, in the old numbering.
+        Marks of those left out (n,), the neighbour that stands in for each (itself if it stays) (n,), and the relations
+        of the rest with their ``spread`` and ``odometry`` marks, in the old numbering.
     """
     count = len(poses)
     surest = np.linalg.det(edges.information)

@@ -1,5 +1,6 @@
 """A flat world of walls, a lidar in it, and wheels that drift."""
 
+import itertools
 import math
 
 import numpy as np
@@ -59,7 +60,7 @@ def rounds(count, laps=1.0, width=2.0, height=1.4):
 def drifting(truth, turn=0.02, scale=1.05):
     """Odometry of ``truth``: ways too long by ``scale``, turned by ``turn`` rad per metre."""
     poses = [np.zeros(3)]
-    for before, after in zip(truth[:-1], truth[1:], strict=True):
+    for before, after in itertools.pairwise(truth):
         delta = between(before, after)
         delta[:2] *= scale
         delta[2] += turn * math.hypot(delta[0], delta[1])

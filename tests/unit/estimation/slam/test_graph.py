@@ -25,7 +25,7 @@ def chain(poses, loops=(), information=SURE):
 def drifted(truth, turn):
     poses = [truth[0]]
     for k in range(len(truth) - 1):
-        poses.append(compose(poses[-1], between(truth[k], truth[k + 1]) + (0.0, 0.0, turn)))
+        poses.append(compose(poses[-1], between(truth[k], truth[k + 1]) + np.array((0.0, 0.0, turn))))
     return np.array(poses)
 
 

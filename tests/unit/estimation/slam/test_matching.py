@@ -27,9 +27,9 @@ def dots(points):
 
 
 def test_the_fine_fit_finds_the_place_and_knows_how_well():
-    submap = seen_from(ROOM, PLACE, PLACE + (0.1, 0.3, 0.4))
-    fit = register(scan(ROOM, PLACE + (0.05, 0.1, 0.1)), submap.cloud, PLACE)
-    assert fit.pose == pytest.approx(PLACE + (0.05, 0.1, 0.1), abs=0.004)
+    submap = seen_from(ROOM, PLACE, PLACE + np.array((0.1, 0.3, 0.4)))
+    fit = register(scan(ROOM, PLACE + np.array((0.05, 0.1, 0.1))), submap.cloud, PLACE)
+    assert fit.pose == pytest.approx(PLACE + np.array((0.05, 0.1, 0.1)), abs=0.004)
     assert fit.overlap > 0.9
     assert fit.residual < 0.012
     assert np.linalg.eigvalsh(fit.information)[0] > 100
@@ -47,7 +47,7 @@ def test_the_search_returns_the_greatest_score_of_its_window():
     step = 0.05 / max(float(np.percentile(np.hypot(*points.T), 80)), 1.0)
     for turn in np.arange(-math.ceil(0.2 / step), math.ceil(0.2 / step) + 1) * step:
         for x in np.arange(-10, 11) * 0.05:
-            at = guess + (x, 0.0, turn)
+            at = guess + np.array((x, 0.0, turn))
             column = correlate(grid, points, at, (0.5, 1e-9), (1e3, 1e3), 0.0)
             best = max(best, column.score)
     assert peak.score == pytest.approx(best, abs=0.02)
@@ -70,7 +70,7 @@ def test_nothing_scores_where_nothing_is():
 
 @pytest.mark.parametrize("off", [(0.3, -0.2, 0.25), (-0.5, 0.4, -0.3), (0.0, 0.0, 0.0)])
 def test_the_front_end_finds_the_scan_in_the_window_of_its_uncertainty(off):
-    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
     match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + off, WIDE, submap)
     assert match.accepted
     assert match.pose == pytest.approx(PLACE, abs=0.01)
@@ -78,9 +78,9 @@ def test_the_front_end_finds_the_scan_in_the_window_of_its_uncertainty(off):
 
 
 def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
-    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
     tight = np.diag((0.03**2, 0.03**2, 0.08**2))
-    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + (0.02, 0.01, 0.45), tight, submap)
+    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + np.array((0.02, 0.01, 0.45)), tight, submap)
     assert match.accepted
     assert match.pose == pytest.approx(PLACE, abs=0.01)
 
@@ -88,7 +88,9 @@ def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
 def test_a_corridor_is_told_and_leaves_the_way_along_it_to_the_wheels():
     submap = seen_from(CORRIDOR, (0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
     guess = np.array((0.9, 0.0, 0.03))
-    match = Planar().locate(scan(CORRIDOR, (0.6, 0.1, 0.0)), np.zeros(3), guess, np.diag((0.05**2, 0.05**2, 0.05**2)), submap)
+    match = Planar().locate(
+        scan(CORRIDOR, (0.6, 0.1, 0.0)), np.zeros(3), guess, np.diag((0.05**2, 0.05**2, 0.05**2)), submap
+    )
     assert match.accepted
     assert match.degenerate
     assert match.direction == pytest.approx(0.0, abs=0.1)
@@ -118,11 +120,11 @@ def test_a_handful_of_points_is_no_scan(count):
 
 def test_kiss_is_judged_like_the_other():
     front = Kiss()
-    submap = seen_from(ROOM, PLACE, PLACE + (0.0, 0.4, 0.3))
+    submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
     first = front.locate(scan(ROOM, PLACE), np.zeros(3), PLACE, WIDE, submap)
     assert first.accepted
     moved = np.array((0.1, 0.0, 0.05))
-    wrong = moved + (0.02, 0.01, -0.02)
+    wrong = moved + np.array((0.02, 0.01, -0.02))
     second = front.locate(scan(ROOM, compose(PLACE, moved)), wrong, compose(PLACE, wrong), WIDE, submap)
     assert second.accepted
     assert np.hypot(*between(PLACE, second.pose)[:2] - moved[:2]) < 0.03
