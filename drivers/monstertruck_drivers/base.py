@@ -1,12 +1,25 @@
 """What every device folder has in common: the emulator's frame and the physics it may ask for."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import DeviceEnd
+
+
+class Trail(bytearray):
+    """The newest bytes of a stream, ``KEPT`` at most: what an emulator was sent, for tests."""
+
+    KEPT: Final = 1 << 16
+
+    def extend(self, data: Iterable[SupportsIndex], /) -> None:
+        """Add bytes at the end; the oldest ones go."""
+        super().extend(data)
+        if len(self) > self.KEPT:
+            del self[: -self.KEPT]
 
 
 class Emulator(Protocol):

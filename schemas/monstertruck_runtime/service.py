@@ -132,6 +132,7 @@ async def supervise(
         if session.ready_at is not None and now - session.ready_at >= policy.settled_after * SECOND:
             delay = policy.first_delay
         session.tell(ServiceState.BACKOFF, lost.reason, detail)
+        del lost  # its traceback holds all of the session, and this very frame
         await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
         delay = min(delay * policy.factor, policy.max_delay)
 

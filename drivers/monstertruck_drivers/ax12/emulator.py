@@ -1,7 +1,6 @@
 """The device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
 
 import asyncio
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
+from monstertruck_drivers.base import Trail
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
@@ -75,7 +75,7 @@ class Ax12Bus:
         if len(ids) > UNITS_MAX or not all(0 <= ident <= p.ID_MAX for ident in ids):
             raise InputError(f"{name}: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
         self.name = name
-        self.received: deque[int] = deque(maxlen=1 << 16)
+        self.received = Trail()
         """Bytes the host sent, for tests."""
         self.latency_s = latency_s
         self._clock = clock

@@ -2,14 +2,13 @@
 
 import asyncio
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import ServoPlant
+from monstertruck_drivers.base import ServoPlant, Trail
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
@@ -117,9 +116,9 @@ class MaestroEmulator:
         self.name = name
         self.usb = usb
         self.on_output = on_output
-        self.received: deque[int] = deque(maxlen=1 << 16)
+        self.received = Trail()
         """Bytes the host sent to the Command Port, for tests."""
-        self.wire: deque[int] = deque(maxlen=1 << 16)
+        self.wire = Trail()
         """Bytes bridged from the TTL Port to the TX pin."""
         self.analog_v = dict.fromkeys(range(CHANNELS), 2.4)
         """Volts at the inputs while there is no plant."""

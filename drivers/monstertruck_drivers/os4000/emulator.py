@@ -2,13 +2,12 @@
 
 import asyncio
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import AttitudeSource, CompassReading
+from monstertruck_drivers.base import AttitudeSource, CompassReading, Trail
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.os4000.protocol import (
     BAUDS,
@@ -121,7 +120,7 @@ class Os4000Emulator:
     ) -> None:
         self.name = name
         self.settings = Settings(rate, fields)
-        self.received: deque[int] = deque(maxlen=1 << 16)
+        self.received = Trail()
         """Bytes the host sent, for tests."""
         self.host_baud: int | None = None
         """Rate the host uses; None = the same as the unit."""
@@ -165,8 +164,9 @@ class Os4000Emulator:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._stream(end))
             while True:
-                for byte in await end.read():
-                    self.received.append(byte)
+                data = await end.read()
+                self.received.extend(data)
+                for byte in data:
                     if self.host_baud in (None, self._baud):
                         self._take(end, byte)
 

@@ -1,6 +1,8 @@
 """Supervision: which failures are retried, when, and what is reported."""
 
 import asyncio
+import gc
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -151,3 +153,28 @@ def test_cancellation_is_reported_and_passes():
 
     run_virtual(main)
     assert [row.state for row in health] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
+
+
+def test_nothing_of_a_lost_session_is_kept_by_its_error():
+    kept: list[weakref.ref[set[int]]] = []
+
+    async def session(_: Ready) -> None:
+        buffers = {1}
+        kept.append(weakref.ref(buffers))
+        raise DeviceLostError("cable")
+
+    async def main(clock: VirtualClock) -> None:
+        service = Scripted(clock, *[session] * 3)
+        report: list[ServiceHealth] = []
+        task = asyncio.create_task(supervise(service, STEADY, clock, report.append, np.random.default_rng(1)))
+        await clock.sleep(2.0)
+        assert len(kept) == 2
+        assert [ref() for ref in kept] == [None, None], "freed at once, not by the collector"
+        task.cancel()
+        await asyncio.wait([task])
+
+    gc.disable()
+    try:
+        run_virtual(main)
+    finally:
+        gc.enable()

@@ -1,0 +1,15 @@
+"""What emulators have in common."""
+
+import sys
+
+from monstertruck_drivers.base import Trail
+
+
+def test_a_trail_keeps_the_newest_bytes_and_is_small():
+    trail = Trail()
+    for number in range(1000):
+        trail.extend(bytes([number % 256]) * 1000)
+    assert len(trail) == Trail.KEPT
+    assert trail[-1] == 999 % 256
+    assert trail.endswith(bytes([999 % 256]) * 1000)
+    assert sys.getsizeof(trail) < 3 * Trail.KEPT
