@@ -14,7 +14,8 @@ from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.goal_service import GoalService, Inputs, Outputs
+from monstertruckd.goal_parts import Inputs, Outputs
+from monstertruckd.goal_service import GoalService
 from monstertruckd.workers.placement import Places
 
 TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"

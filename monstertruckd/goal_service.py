@@ -2,7 +2,6 @@
 
 import asyncio
 import math
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -18,18 +17,17 @@ from monstertruck_planners.manage.lookout import blocked, cut, way_ahead
 from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
-from monstertruck_runtime.mailbox import Mailbox
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.schedule import Schedule
-from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalOrder, GoalRequest, Request, Role
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
+from monstertruck_schemas.state import GateMode, Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.gate.sources import Sequences, refusal
+from monstertruckd.goal_parts import Followed, Inputs, Outputs, goal_state, pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]
@@ -43,41 +41,6 @@ STUB: Final = 0.01
 """Length of a path that leads nowhere, m."""
 REPORT: Final = SECOND // 2
 """Between two reports without news, ns."""
-
-
-@dataclass(frozen=True, slots=True)
-class Inputs:
-    """What the service reads."""
-
-    goals: Mailbox[GoalRequest]
-    controls: Mailbox[GoalControl]
-    gate: Subscription[GateState]
-    pose: Subscription[Odometry]
-    """In the paths' frame."""
-    tracker: Subscription[TrackerState]
-    path: Subscription[Path]
-    scan: Subscription[LaserScan] | None
-    grid: Subscription[Grid] | None
-    """None = the configured map."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """What it writes."""
-
-    path: Publisher[Path]
-    wish: Publisher[DriveRequest]
-    state: Publisher[GoalState]
-    events: EventSink
-
-
-@dataclass(frozen=True)
-class Followed:
-    """The path being driven."""
-
-    message: Path
-    poses: Array
-    travelled: Array
 
 
 class GoalService:
@@ -244,7 +207,7 @@ class GoalService:
             now=now / SECOND,
             armed=gate is not None and gate.mode in ACTIVE and odometry is not None,
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
-            pose=None if odometry is None else _pose(odometry),
+            pose=None if odometry is None else pose_of(odometry),
             answer=answer,
             outcome=report.outcome if ours and report is not None else None,
             along=along,
@@ -259,7 +222,7 @@ class GoalService:
         points = self._scan(now)
         if not len(points):
             return False
-        pose = _pose(odometry)
+        pose = pose_of(odometry)
         way = way_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, np.array(pose))
         return blocked(self._footprint, way, points, pose)
 
@@ -296,7 +259,7 @@ class GoalService:
         if odometry is None:
             self._planning = self._tasks.create_task(_known(PlanAnswer(Reason.NO_MAP, "no fresh pose")))
             return
-        pose = _pose(odometry)
+        pose = pose_of(odometry)
         points = placed(np.column_stack((points := self._scan(now), np.zeros(len(points)))), pose)[:, :2]
         grid = None if self._in.grid is None else self._in.grid.latest
         task = PlanTask(
@@ -342,7 +305,7 @@ class GoalService:
             self._publish(followed.poses[:count], followed.message.directions[:count], steering, "halt")
         else:
             ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
-            self._publish(placed(ahead, _pose(odometry)), np.ones(2), (), "halt")
+            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), "halt")
         self._followed = None
 
     def _publish(self, poses: Array, directions: Array, steering: tuple[Any, ...], what: str) -> None:
@@ -393,7 +356,7 @@ class GoalService:
         )
 
     def _report(self, now: int) -> None:
-        state = self._state(now)
+        state = goal_state(self._mission, now, self._followed, self._in)
         same = ("phase", "outcome", "number", "routes", "recoveries")
         told = self._told
         unchanged = told is not None and all(getattr(told, name) == getattr(state, name) for name in same)
@@ -404,42 +367,9 @@ class GoalService:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
-    def _state(self, now: int) -> GoalState:
-        odometry, mission = self._in.pose.latest, self._mission
-        frame = "map" if odometry is None else odometry.frame
-        if mission is None:
-            return GoalState(stamp=now, received=now, seq=0, frame=frame)
-        x, y, yaw = mission.goal
-        followed, report = self._followed, self._in.tracker.latest
-        remaining = 0.0
-        if followed is not None and mission.active:
-            ours = report is not None and report.path == followed.message.name
-            along = report.along if ours and report is not None else 0.0
-            remaining = max(float(followed.travelled[-1]) - along, 0.0)
-        return GoalState(
-            stamp=now,
-            received=now,
-            seq=0,
-            frame=frame,
-            number=mission.number,
-            source=mission.source,
-            goal=Pose2D(x=x, y=y, yaw=yaw),
-            phase=mission.phase,
-            outcome=mission.outcome,
-            text=mission.text,
-            remaining=remaining,
-            elapsed=mission.elapsed,
-            routes=mission.routes,
-            recoveries=mission.recoveries,
-        )
-
     def _seconds(self) -> float:
         return self._clock.now() / SECOND
 
 
 async def _known(answer: PlanAnswer) -> PlanAnswer:
     return answer
-
-
-def _pose(odometry: Odometry) -> Pose:
-    return odometry.pose.x, odometry.pose.y, odometry.pose.yaw
