@@ -124,8 +124,9 @@ class Daemon:
         """
         async with (
             self._outside(),
-            self._remembering(),
+            self._black_box(),
             self._recording(),
+            self._remembering(),
             scope("actuators") as actuators,
             scope("gate") as gate,
             scope("sensors") as sensors,
@@ -192,20 +193,29 @@ class Daemon:
                 tap.close()
 
     @asynccontextmanager
-    async def _remembering(self) -> AsyncIterator[None]:
+    async def _black_box(self) -> AsyncIterator[None]:
         """Outside the recording, whose file is finished before a box that is written at the very end."""
         if self.black_box is None:
             yield
             return
-        async with self.black_box as box:
-            tap = self.bus.tap(
-                lambda topic, message, data: box.record(topic, message.stamp, data),
-                (topic for topic in TOPICS if topic.logged),
-            )
-            try:
-                yield
-            finally:
-                tap.close()
+        async with self.black_box:
+            yield
+
+    @asynccontextmanager
+    async def _remembering(self) -> AsyncIterator[None]:
+        """Inside the recording, whose end takes real time: what happens meanwhile is in no box."""
+        if (box := self.black_box) is None:
+            yield
+            return
+        tap = self.bus.tap(
+            lambda topic, message, data: box.record(topic, message.stamp, data),
+            (topic for topic in TOPICS if topic.logged),
+        )
+        try:
+            yield
+        finally:
+            tap.close()
+            box.freeze()
 
     def _status(self) -> str:
         return status_line(self.gate.mode, self._board.rows())

@@ -105,6 +105,7 @@ class BlackBox:
         self._last: dict[Reason, int] = {}
         """When the newest box with a trip of this reason is due."""
         self._pending: list[_Pending] = []
+        self._frozen: list[tuple[_Pending, Snapshot]] = []
         self._taken: asyncio.Queue[tuple[_Pending, Snapshot] | None] = asyncio.Queue()
         self._wake = asyncio.Event()
         self._closing = False
@@ -125,6 +126,9 @@ class BlackBox:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self.freeze()
+        for frozen in self._frozen:
+            self._taken.put_nowait(frozen)
         self._closing = True
         self._wake.set()
         self._hurry.set()
@@ -138,6 +142,12 @@ class BlackBox:
             for task in (self._taking, self._saving):
                 task.cancel()
             await asyncio.wait((self._taking, self._saving))
+
+    def freeze(self) -> None:
+        """Take what the waiting boxes will hold now, before the end; they are written when the context is left."""
+        self._frozen += [(pending, self.ring.snapshot()) for pending in self._pending]
+        self._pending.clear()
+        self._wake.set()
 
     def record(self, topic: Topic[Any], stamp: int, payload: bytes) -> None:
         """Remember one encoded message.
@@ -180,12 +190,12 @@ class BlackBox:
 
     async def _take(self) -> None:
         """Take each box's content at the instant it is due, whatever the disk is doing."""
-        while self._pending or not self._closing:
+        while not self._closing:
             pending = min(self._pending, key=attrgetter("due"), default=None)
-            if not await self._is_due(pending) or pending is None:
+            if not await self._is_due(pending) or pending not in self._pending:
                 continue
             self._pending.remove(pending)
-            if self._taken.qsize() < BACKLOG or self._closing:
+            if self._taken.qsize() < BACKLOG:
                 self._taken.put_nowait((pending, self.ring.snapshot()))
             else:
                 slow = TimeoutError(errno.ETIMEDOUT, "the disk is too slow")
@@ -194,8 +204,6 @@ class BlackBox:
 
     async def _is_due(self, pending: _Pending | None) -> bool:
         """Wait until ``pending`` is due (True), or there is news (False)."""
-        if self._closing:
-            return True
         self._wake.clear()
         if pending is None:
             return not await self._wake.wait()

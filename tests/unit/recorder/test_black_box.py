@@ -215,6 +215,10 @@ def test_what_is_due_at_the_end_is_written_before_it(tmp_path: Path):
         await bench.drive(1)
         bench.trip(Reason.ESTOP_REQUESTED)
 
+        bench.box.freeze()
+        await bench.drive(10)
+        assert bench.files == [], "it has its content, and waits for the end"
+
     bench = on_bench(tmp_path, scenario)
     assert bench.told.reasons == [Reason.BLACK_BOX_SAVED]
     assert len(list(open_log(tmp_path / bench.files[0]))) == 50
