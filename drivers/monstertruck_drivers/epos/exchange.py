@@ -170,7 +170,11 @@ class Exchanger:
         await self.settle()
         self._flight = asyncio.create_task(self._run(request, answered))
         self._flight.add_done_callback(_retrieve)
-        return await asyncio.shield(self._flight)
+        try:
+            return await asyncio.shield(self._flight)
+        finally:
+            if self._flight is not None and self._flight.done():
+                self._flight = None  # its error's traceback holds this exchanger
 
     async def settle(self) -> None:
         """Let the controller forget a half frame: silence on the line, from both sides.
