@@ -122,6 +122,7 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.POSE: odometries,
     t.PATH: paths,
     t.MAP: grids,
+    t.MAP_TILES: grids,
     t.TRANSFORMS: trees,
     t.LOG: st.builds(LogRecord, **header, level=st.sampled_from(LogLevel), line=st.integers(0, 2**32 - 1)),
 }
