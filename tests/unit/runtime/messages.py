@@ -151,6 +151,8 @@ def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
         special["values"] = st.dictionaries(
             st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
         )
+    if topic is t.SLAM:
+        special["overlap"] = st.floats(0, 1)
     if topic is t.STOP:
         special |= {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)}
     return st.builds(topic.model, **special)
