@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
-from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import text_of
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.install.configuration import FOLDER, files_of, load_real
 from monstertruckd.install.rules import rules_text
 from monstertruckd.install.shipped import filled
-from monstertruckd.install.unit import LINKS, Program, unit_text, user_name
+from monstertruckd.install.unit import LINKS, Program, temporary, unit_text, user_name
 
 USER: Final = "monstertruckd"
 SERVICE: Final = "monstertruckd.service"
@@ -75,9 +75,13 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
     Raises:
         NotFoundError: no configuration was named and none is installed.
         ConfigError: it was refused.
-        InputError: systemd could not use the user's name or one of the paths.
+        InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
+            could not see the program.
     """
     user_name(user)
+    hidden = temporary(program)
+    if hidden is not None and root == Path("/"):
+        raise InputError(hidden)
     source = config_file or installed_config(root) or below(root, CONFIG)
     if config_file is None and not source.is_file():
         raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")
@@ -93,7 +97,7 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
             Planned(UNIT, unit_text(config, installed, user, program)),
             Planned(ENABLED, target=UNIT),
         ),
-        tuple(_notes(config)),
+        (*_notes(config), *([hidden] if hidden is not None else ())),
     )
 
 

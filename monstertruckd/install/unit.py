@@ -92,15 +92,15 @@ def _stop(config: TruckConfig, program: Program) -> str:
     return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""
 
 
-def _at_home(program: Program) -> list[Path]:
-    """What the service must still see of the folders that are hidden from it.
+def temporary(program: Program) -> str | None:
+    """Why the service could not run ``program``; None = it can."""
+    hidden = (place for place in program.reads if any(place.is_relative_to(folder) for folder in HIDDEN))
+    place = next(hidden, None)
+    return None if place is None else f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd"
 
-    Raises:
-        InputError: the program is where no service may be run from.
-    """
-    for place in program.reads:
-        if any(place.is_relative_to(folder) for folder in HIDDEN):
-            raise InputError(f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd")
+
+def _at_home(program: Program) -> list[Path]:
+    """What the service must still see of the folders that are hidden from it."""
     return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
 
 

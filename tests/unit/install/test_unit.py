@@ -94,9 +94,11 @@ def test_a_program_at_home_is_shown_to_the_service_and_nothing_else_of_it():
 
 
 @pytest.mark.parametrize("place", ["/tmp/truck", "/var/tmp/x"])
-def test_a_temporary_program_is_refused(place: str):
+def test_a_temporary_program_is_refused_where_it_would_run_and_pointed_out_elsewhere(place: str, tmp_path: Path):
+    program = Program(PROGRAM.python, PROGRAM.neutral, (Path(place),))
     with pytest.raises(InputError, match=f"{place}: temporary"):
-        unit_of(program=Program(PROGRAM.python, PROGRAM.neutral, (Path(place),)))
+        truck_plan(Path("/"), program=program)
+    assert truck_plan(tmp_path, program=program).notes[-1].startswith(f"{place}: temporary")
 
 
 def test_a_path_systemd_would_split_is_refused():
