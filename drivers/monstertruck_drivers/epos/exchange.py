@@ -168,12 +168,12 @@ class Exchanger:
     async def _transact(self, request: Frame, *, answered: bool = True) -> Frame | None:
         await self.finish()
         await self.settle()
-        self._flight = asyncio.create_task(self._run(request, answered))
-        self._flight.add_done_callback(_retrieve)
+        self._flight = flight = asyncio.create_task(self._run(request, answered))
+        flight.add_done_callback(_retrieve)
         try:
-            return await asyncio.shield(self._flight)
+            return await asyncio.shield(flight)
         finally:
-            if self._flight is not None and self._flight.done():
+            if flight.done() and self._flight is flight:
                 self._flight = None  # its error's traceback holds this exchanger
 
     async def settle(self) -> None:
