@@ -23,6 +23,7 @@ from monstertruck_estimation.slam.registration import register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.se2 import between, compose, inverse, rotation
 from monstertruck_estimation.slam.submap import merged
+from monstertruck_estimation.slam.visibility import contradiction
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ QUERY_CELL: Final = 0.1
 """About one of their points is used per square of this edge, m."""
 QUERY_POINTS: Final = 320
 """Points of the query at most."""
-PLACE_KEYS: Final = 30
+PLACE_KEYS: Final = 60
 """Key scans of the place it is searched in, at most."""
 LEAST_SCORE: Final = 0.45
 """Mean likelihood of surroundings found again."""
@@ -56,7 +57,9 @@ LEAST_RATIO: Final = 0.02
 """Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
 FARTHEST: Final = 0.3
 """The fine fit ends this near to the coarse one, m."""
-RIVAL: Final = 0.92
+CONTRADICTION: Final = 0.15
+"""Share of the points looked through by scans of the other side, from which a place is another one."""
+RIVAL: Final = 0.9
 """A second place this nearly as good makes the first one worthless."""
 APART: Final = 1.0
 """Distance at which places are different, m."""
@@ -65,7 +68,7 @@ LEAST_LIKENESS: Final = 0.8
 FLOOR: Final = (0.03, 0.03, 0.01)
 """Standard deviation of a closure, m and rad: its submaps are not rigid."""
 WITNESSES: Final = 3
-"""Hits that must agree before a wide search is believed."""
+"""Hits that must agree before a wide search is believed, and so many more for each that contradicts."""
 BASELINE: Final = 1.0
 """Way between the first and the last of them, m."""
 CONSISTENT: Final = 11.3
@@ -154,12 +157,15 @@ class LoopCloser:
         """Look for ``query``, the surroundings of the newest key scan, in those of ``candidate``."""
         self.searches += 1
         newest = len(keymap) - 1
-        numbers = keymap.around(candidate, PLACE_KEYS)
+        window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
+        # All of the window, not only what is round the candidate: a place that looks alike must not win by default.
+        numbers = keymap.sure(candidate)
         numbers = numbers[~np.isin(numbers, own)]
+        numbers = numbers[_distance(keymap, newest)[numbers] < window[0] + keymap.config.local_reach]
         if not len(numbers):
             return None
+        numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
         submap = keymap.submap(numbers)
-        window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
         guess = keymap.poses[newest]
         peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, LEAST_SCORE, APART)
@@ -170,8 +176,11 @@ class LoopCloser:
         moved = between(peak.pose, fit.pose)
         if fit.overlap < LEAST_OVERLAP or ratio < LEAST_RATIO or math.hypot(moved[0], moved[1]) > FARTHEST:
             return None
-        near = keymap.poses[numbers, :2] - fit.pose[:2]
-        origin = int(numbers[np.argmin(np.hypot(near[:, 0], near[:, 1]))])
+        off = keymap.poses[numbers, :2] - fit.pose[:2]
+        near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
+        if _contradicted(keymap, own, newest, near, fit.pose):
+            return None
+        origin = int(near[0])
         # The information is about x, y in map; the relation is in the frame of its origin.
         turn = np.eye(3)
         turn[:2, :2] = rotation(keymap.poses[origin, 2])
@@ -180,10 +189,12 @@ class LoopCloser:
 
     def _believed(self, keymap: KeyMap, hit: _Hit, window: tuple[float, float]) -> bool:
         """Add ``hit`` and what agrees with it to the graph if that is enough, and if the graph bears it."""
-        witnesses = [hit, *self._agreeing(keymap, hit)]
+        agreeing, against = self._compared(keymap, hit)
+        witnesses = [hit, *agreeing]
         self._hits.append(hit)
         sure = window[0] <= SURE[0] and window[1] <= SURE[1]
-        if not sure and (len(witnesses) < WITNESSES or _way(keymap, witnesses) < BASELINE):
+        enough = len(witnesses) >= WITNESSES * (1 + against) and _way(keymap, witnesses) >= BASELINE
+        if not sure and not enough:
             return False
         if not self._added(keymap, witnesses):
             return False
@@ -191,13 +202,13 @@ class LoopCloser:
         self._hits = [other for other in self._hits if id(other) not in used]
         return True
 
-    def _agreeing(self, keymap: KeyMap, hit: _Hit) -> list[_Hit]:
-        """Earlier hits that form a consistent loop with ``hit``."""
+    def _compared(self, keymap: KeyMap, hit: _Hit) -> tuple[list[_Hit], int]:
+        """Earlier hits that form a consistent loop with ``hit``, and the number of those that contradict it."""
         if not self._hits:
-            return []
+            return [], 0
         at_target, _ = keymap.drift(hit.target)
         at_origin, _ = keymap.drift(hit.origin)
-        result = []
+        agreeing, against = [], 0
         for other in self._hits:
             if other.target == hit.target:
                 continue
@@ -210,8 +221,10 @@ class LoopCloser:
             if not place <= VAGUE:
                 continue
             if (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT:
-                result.append(other)
-        return result
+                agreeing.append(other)
+            else:
+                against += 1
+        return agreeing, against
 
     def _added(self, keymap: KeyMap, hits: list[_Hit]) -> bool:
         """Add the hits and optimise; take them back if they do not hold or break what held."""
@@ -238,6 +251,13 @@ def _window(covariance: Array) -> tuple[float, float]:
     """Half widths of the search, m and rad, for this drift."""
     place, turn = deviations(covariance)
     return WINDOW * place + MARGIN[0], WINDOW * turn + MARGIN[1]
+
+
+def _contradicted(keymap: KeyMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array) -> bool:
+    """Whether the scans of ``own`` and ``near`` looked through each other's walls, were ``newest`` at ``pose``."""
+    placed = compose(pose, between(keymap.poses[newest], keymap.poses[own]))
+    mine, theirs = ([keymap.keys[k].scan for k in numbers] for numbers in (own, near))
+    return contradiction(mine, placed, theirs, keymap.poses[near]) > CONTRADICTION
 
 
 def _surroundings(keymap: KeyMap, numbers: NDArray[np.intp], centre: int) -> Scan:

@@ -93,12 +93,16 @@ class KeyMap:
         """Bound of the drift against ``source``: covariances in its frame, and summed variances."""
         return drift(self.poses, self.edges.edges(), self.edges.spread, source)
 
+    def sure(self, source: int) -> Numbers:
+        """Numbers, rising, of the key scans that are sure against ``source``."""
+        _, far = self.drift(source)
+        return np.flatnonzero(far <= self.config.local_spread**2)
+
     def around(self, source: int, most: int, reach: float | None = None) -> Numbers:
         """Numbers of the key scans near ``source`` that are sure against it, nearest first."""
-        _, far = self.drift(source)
-        centre = self.poses[source]
-        off = np.hypot(self.poses[:, 0] - centre[0], self.poses[:, 1] - centre[1])
-        near = np.flatnonzero((far <= self.config.local_spread**2) & (off <= (reach or self.config.local_reach)))
+        near, centre = self.sure(source), self.poses[source]
+        off = self.poses[near, :2] - centre[:2]
+        near = near[np.hypot(off[:, 0], off[:, 1]) <= (reach or self.config.local_reach)]
         return near[np.argsort(self._closeness(near, centre), kind="stable")][:most]
 
     def local(self) -> Numbers:
