@@ -4,13 +4,14 @@ Residual of an edge: the pose of ``target`` in the frame of ``origin`` minus its
 dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): switchable constraints in closed form.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import splu
 
@@ -121,61 +122,88 @@ def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
 
 
 class _Pattern:
-    """The sparse normal equations of one set of edges, assembled anew for every step."""
+    """The sparse normal equations of one set of edges: ordered once for little fill, assembled anew for every step."""
 
     def __init__(self, edges: Edges, count: int, fixed: int) -> None:
-        self._size = 3 * count
-        a, b = 3 * edges.origin, 3 * edges.target
-        k = np.arange(3)
-        rows, columns = [], []
-        for left, right in ((a, a), (a, b), (b, a), (b, b)):
-            rows.append(np.broadcast_to((left[:, None] + k)[:, :, None], (len(edges), 3, 3)))
-            columns.append(np.broadcast_to((right[:, None] + k)[:, None, :], (len(edges), 3, 3)))
-        diagonal = np.arange(self._size)
-        self._rows = np.concatenate([r.ravel() for r in rows] + [diagonal])
-        self._columns = np.concatenate([c.ravel() for c in columns] + [diagonal])
-        self._held = slice(3 * fixed, 3 * fixed + 3)
+        self._count = count
+        place = _ordering(edges, count)
+        self._place, self._fixed = place, int(place[fixed])
+        a, b = place[edges.origin], place[edges.target]
+        own = np.arange(count)
+        rows = np.concatenate((a, a, b, b, own))
+        columns = np.concatenate((a, b, a, b, own))
+        keys = rows * count + columns
+        unique, slots = np.unique(keys, return_inverse=True)
+        self._slots = np.ascontiguousarray(slots[: 4 * len(edges)].reshape(4, -1).T)
+        self._diagonal = slots[4 * len(edges) :]
+        self._columns = unique % count
+        self._offsets = np.searchsorted(unique, np.arange(count + 1) * count)
         self._a, self._b = a, b
 
     def solve(self, poses: Array, edges: Edges, off: Array, weights: Array, damping: float) -> Array:
         """One damped Gauss-Newton step, shape (n, 3)."""
-        by_origin, by_target = _jacobians(poses[edges.origin], poses[edges.target])
-        weighted = edges.information * weights[:, None, None]
-        from_origin = np.einsum("nji,njk->nik", by_origin, weighted)
-        from_target = np.einsum("nji,njk->nik", by_target, weighted)
-        blocks = [
-            from_origin @ by_origin,
-            from_origin @ by_target,
-            from_target @ by_origin,
-            from_target @ by_target,
-        ]
-        gradient = np.zeros(self._size)
-        for first, factor in ((self._a, from_origin), (self._b, from_target)):
-            pull = np.einsum("nij,nj->ni", factor, off)
-            for k in range(3):
-                gradient += np.bincount(first + k, weights=pull[:, k], minlength=self._size)
-        ground = np.full(self._size, damping)
-        ground[self._held] = 1e12
-        values = np.concatenate([block.ravel() for block in blocks] + [ground])
-        matrix = csc_matrix((values, (self._rows, self._columns)), shape=(self._size, self._size))
-        factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0})
-        return -np.asarray(factors.solve(gradient)).reshape(-1, 3)
+        ground = damping * np.eye(3)
+        data = np.zeros((len(self._columns), 3, 3))
+        data[self._diagonal] = ground
+        data[self._diagonal[self._fixed]] = 1e12 * np.eye(3)
+        gradient = np.zeros((self._count, 3))
+        ends = poses[edges.origin], poses[edges.target]
+        _assemble(*ends, off, edges.information, weights, self._a, self._b, self._slots, data, gradient)
+        rows = bsr_matrix((data, self._columns, self._offsets)).tocsr()
+        # Symmetric: the rows are the columns.
+        matrix = csc_matrix((rows.data, rows.indices, rows.indptr), shape=rows.shape)
+        factors = splu(matrix, permc_spec="NATURAL", options={"SymmetricMode": True, "DiagPivotThresh": 0.0})
+        return -np.asarray(factors.solve(gradient.ravel())).reshape(-1, 3)[self._place]
 
 
-def _jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
-    """Derivatives, shape (n, 3, 3), of ``between`` by both poses."""
-    c, s = np.cos(origin[:, 2]), np.sin(origin[:, 2])
-    dx, dy = target[:, 0] - origin[:, 0], target[:, 1] - origin[:, 1]
-    by_origin = np.zeros((len(origin), 3, 3))
-    by_target = np.zeros((len(origin), 3, 3))
-    by_target[:, 0, 0], by_target[:, 0, 1] = c, s
-    by_target[:, 1, 0], by_target[:, 1, 1] = -s, c
-    by_target[:, 2, 2] = 1.0
-    by_origin[:, :2, :2] = -by_target[:, :2, :2]
-    by_origin[:, 0, 2] = -s * dx + c * dy
-    by_origin[:, 1, 2] = -c * dx - s * dy
-    by_origin[:, 2, 2] = -1.0
-    return by_origin, by_target
+def _ordering(edges: Edges, count: int) -> Index:
+    """Place of every pose among the unknowns, shape (count,), by minimum degree on the graph of the poses."""
+    own = np.arange(count)
+    rows = np.concatenate((edges.origin, edges.target, own))
+    columns = np.concatenate((edges.target, edges.origin, own))
+    ones = np.concatenate((np.full(2 * len(edges), -1.0), np.full(count, 2.0 * len(edges) + 1.0)))
+    pattern = csc_matrix((ones, (rows, columns)), shape=(count, count))
+    factors = splu(pattern, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0})
+    return np.asarray(factors.perm_c, dtype=np.int64)
+
+
+@njit(cache=True)
+def _assemble(  # type: ignore[no-untyped-def] # noqa: ANN202
+    origins,  # noqa: ANN001
+    targets,  # noqa: ANN001
+    off,  # noqa: ANN001
+    information,  # noqa: ANN001
+    weights,  # noqa: ANN001
+    first,  # noqa: ANN001
+    second,  # noqa: ANN001
+    slots,  # noqa: ANN001
+    data,  # noqa: ANN001
+    gradient,  # noqa: ANN001
+):
+    """Add every edge's blocks to ``data`` at its four ``slots``, and its pull to ``gradient``."""
+    by_origin, by_target = np.zeros((3, 3)), np.zeros((3, 3))
+    by_origin[2, 2], by_target[2, 2] = -1.0, 1.0
+    for e in range(first.size):
+        c, s = math.cos(origins[e, 2]), math.sin(origins[e, 2])
+        dx, dy = targets[e, 0] - origins[e, 0], targets[e, 1] - origins[e, 1]
+        by_target[0, 0], by_target[0, 1], by_target[1, 0], by_target[1, 1] = c, s, -s, c
+        by_origin[0, 0], by_origin[0, 1], by_origin[1, 0], by_origin[1, 1] = -c, -s, s, -c
+        by_origin[0, 2], by_origin[1, 2] = -s * dx + c * dy, -c * dx - s * dy
+        for i in range(3):
+            for m in range(3):
+                left, right = 0.0, 0.0
+                for k in range(3):
+                    left += by_origin[k, i] * information[e, k, m]
+                    right += by_target[k, i] * information[e, k, m]
+                left *= weights[e]
+                right *= weights[e]
+                gradient[first[e], i] += left * off[e, m]
+                gradient[second[e], i] += right * off[e, m]
+                for j in range(3):
+                    data[slots[e, 0], i, j] += left * by_origin[m, j]
+                    data[slots[e, 1], i, j] += left * by_target[m, j]
+                    data[slots[e, 2], i, j] += right * by_origin[m, j]
+                    data[slots[e, 3], i, j] += right * by_target[m, j]
 
 
 def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array, Array]:
