@@ -96,14 +96,15 @@ class KeyMap:
     def sure(self, source: int) -> Numbers:
         """Numbers, rising, of the key scans that are sure against ``source``."""
         _, far = self.drift(source)
-        return np.flatnonzero(far <= self.config.local_spread**2)
+        return np.asarray(np.flatnonzero(far <= self.config.local_spread**2))
 
     def around(self, source: int, most: int, reach: float | None = None) -> Numbers:
         """Numbers of the key scans near ``source`` that are sure against it, nearest first."""
         near, centre = self.sure(source), self.poses[source]
         off = self.poses[near, :2] - centre[:2]
         near = near[np.hypot(off[:, 0], off[:, 1]) <= (reach or self.config.local_reach)]
-        return near[np.argsort(self._closeness(near, centre), kind="stable")][:most]
+        order = np.argsort(self._closeness(near, centre), kind="stable")
+        return np.asarray(near[order][:most])
 
     def local(self) -> Numbers:
         """Numbers, rising, of the key scans that make the submap around the newest one."""
