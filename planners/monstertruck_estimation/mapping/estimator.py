@@ -1,6 +1,7 @@
 """From one scan to one estimate: preparation, mapping, and what is told about it."""
 
 import math
+from functools import partial
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -137,7 +138,9 @@ class MappingEstimator:
     def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
         """See ``Estimator``."""
         odom = None if inputs.odom is None else np.array(inputs.odom)
-        step = self.mapper.step(scan, inputs.stamp, odom)
+        swept = odom is None and inputs.time_increment > 0
+        again = partial(prepared, inputs, self.mapper.config.longest) if swept else None
+        step = self.mapper.step(scan, inputs.stamp, odom, again)
         if step is None:
             return None
         accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.map) == 1)
@@ -148,7 +151,7 @@ class MappingEstimator:
         self.counts["rejected"] += Event.REJECTED in step.events
         self._moved |= Event.CLOSED in step.events
         if accepted:
-            self.painter.add(scan, step.stamp, step.pose, inputs.mount)
+            self.painter.add(step.scan, step.stamp, step.pose, inputs.mount)
             if inputs.odom is not None:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
         standing = Standing.LOST if self._misfits >= LOST_AFTER else standing_of(step.match, Standing.MAPPING)

@@ -1,6 +1,7 @@
 """The mapper: scans and odometry in, poses, map and events out. Deterministic; no clock, no I/O."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -12,7 +13,7 @@ from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.frontend import DOUBTFUL, LEAST_PAIRS, FrontEnd, Match, Planar, Verdict, rejected
 from monstertruck_estimation.slam.keymap import KeyMap
-from monstertruck_estimation.slam.motion import MotionModel
+from monstertruck_estimation.slam.motion import MotionModel, velocity
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.store import Trail
@@ -20,7 +21,10 @@ from monstertruck_estimation.slam.submap import Submap
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
+SWIFT: Final = (0.02, 0.5)
+"""Scans this far apart tell the velocity during a scan, s."""
 PATIENCE: Final = 3
 """A doubtful scan joins the map only if this many in a row are: a single one may have a wrong stamp or odometry."""
 
@@ -48,6 +52,8 @@ class Step:
     """Shape (3, 3): of ``pose`` against the map around it."""
     match: Match
     """How the scan fitted; its pose is that before a closure at this step."""
+    scan: Scan
+    """The points as they were used last."""
     events: tuple[Event, ...] = ()
 
 
@@ -75,17 +81,21 @@ class Mapper:
         self._doubts = 0
 
     @property
-    def twist(self) -> tuple[float, float, float]:
+    def twist(self) -> Vector:
         """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), for the next one's motion distortion."""
         return self._motion.twist
 
-    def step(self, scan: Scan, stamp: int, odom: Array | None = None) -> Step | None:
+    def step(
+        self, scan: Scan, stamp: int, odom: Array | None = None, again: Callable[[Vector], Scan] | None = None
+    ) -> Step | None:
         """Take one scan.
 
         Args:
-            scan: points in base at ``stamp``.
+            scan: points in base at ``stamp``, their motion distortion undone by odometry or by ``twist``.
             stamp: ns; a scan that is not later than the one before is left out (None).
             odom: shape (3,), pose of base in odom at ``stamp``; None predicts from the motion so far.
+            again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): where odometry does
+                not tell it, the scan is matched a second time by the motion that the first match found.
         """
         if self._stamp is not None and stamp <= self._stamp:
             return None
@@ -97,6 +107,9 @@ class Mapper:
             match = rejected(guess, covariance, Verdict.EMPTY)
         else:
             match = self._front.locate(scan, delta, guess, covariance, self._submap)
+            if again is not None and match.accepted and SWIFT[0] <= dt <= SWIFT[1]:
+                scan = again(velocity(between(self._pose, match.pose), dt))
+                match = self._front.locate(scan, delta, guess, covariance, self._submap)
         doubtful = not match.accepted or match.overlap < DOUBTFUL
         self._doubts = self._doubts + 1 if doubtful else 0
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
@@ -109,7 +122,7 @@ class Mapper:
             self._trail.append(stamp, newest, between(self.map.poses[newest], self._pose))
         odom_now = self._motion.odom
         correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
-        return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, events)
+        return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, scan, events)
 
     def finish(self) -> None:
         """Register all key scans jointly (seconds of work): for the end of a run, or a robot that stands."""

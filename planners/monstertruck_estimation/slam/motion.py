@@ -24,6 +24,14 @@ FIT_NOISE: Final = 0.01
 """Standard deviation of a match itself, m."""
 
 
+def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
+    """Velocity in base (vx, vy, wz; m/s, rad/s) that makes the way ``delta``, shape (3,), in ``dt`` s; 0 if dt is."""
+    if dt <= 0:
+        return 0.0, 0.0, 0.0
+    vx, vy, wz = (delta / dt).tolist()
+    return vx, vy, wz
+
+
 class MotionModel:
     """Predicts the motion between two scans, and learns from the matches how good odometry is.
 
@@ -54,10 +62,7 @@ class MotionModel:
     @property
     def twist(self) -> tuple[float, float, float]:
         """Velocity of base between the last two scans (vx, vy, wz; m/s, rad/s)."""
-        if self._dt <= 0:
-            return 0.0, 0.0, 0.0
-        vx, vy, wz = (self._delta / self._dt).tolist()
-        return vx, vy, wz
+        return velocity(self._delta, self._dt)
 
     def predict(self, dt: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""

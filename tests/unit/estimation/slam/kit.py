@@ -28,16 +28,19 @@ CORRIDOR = [((-50.0, -1.0), (50.0, -1.0)), ((-50.0, 1.0), (50.0, 1.0))]
 
 
 def ranges(walls, pose, geometry=LIDAR, beams=BEAMS, noise=0.0, rng=None):
-    """Exact ranges by intersection of every beam with every wall, inf where none is hit."""
-    sensor = compose(np.asarray(pose, float), np.array(geometry.mount))
-    angles = sensor[2] + geometry.start_angle + geometry.angle_increment * np.arange(beams)
-    ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    a = np.array([wall[0] for wall in walls]) - sensor[:2]
-    along = np.array([wall[1] for wall in walls]) - np.array([wall[0] for wall in walls])
-    cross = ways[:, None, 0] * along[None, :, 1] - ways[:, None, 1] * along[None, :, 0]
+    """Exact ranges by intersection of every beam with every wall, inf where none is hit.
+
+    ``pose`` is the base's, shape (3,), or its own for every beam, shape (beams, 3).
+    """
+    sensor = compose(np.broadcast_to(np.asarray(pose, float), (beams, 3)), np.array(geometry.mount))
+    angles = sensor[:, 2] + geometry.start_angle + geometry.angle_increment * np.arange(beams)
+    ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)[:, None]
+    a = np.array([wall[0] for wall in walls])[None] - sensor[:, None, :2]
+    along = (np.array([wall[1] for wall in walls]) - np.array([wall[0] for wall in walls]))[None]
+    cross = ways[..., 0] * along[..., 1] - ways[..., 1] * along[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = (a[:, 0] * along[:, 1] - a[:, 1] * along[:, 0])[None] / cross
-        share = (a[None, :, 0] * ways[:, None, 1] - a[None, :, 1] * ways[:, None, 0]) / cross
+        far = (a[..., 0] * along[..., 1] - a[..., 1] * along[..., 0]) / cross
+        share = (a[..., 0] * ways[..., 1] - a[..., 1] * ways[..., 0]) / cross
     hit = (np.abs(cross) > 1e-12) & (far > 0) & (share >= 0) & (share <= 1)
     result = np.where(hit, far, np.inf).min(axis=1)
     if rng is not None:

@@ -1,3 +1,6 @@
+import dataclasses
+import functools
+import itertools
 import math
 
 import numpy as np
@@ -7,8 +10,20 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.kiss import Kiss
 from monstertruck_estimation.slam.mapper import Event, Mapper
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
-from monstertruck_estimation.slam.se2 import compose
-from tests.unit.estimation.slam.kit import CORRIDOR, LIDAR, ROOM, box, drifting, drive, errors, ranges, rounds, scan
+from monstertruck_estimation.slam.se2 import between, compose
+from tests.unit.estimation.slam.kit import (
+    BEAMS,
+    CORRIDOR,
+    LIDAR,
+    ROOM,
+    box,
+    drifting,
+    drive,
+    errors,
+    ranges,
+    rounds,
+    scan,
+)
 
 # A ring of corridors too long for the lidar to see across, with something to see everywhere.
 BLOCKS = (
@@ -90,6 +105,24 @@ def test_without_wheels_the_motion_so_far_is_the_guess():
     assert errors(mapper.trajectory()[1], truth).max() < 0.06
     assert steps[-1].map_from_odom is None
     assert mapper.twist[0] == pytest.approx(0.5, abs=0.15)
+
+
+def test_the_distortion_of_a_swept_scan_is_undone_by_the_motion_it_shows():
+    jerky = np.cumsum(20 + 18 * np.sin(1.2 * np.arange(60))).astype(int)
+    truth = rounds(1500, 1.0)[jerky]
+    swept = dataclasses.replace(LIDAR, time_increment=0.08 / BEAMS)
+    share = np.linspace(0.0, 0.8, BEAMS)[:, None]
+    scans = []
+    for now, then in itertools.pairwise(truth):
+        scans.append(ranges(ROOM, compose(now, share * between(now, then)), swept))
+    off = []
+    for twice in (False, True):
+        mapper = Mapper()
+        for k, values in enumerate(scans):
+            again = functools.partial(prepare, values, swept)
+            mapper.step(again(mapper.twist), int(k * 1e8), None, again if twice else None)
+        off.append(errors(mapper.trajectory()[1], truth[:-1]).mean())
+    assert off[1] < 0.8 * off[0]
 
 
 def test_a_corridor_does_not_collapse():
