@@ -198,7 +198,7 @@ class Exchanger:
         self.began = self._clock.now()
         try:
             frame = await self._converse(request, answered)
-        except _BusyError as error:
+        except (_BusyError, _HeldUpError) as error:
             raise DeviceTimeoutError(str(error)) from None
         except BaseException:
             self.quiet_until = self._quiet()
@@ -279,10 +279,18 @@ class Exchanger:
         return decode_body(ANSWER, head + await self._exactly(body_size(head[0]), ACKNOWLEDGE_TIMEOUT))
 
     async def _exactly(self, count: int, timeout: float) -> bytes:
+        asked = self._clock.now()
         try:
-            return await self._link.exactly(count, timeout)
+            data = await self._link.exactly(count, timeout)
         except TimeoutError:
+            self._check_held_up(asked)
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
+        self._check_held_up(asked)
+        return data
+
+    def _check_held_up(self, asked: int) -> None:
+        if (waited := (self._clock.now() - asked) / SECOND) >= QUIET:
+            raise _HeldUpError(f"{self._link.name}: this process stood still for {waited:.1f} s")
 
 
 def _retrieve(flight: "asyncio.Task[Frame | None]") -> None:
@@ -293,3 +301,7 @@ def _retrieve(flight: "asyncio.Task[Frame | None]") -> None:
 
 class _BusyError(Exception):
     """The controller refused the opcode again and again; nothing is half sent."""
+
+
+class _HeldUpError(Exception):
+    """The wait outlasted its own limit: the controller has long forgotten this exchange and hears a new one at once."""

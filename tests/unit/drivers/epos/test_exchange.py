@@ -11,7 +11,7 @@ from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger, ObjectError
 from monstertruck_drivers.epos.protocol import Segment, answer, segment_request
 from monstertruck_drivers.link import Link
-from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.clock import SECOND, VirtualClock, VirtualLoop, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from tests.unit.drivers.epos.rig import on_line
 
@@ -26,13 +26,23 @@ class Peer:
     def __init__(self, clock: VirtualClock) -> None:
         self.written: list[tuple[float, bytes]] = []
         self.replies: list[bytes] = []
+        self.stand_still_before: int | None = None
+        """Number of the reply before which the host's process does not run for 1.5 s."""
         self._clock = clock
         self.link = Link("peer", self._take, lambda: None)
 
     def _take(self, data: bytes) -> None:
         self.written.append((self._clock.now() / SECOND - 1, data))
-        if self.replies:
+        if len(self.written) - 1 == self.stand_still_before:
+            asyncio.get_running_loop().call_soon(self._stand_still)
+        elif self.replies:
             self.link.feed(self.replies.pop(0))
+
+    def _stand_still(self) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        loop.jump(1.5)
+        self.link.feed(self.replies.pop(0))
 
 
 def with_peer(*replies: bytes) -> Callable[[Callable[[Peer, Exchanger], Coroutine[Any, Any, None]]], None]:
@@ -206,6 +216,20 @@ def test_after_a_timeout_nothing_is_sent_for_550_ms():
         assert peer.written[2][0] - failed == pytest.approx(0.55, abs=0.001)
 
     with_peer(O, b"")(test)
+
+
+@pytest.mark.parametrize("reply", range(3))
+def test_after_a_standstill_of_this_process_a_new_exchange_begins_at_once(reply: int):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        peer.stand_still_before = reply
+        with pytest.raises(DeviceTimeoutError, match=r"stood still for 1\.5 s"):
+            await line.read(od.STATUSWORD)
+        peer.replies = [O, O + b"\0", ANSWER]
+        begun = len(peer.written)
+        assert await line.read(od.STATUSWORD) == DISABLED
+        assert peer.written[begun][0] == pytest.approx(1.5, abs=0.001)
+
+    with_peer(O, O + b"\0", ANSWER)(test)
 
 
 def test_late_bytes_prolong_the_silence_and_are_never_taken_for_an_answer():
