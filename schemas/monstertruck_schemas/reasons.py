@@ -136,6 +136,8 @@ class Reason(StrEnum):
     NO_MAP = "no_map", 39, "no map or no pose to plan with yet"
     GOAL_ACCEPTED = "goal_accepted", 0, "a goal was taken on"
     ROUTE_FOUND = "route_found", 0, "a route was planned"
+    ROUTE_DEFORMED = "route_deformed", 0, "the way leads round something that stands on the route"
+    ROUTE_FREE = "route_free", 0, "the route is driven as it was planned again"
     RECOVERING = "recovering", 0, "a way out of trouble is tried"
     PAUSED = "paused", 0, "the way to the goal is interrupted"
     RESUMED = "resumed", 0, "the way to the goal goes on"

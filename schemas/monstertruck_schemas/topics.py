@@ -96,7 +96,7 @@ CAMERA: Final = Topic(
     2.0,
     foxglove="foxglove.CompressedImage",
 )
-STABILISER: Final = Topic("sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 50, 0.2)
+STABILISER: Final = Topic("sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 25, 0.2)
 
 ODOMETRY: Final = Topic(
     "state/odometry",

@@ -133,16 +133,17 @@ class Session:
         # A damaged length must not make the parser wait for more than can come.
         parser = Parser(longest=max(len(request) - 4, count + 2))
         echo_due = self.echo
-        try:
-            async with self._clock.deadline(self._timeout(len(request) + 6 + count)):
-                while True:
-                    data = await self._link.read()
-                    self.strange += len(data)
-                    for packet in parser.feed(data):
-                        self.strange -= len(packet.params) + 6
-                        if echo_due and packet.encode() == request:
-                            echo_due = False
-                        elif wanted(packet):
-                            return packet
-        except TimeoutError:
-            return None
+        end = self._clock.now() + round(self._timeout(len(request) + 6 + count) * SECOND)
+        while (left := end - self._clock.now()) > 0:
+            try:
+                data = await self._link.read(left / SECOND)
+            except TimeoutError:
+                return None
+            self.strange += len(data)
+            for packet in parser.feed(data):
+                self.strange -= len(packet.params) + 6
+                if echo_due and packet.encode() == request:
+                    echo_due = False
+                elif wanted(packet):
+                    return packet
+        return None

@@ -94,6 +94,7 @@ class Run:
     ) -> None:
         steps = np.diff(points, axis=0)
         self._points = points
+        self._steps = steps
         self._lengths = np.hypot(steps[:, 0], steps[:, 1])
         self._tangents = np.arctan2(steps[:, 1], steps[:, 0])
         self._s = np.concatenate(([0.0], np.cumsum(self._lengths)))
@@ -135,12 +136,10 @@ class Run:
         """Nearest point between ``low`` and ``high`` metres."""
         first = max(int(np.searchsorted(self._s, low, side="right")) - 1, 0)
         end = max(int(np.searchsorted(self._s, high, side="left")), first + 1)
-        start, step = self._points[first:end], np.diff(self._points[first : end + 1], axis=0)
-        length = self._lengths[first:end]
-        start = start[: len(length)]
+        step, length = self._steps[first:end], self._lengths[first:end]
+        start, s0 = self._points[first : first + len(step)], self._s[first : first + len(step)]
         along = ((x - start[:, 0]) * step[:, 0] + (y - start[:, 1]) * step[:, 1]) / length
-        s0 = self._s[first : first + len(length)]
-        s = np.clip(s0 + np.clip(along, 0.0, length), low, high)
+        s = np.minimum(np.maximum(s0 + np.minimum(np.maximum(along, 0.0), length), low), high)
         share = ((s - s0) / length)[:, None]
         feet = start + share * step
         best = int(np.argmin(np.hypot(feet[:, 0] - x, feet[:, 1] - y)))

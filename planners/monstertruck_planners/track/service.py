@@ -90,8 +90,9 @@ class TrackerService:
         self._drive = drive
         self._tracker = tracker
         self._events = events
-        self._scanned: LaserScan | None = None
-        self._points = np.empty((0, 2))
+        self._seen: tuple[LaserScan, Line] | None = None
+        self._room = math.inf
+        """Clearance ahead on that line, in that scan."""
         self._followed: Path | None = None
         self._line: Line | None = None
         self._progress = Progress()
@@ -153,16 +154,20 @@ class TrackerService:
 
     def _clearance(self, pose: Odometry, now: int) -> float:
         """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
-        scan = None if self._scan is None else self._scan.latest
-        if scan is None or self._line is None or now - scan.received > SCAN.fresh_for() * SECOND:
+        scan, line = None if self._scan is None else self._scan.latest, self._line
+        if scan is None or line is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return math.inf
-        ahead = self._line.ahead(self._progress, self._config.reach, LOOKS)
+        if self._seen is None or self._seen[0] is not scan or self._seen[1] is not line:
+            self._seen, self._room = (scan, line), self._measure_room(scan, line, pose)
+        return self._room
+
+    def _measure_room(self, scan: LaserScan, line: Line, pose: Odometry) -> float:
+        ahead = line.ahead(self._progress, self._config.reach, LOOKS)
         c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
         dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
         poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
-        if scan is not self._scanned:
-            self._scanned, self._points = scan, scan_points(scan, self._lidar)
-        near = points_near(self._points, poses, self._footprint.circumscribed_radius + self._config.slow_clearance)
+        reach = self._footprint.circumscribed_radius + self._config.slow_clearance
+        near = points_near(scan_points(scan, self._lidar), poses, reach)
         return float(clearance_to_points(self._footprint, poses, near).min())
 
     def _feel(self, now: int) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from tests.unit.drivers.kit import DriverRig, Kept
 
 LEVEL = {1: 511.0, 2: 204.0}
 """Shafts with the lidar level."""
-FAST = Ax12Config(usb_latency=0.001)
+FAST = Ax12Config(usb_latency=0.001, rate=50.0)
 
 
 class Rig(DriverRig):

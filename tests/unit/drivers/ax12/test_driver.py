@@ -141,7 +141,7 @@ def test_a_slow_adapter_slows_the_rate_and_nothing_else():
             assert rig.joint("pitch") == pytest.approx(0.099, abs=0.02)
         assert rig.events.kept == []
 
-    on_bench(test, Ax12Config(), latency_s=0.016)
+    on_bench(test, Ax12Config(rate=50.0), latency_s=0.016)
 
 
 def test_timeouts_follow_the_adapter():
