@@ -41,7 +41,7 @@ def _ends(role: str, config: TruckConfig, bus: Bus) -> tuple[Any, ...]:
     """What a driver reads and writes, in the order its constructor takes them."""
     match role:
         case "lidar":
-            return (_scans(config, bus),)
+            return (scan_publisher(config, bus),)
         case "compass":
             return (bus.publisher(topics.COMPASS, Writer.DRIVER),)
         case "camera":
@@ -57,7 +57,7 @@ def _ends(role: str, config: TruckConfig, bus: Bus) -> tuple[Any, ...]:
             return commands, bus.publisher(topics.STEERING, Writer.DRIVER), battery
 
 
-def _scans(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
+def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
     """Where scans go: with the tilt of their plane, as far as compass and stabiliser tell it."""
     out = bus.publisher(topics.SCAN, Writer.DRIVER)
     if config.devices.compass is None:
