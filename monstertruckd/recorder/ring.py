@@ -1,21 +1,28 @@
-"""The newest messages in memory, by time and by size: what a black box is written from."""
+"""The newest messages in memory, by time and by size: what a black box is written from.
+
+Messages lie one behind the other in blocks of one size, each a number of its topic, its times and its payload. As
+objects of their own they would leave the heap in crumbs: an hour of driving then cost megabytes nobody used.
+"""
 
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from heapq import merge
-from itertools import chain, islice
 from operator import attrgetter
-from typing import Final
+from struct import Struct
+from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.topics import Topic
 from monstertruckd.recorder.file import Entry
 
-OVERHEAD: Final = 250
-"""Bytes an entry takes beside its payload: itself, its numbers, the header of its bytes, its place in the ring."""
-
-SEGMENT: Final = 64 * 1024
+BLOCK: Final = 256 * 1024
 """Bytes of entries that are freed together."""
+SHARE: Final = 32
+"""Part of the whole memory that a block takes at most."""
+
+_HEAD: Final = Struct("<qqqII")
+"""Log time, stamp, sequence, number of the topic, length of the payload."""
 
 PICTURES: Final = "foxglove.CompressedImage"
 JOURNAL: Final = "event"
@@ -35,16 +42,58 @@ class Span:
     """Between two pictures that are left of the older ones."""
 
 
+class _Block:
+    """Entries one behind the other."""
+
+    __slots__ = ("data", "used")
+
+    def __init__(self, size: int) -> None:
+        self.data = bytearray(size)
+        self.used = 0
+
+    def fits(self, entry: Entry) -> bool:
+        return self.used + _length(entry) <= len(self.data)
+
+    def append(self, entry: Entry, topic: int) -> None:
+        head, begin = self.used, self.used + _HEAD.size
+        _HEAD.pack_into(self.data, head, entry.log_time, entry.stamp, entry.sequence, topic, len(entry.payload))
+        self.used = begin + len(entry.payload)
+        self.data[begin : self.used] = entry.payload
+
+    def time(self, at: int) -> int:
+        """Log time of the entry that begins there."""
+        return int(_HEAD.unpack_from(self.data, at)[0])
+
+    def entry(self, at: int, topics: list[Topic[Any]]) -> Entry:
+        """The entry that begins there."""
+        log_time, stamp, sequence, topic, length = _HEAD.unpack_from(self.data, at)
+        begin = at + _HEAD.size
+        return Entry(topics[topic], log_time, stamp, sequence, bytes(self.data[begin : begin + length]))
+
+
+def _length(entry: Entry) -> int:
+    return _HEAD.size + len(entry.payload)
+
+
 @dataclass(frozen=True, slots=True)
 class _View:
     """Entries of one sort at one instant; what the ring does afterwards does not change it."""
 
-    segments: tuple[list[Entry], ...]
-    skipped: int
+    topics: list[Topic[Any]]
+    blocks: tuple[_Block, ...]
+    at: int
+    """Where the first entry begins in the first block."""
     count: int
 
     def __iter__(self) -> Iterator[Entry]:
-        return islice(chain.from_iterable(self.segments), self.skipped, self.skipped + self.count)
+        left, at = self.count, self.at
+        for block in self.blocks:
+            while left and at < block.used:
+                entry = block.entry(at, self.topics)
+                yield entry
+                at += _length(entry)
+                left -= 1
+            at = 0
 
 
 class Snapshot:
@@ -69,57 +118,68 @@ class Snapshot:
 
 
 class _Part:
-    """Entries of one sort, oldest first, in lists to which only the newest entries are added."""
+    """Entries of one sort, oldest first.
 
-    def __init__(self, seconds: float) -> None:
-        self.span = round(seconds * SECOND)
-        self._segments: deque[list[Entry]] = deque()
-        self._skipped = 0
-        """Entries of the first segment that are no longer kept."""
-        self._room = 0
-        """Bytes the last segment takes yet."""
+    Args:
+        seconds: how long they are kept.
+        block: bytes of a block; a larger entry gets one of its own.
+    """
+
+    def __init__(self, seconds: float, block: int) -> None:
+        self.size = 0
+        """Bytes of its blocks."""
+        self.oldest = self.newest = 0
+        """Log times of the first and the last entry, if there is one."""
+        self._span = round(seconds * SECOND)
+        self._block = block
+        self._topics: list[Topic[Any]] = []
+        self._numbers: dict[str, int] = {}
+        self._blocks: deque[_Block] = deque()
+        self._at = 0
+        """Where the first entry begins in the first block."""
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def first(self) -> Entry:
-        """The oldest entry."""
-        return self._segments[0][self._skipped]
-
-    @property
-    def last(self) -> Entry:
-        """The newest entry."""
-        return self._segments[-1][-1]
-
     def append(self, entry: Entry) -> None:
         """Add the newest entry."""
-        if self._room <= 0 or not self._segments:
-            self._segments.append([])
-            self._room = SEGMENT
-        self._segments[-1].append(entry)
-        self._room -= _bytes(entry)
+        if not self._blocks or not self._blocks[-1].fits(entry):
+            self._blocks.append(_Block(max(self._block, _length(entry))))
+            self.size += len(self._blocks[-1].data)
+        self._blocks[-1].append(entry, self._number(entry.topic))
+        self.newest = entry.log_time
+        if not self._count:
+            self.oldest = entry.log_time
         self._count += 1
 
     def popleft(self) -> Entry:
         """Take out the oldest entry."""
-        entry = self.first
-        self._skipped += 1
+        entry = self._blocks[0].entry(self._at, self._topics)
+        self._at += _length(entry)
         self._count -= 1
-        if self._skipped == len(self._segments[0]):
-            self._segments.popleft()
-            self._skipped = 0
+        if self._at == self._blocks[0].used:
+            self.size -= len(self._blocks.popleft().data)
+            self._at = 0
+        if self._count:
+            self.oldest = self._blocks[0].time(self._at)
         return entry
 
     def expired(self, now: int) -> Iterator[Entry]:
         """Take out what is too old."""
-        while self._count and now - self.first.log_time > self.span:
+        while self._count and now - self.oldest > self._span:
             yield self.popleft()
 
     def view(self) -> _View:
         """What is here now; copies no entries."""
-        return _View(tuple(self._segments), self._skipped, self._count)
+        return _View(self._topics, tuple(self._blocks), self._at, self._count)
+
+    def _number(self, topic: Topic[Any]) -> int:
+        number = self._numbers.get(topic.name)
+        if number is None:
+            number = self._numbers[topic.name] = len(self._topics)
+            self._topics.append(topic)
+        return number
 
 
 class Ring:
@@ -130,35 +190,38 @@ class Ring:
 
     Args:
         span: how long what is kept.
-        limit: bytes, ``OVERHEAD`` included; ``SEGMENT`` of each sort may be taken beside them.
+        limit: bytes, of whole blocks; the newest message of each sort stays even beyond them.
     """
 
     def __init__(self, span: Span, limit: int) -> None:
         self._limit = limit
-        self._rest = _Part(span.everything)
-        self._journal = _Part(span.journal)
-        self._fresh = _Part(span.pictures)
-        self._thinned = _Part(span.everything)
+        block = min(BLOCK, limit // SHARE)
+        self._rest = _Part(span.everything, block)
+        self._journal = _Part(span.journal, block)
+        self._fresh = _Part(span.pictures, block)
+        self._thinned = _Part(span.everything, block)
+        self._parts = (self._rest, self._journal, self._thinned, self._fresh)
         self._period = round(span.picture_period * SECOND)
         self._heads: dict[str, Entry] = {}
-        self.size = 0
-        """Bytes taken, ``OVERHEAD`` included."""
         self.lost = 0
         """Messages that had to go before their time."""
+
+    @property
+    def size(self) -> int:
+        """Bytes taken by blocks; the newest message of each retained topic comes on top."""
+        return sum(part.size for part in self._parts)
 
     def add(self, entry: Entry) -> None:
         """Take the newest message, and let go what is too old or too much."""
         self._part(entry).append(entry)
-        self.size += _bytes(entry)
         self._expire(entry.log_time)
         while self.size > self._limit and (crowded := self._fullest()) is not None:
             self._drop(crowded.popleft())
             self.lost += 1
 
     def snapshot(self) -> Snapshot:
-        """Everything kept; takes no longer however much it is than a list of its segments."""
-        parts = (self._rest, self._journal, self._thinned, self._fresh)
-        return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
+        """Everything kept; takes no longer however much it is than a list of its blocks."""
+        return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in self._parts))
 
     def _part(self, entry: Entry) -> _Part:
         if entry.topic.foxglove == PICTURES:
@@ -171,7 +234,7 @@ class Ring:
                 self._drop(entry)
         for picture in self._fresh.expired(now):
             kept = self._thinned
-            if kept and picture.log_time - kept.last.log_time < self._period:
+            if kept and picture.log_time - kept.newest < self._period:
                 self._drop(picture)
             else:
                 kept.append(picture)
@@ -182,13 +245,5 @@ class Ring:
         return next((part for part in parts if len(part) > 1), None)
 
     def _drop(self, entry: Entry) -> None:
-        self.size -= _bytes(entry)
         if entry.topic.retained:
-            if (before := self._heads.get(entry.topic.name)) is not None:
-                self.size -= _bytes(before)
             self._heads[entry.topic.name] = entry
-            self.size += _bytes(entry)
-
-
-def _bytes(entry: Entry) -> int:
-    return len(entry.payload) + OVERHEAD
