@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.cli.options import ENDPOINT, complete_topic
+from monstertruckd.cli.options import complete_topic
 from monstertruckd.cli.output import JsonOption, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
@@ -219,21 +219,3 @@ def needs_extra(name: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         text = f"{error.name} is not installed: it comes with the extra {name!r} (pip install 'monstertruckd[{name}]')"
         raise NotFoundError(text) from None
-
-
-def replay(
-    log: LogArgument,
-    robot: Annotated[str, typer.Option("--robot", "-r", help="Name to replay under.")] = "truck",
-    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = ENDPOINT,
-    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
-    topics: TopicsOption = None,
-) -> None:
-    """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber.
-
-    Ctrl-C or SIGTERM end it like its last message does, with exit code 0.
-    """
-    from monstertruckd.replay import replay_log
-
-    with suppress(KeyboardInterrupt), progress("replay", log.stat().st_size if log.exists() else None) as done:
-        count = replay_log(log, robot, endpoint, speed, topics, done)
-        remark(f"{count} messages replayed")

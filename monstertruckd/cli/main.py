@@ -19,6 +19,7 @@ from monstertruckd.cli import (
     orders,
     plan,
     plan_server,
+    replay,
     robot,
     service,
     usb,
@@ -66,7 +67,7 @@ app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
 app.command("plan-server")(plan_server.plan_server)
-app.command("replay")(logs.replay)
+app.command("replay")(replay.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)
 app.command("usb")(usb.usb)

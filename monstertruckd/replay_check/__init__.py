@@ -1,0 +1,6 @@
+"""What a robot would have made of a recorded run: its sensors once more through estimation, the outputs compared."""
+
+from monstertruckd.replay_check.check import check_log
+from monstertruckd.replay_check.result import Check
+
+__all__ = ["Check", "check_log"]

@@ -1,0 +1,163 @@
+"""Computes a log again and says how far that is from what was recorded.
+
+Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
+for bit. The estimation worker answers when it is done: on the virtual clock at a declared instant, so its outputs and
+what rests on them are expected bit for bit too; on the wall clock at an instant the log does not tell, so they may
+differ by ``WORKER_TOLERANCE``.
+"""
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.clock import SECOND, VirtualLoop
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import BY_NAME, Topic
+from monstertruckd.bus.local import TapCallback
+from monstertruckd.config.load import load_truck
+from monstertruckd.logs import LogMessage, open_log
+from monstertruckd.replay_check.chain import WORKER, Chain, early_ticks, outputs_of
+from monstertruckd.replay_check.comparison import TopicComparison
+from monstertruckd.replay_check.pace import PacedClock
+from monstertruckd.replay_check.recorded import Survey, preamble, recorded_config, survey
+from monstertruckd.replay_check.result import Check, Unreadable
+
+RESTS_ON_WORKER: Final = frozenset(
+    {*WORKER, *(topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE))}
+)
+"""Outputs a worker has a say in where the robot maps or localises."""
+WORKER_TOLERANCE: Final = 0.05
+"""Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""
+
+TOGETHER: Final = SECOND // 1000
+"""Ticks this close, ns, may have had their turn at once."""
+
+
+def check_log(
+    log: Path,
+    config: Path | None = None,
+    tolerance: float | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Check:
+    """Compute the outputs of ``log`` again and compare them.
+
+    Args:
+        log: file to read.
+        config: another configuration to compute with; None = the log's own.
+        tolerance: greatest difference that agrees, in SI units, instead of the ones above.
+        progress: told the bytes of the log read so far.
+
+    Raises:
+        NotFoundError: no such log, configuration or saved map.
+        InputError: the log holds no configuration, no sensors, no outputs, or begins in the middle of a run.
+        ConfigError: a configuration is refused.
+        WorkerError: the estimation worker failed.
+    """
+    reader = open_log(log)
+    found = survey(reader)
+    attachments, metadata = preamble(reader)
+    own = recorded_config(log, attachments)
+    used = own if config is None else load_truck(config)[0]
+    compared = outputs_of(own) | outputs_of(used)
+    _refuse_the_middle(log, found, compared)
+    virtual = int(metadata.get("real_offset_ns", 0)) == 0
+    exact = virtual or (own.slam is None and used.slam is None)
+    rows = {
+        topic.name: TopicComparison(topic, _tolerance(topic.name, tolerance, exact=exact), found.start)
+        for topic in topics.TOPICS
+        if topic.name in compared
+    }
+    unreadable: list[Unreadable] = []
+
+    async def main(clock: PacedClock) -> None:
+        chain = Chain(used, clock, early_ticks(own, found))
+        tap = chain.bus.tap(_into(rows, clock), (row.topic for row in rows.values()))
+        async with chain.running():
+            relevant = (entry for entry in reader if entry.topic in rows or chain.takes(entry.topic))
+            for bunch in _bunches(relevant, chain.ticks):
+                progress(reader.position)
+                await _feed(chain, bunch, rows, found, unreadable)
+            await chain.finish(found.end)
+            tap.close()
+
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(found.start)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, VirtualLoop)
+        runner.run(main(PacedClock(loop)))
+    end = max((found.newest[name].log_time for name in compared & found.newest.keys()), default=found.end)
+    return Check(
+        log,
+        config,
+        (found.end - found.start) / SECOND,
+        end,
+        tuple(rows.values()),
+        tuple(unreadable),
+        found.lost(),
+        found.damage,
+    )
+
+
+def _bunches(log: Iterable[LogMessage], ticks: Callable[[str], bool]) -> Iterator[list[LogMessage]]:
+    """Messages one by one; but outputs that show ticks together, as long as nothing else was recorded in between."""
+    bunch: list[LogMessage] = []
+    for entry in log:
+        ticking = ticks(entry.topic)
+        if bunch and not (ticking and entry.log_time - bunch[0].log_time <= TOGETHER):
+            yield bunch
+            bunch = []
+        bunch.append(entry)
+        if not ticking:
+            yield bunch
+            bunch = []
+    if bunch:
+        yield bunch
+
+
+async def _feed(
+    chain: Chain,
+    bunch: Sequence[LogMessage],
+    rows: Mapping[str, TopicComparison],
+    found: Survey,
+    unreadable: list[Unreadable],
+) -> None:
+    for entry in bunch:
+        if (row := rows.get(entry.topic)) is not None:
+            row.recorded(entry.sequence, entry.log_time, entry.payload)
+    entry = bunch[0]
+    if not chain.takes(entry.topic):
+        await chain.tick(bunch)
+        return
+    try:
+        message = entry.decode()
+    except TruckError as error:
+        at = (entry.log_time - found.start) / SECOND
+        unreadable.append(Unreadable(entry.topic, entry.sequence, at, str(error)))
+    else:
+        await chain.take(BY_NAME[entry.topic], message, entry.log_time)
+
+
+def _into(rows: Mapping[str, TopicComparison], clock: PacedClock) -> TapCallback:
+    def take(topic: Topic[Message], _: Message, payload: bytes) -> None:
+        rows[topic.name].recomputed(clock.now(), payload)
+
+    return take
+
+
+def _tolerance(topic: str, wanted: float | None, *, exact: bool) -> float:
+    if wanted is not None:
+        return wanted
+    return WORKER_TOLERANCE if topic in RESTS_ON_WORKER and not exact else 0.0
+
+
+def _refuse_the_middle(log: Path, found: Survey, compared: Collection[str]) -> None:
+    outputs = [entry for name, entry in found.first.items() if name in compared and name != topics.SCAN.name]
+    if not outputs:
+        raise InputError(f"{log}: holds no outputs of estimation to compare with")
+    for entry in outputs:
+        number = entry.decode().seq
+        if number > 0:
+            text = f"{entry.topic} begins with number {number}: expected the first part of a run, which begins with 0"
+            raise InputError(f"{log}: {text}")

@@ -1,0 +1,102 @@
+"""How far two messages of one topic are apart, in words an operator knows: metres, angles, other numbers, else text."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.transforms import conjugate, multiply, wrap_angle
+from monstertruck_schemas.base import Message, Pose2D, Schema
+from monstertruck_schemas.state import Grid, Transform
+
+HEADER: Final = frozenset({"stamp", "received", "seq"})
+ANGLES: Final = frozenset({"yaw", "roll", "pitch", "tilt", "front", "rear", "heading_error", "direction"})
+LENGTHS: Final = frozenset({"cross_track", "along", "length"})
+
+
+class Kind(StrEnum):
+    """What a difference is measured in."""
+
+    LENGTH = "m"
+    ANGLE = "rad"
+    NUMBER = "number"
+    TEXT = "text"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Of one field."""
+
+    kind: Kind
+    field: str
+    value: float
+    """In SI units; +inf where the two cannot be subtracted."""
+
+
+def differences(before: Message, after: Message) -> list[Difference]:
+    """Every field in which two messages differ, but for their headers."""
+    return [found for found in _walk("", before, after) if not found.value <= 0]
+
+
+def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
+    match a, b:
+        case Pose2D(), Pose2D():
+            yield Difference(Kind.LENGTH, name, math.hypot(b.x - a.x, b.y - a.y))
+            yield Difference(Kind.ANGLE, f"{name}.yaw", abs(wrap_angle(b.yaw - a.yaw)))
+        case Transform(), Transform():
+            yield from _transform(name, a, b)
+        case Grid(), Grid():
+            yield from _grid(a, b)
+        case Schema(), Schema() if type(a) is type(b):
+            for field in type(a).model_fields:
+                if field not in HEADER:
+                    yield from _walk(f"{name}.{field}".lstrip("."), getattr(a, field), getattr(b, field))
+        case np.ndarray(), np.ndarray():
+            yield _array(name, a, b)
+        case tuple(), tuple() if len(a) == len(b):
+            for index, (one, other) in enumerate(zip(a, b, strict=True)):
+                yield from _walk(f"{name}[{index}]", one, other)
+        case (bool(), _) | (_, bool()):
+            yield _text(name, a, b)
+        case ((int() | float()), (int() | float())):
+            yield _number(name, a, b)
+        case _:
+            yield _text(name, a, b)
+
+
+def _number(name: str, a: float, b: float) -> Difference:
+    last = name.rpartition(".")[2]
+    if last in ANGLES:
+        return Difference(Kind.ANGLE, name, abs(wrap_angle(b - a)))
+    return Difference(Kind.LENGTH if last in LENGTHS else Kind.NUMBER, name, 0.0 if a == b else abs(b - a))
+
+
+def _text(name: str, a: object, b: object) -> Difference:
+    return Difference(Kind.TEXT, name, 0.0 if a == b else math.inf)
+
+
+def _array(name: str, a: Any, b: Any) -> Difference:
+    if a.shape != b.shape:
+        return Difference(Kind.TEXT, name, math.inf)
+    off = np.abs(b[a != b].astype(np.float64) - a[a != b])
+    return Difference(Kind.NUMBER, name, float(off.max()) if off.size else 0.0)
+
+
+def _transform(name: str, a: Transform, b: Transform) -> Iterator[Difference]:
+    yield _text(f"{name}.frames", (a.parent, a.child), (b.parent, b.child))
+    yield Difference(Kind.LENGTH, f"{a.child}.translation", math.dist(a.translation, b.translation))
+    x, y, z, w = multiply(conjugate(a.rotation), b.rotation)
+    turned = 0.0 if a.rotation == b.rotation else 2 * math.atan2(math.hypot(x, y, z), abs(w))
+    yield Difference(Kind.ANGLE, f"{a.child}.rotation", turned)
+
+
+def _grid(a: Grid, b: Grid) -> Iterator[Difference]:
+    """Cells as mean difference of occupancy, 0..1: one cell says little."""
+    yield from _walk("origin", a.origin, b.origin)
+    yield _text("size", (a.width, a.height, a.resolution), (b.width, b.height, b.resolution))
+    if a.cells.shape == b.cells.shape:
+        off = np.abs(a.cells.astype(np.float64) - b.cells)
+        yield Difference(Kind.NUMBER, "cells", float(off.mean()) / 100)

@@ -1,0 +1,66 @@
+"""A clock on which services tick when they ticked in a recorded run, not when their schedules say so.
+
+A tick on the wall clock comes some time after it is due, and a reading that fell in between was taken or was not. The
+log tells: messages stand in it in the order in which they were handed over, and a service that reads its inputs and
+publishes without waiting in between had read exactly what stands before its output. So it is held until the replay
+has come to that output, and its time is then that output's stamp.
+"""
+
+import asyncio
+from contextvars import ContextVar
+from typing import Final
+
+from monstertruck_runtime.clock import ReplayClock
+
+_PACE: Final[ContextVar["Pace | None"]] = ContextVar("pace", default=None)
+
+
+class Pace:
+    """The ticks of one service."""
+
+    def __init__(self) -> None:
+        self.instant: int | None = None
+        """Of the newest tick, ns; None before the first."""
+        self._held: asyncio.Future[None] | None = None
+
+    def adopt(self) -> None:
+        """The running task and what it starts tick by this."""
+        _PACE.set(self)
+
+    async def hold(self) -> None:
+        """Called by the service's clock: wait for the next tick."""
+        self._held = asyncio.get_running_loop().create_future()
+        try:
+            await self._held
+        finally:
+            self._held = None
+
+    async def release(self, instant: int) -> None:
+        """Let the service have its turn at ``instant``, ns, when the loop comes to it; once for each instant."""
+        if instant == self.instant:
+            return
+        while self._held is None or self._held.done():
+            await asyncio.sleep(0)
+        self.instant = instant
+        self._held.set_result(None)
+
+
+class PacedClock(ReplayClock):
+    """A replay clock; in tasks that adopted a ``Pace``, time is that of their ticks."""
+
+    def now(self) -> int:
+        """Nanoseconds of the log's daemon time."""
+        pace = _PACE.get()
+        return super().now() if pace is None or pace.instant is None else pace.instant
+
+    async def sleep_until(self, instant: int) -> None:
+        """Wait until ``instant``, or for the next tick."""
+        pace = _PACE.get()
+        if pace is None:
+            await super().sleep_until(instant)
+        else:
+            await pace.hold()
+
+    async def reach(self, instant: int) -> None:
+        """Wait until ``instant`` to the nanosecond: a jump of the loop ends one beyond its timer."""
+        await super().sleep_until(instant - 1)
