@@ -14,11 +14,13 @@ from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.goal_deform import Deformation
 from monstertruckd.goal_parts import Inputs, Outputs
 from monstertruckd.goal_service import GoalService
 from monstertruckd.workers.placement import Places
 
 TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"
+DEFORMER: Final = "monstertruckd.workers.deforming:DeformingWorker"
 PATIENCE: Final = 180.0
 """Real seconds the worker may take to start: the first time it compiles."""
 
@@ -37,8 +39,9 @@ def build_goals(
     """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
     lidar, mapped = config.devices.lidar, config.slam is not None
     assert config.tracker is not None
+    planner = planner.model_copy(update={"map": None}) if mapped else planner
     return GoalService(
-        planner.model_copy(update={"map": None}) if mapped else planner,
+        planner,
         clock,
         places.actor(
             config.placement.planner,
@@ -64,4 +67,33 @@ def build_goals(
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         ),
         outputs=Outputs(path, wish, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
+        deformation=_deformation(config, planner, bus, clock, chassis, footprint, places),
+    )
+
+
+def _deformation(
+    config: TruckConfig, planner: PlannerConfig, bus: Bus, clock: Clock, chassis: Chassis, footprint: Footprint,
+    places: Places,
+) -> Deformation | None:  # fmt: skip
+    lidar, mapped, local = config.devices.lidar, config.slam is not None, planner.local
+    if planner.deform is None or lidar is None:
+        return None
+    return Deformation(
+        planner,
+        clock,
+        places.actor(
+            config.placement.deformer,
+            "deforming",
+            DEFORMER,
+            latency=local.latency,
+            deadline=local.deadline,
+            patience=PATIENCE,
+        ),
+        geometry=chassis.bicycle,
+        footprint=footprint,
+        lidar=lidar.mount.planar,
+        scan=bus.subscribe(topics.SCAN, latest()),
+        pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
+        grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
+        events=bus.event_sink(),
     )

@@ -51,10 +51,17 @@ class Followed:
     message: Path
     poses: Array
     travelled: Array
+    before: float = 0.0
+    """Metres driven on the paths that it was deformed from."""
+
+    def told(self, report: TrackerState | None) -> TrackerState | None:
+        """What the tracker says of it; None while that speaks of another path."""
+        return report if report is not None and report.path == self.message.name else None
 
     def along(self, report: TrackerState | None) -> float:
-        """Metres driven on it, by what the tracker says; 0 while that speaks of another path."""
-        return report.along if report is not None and report.path == self.message.name else 0.0
+        """Metres driven on it."""
+        told = self.told(report)
+        return 0.0 if told is None else told.along
 
 
 def pose_of(odometry: Odometry) -> Pose:
@@ -62,8 +69,10 @@ def pose_of(odometry: Odometry) -> Pose:
     return odometry.pose.x, odometry.pose.y, odometry.pose.yaw
 
 
-def goal_state(mission: Mission | None, now: int, followed: Followed | None, inputs: Inputs) -> GoalState:
-    """The report on a goal, its sequence number still 0."""
+def goal_state(
+    mission: Mission | None, now: int, followed: Followed | None, inputs: Inputs, left: float = 0.0
+) -> GoalState:
+    """The report on a goal, its sequence number still 0; ``left`` metres of the route are ahead at least."""
     odometry = inputs.pose.latest
     frame = "map" if odometry is None else odometry.frame
     if mission is None:
@@ -71,7 +80,7 @@ def goal_state(mission: Mission | None, now: int, followed: Followed | None, inp
     x, y, yaw = mission.goal
     remaining = 0.0
     if followed is not None and mission.active:
-        remaining = max(float(followed.travelled[-1]) - followed.along(inputs.tracker.latest), 0.0)
+        remaining = max(float(followed.travelled[-1]) - followed.along(inputs.tracker.latest), left, 0.0)
     return GoalState(
         stamp=now,
         received=now,

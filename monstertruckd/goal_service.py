@@ -12,33 +12,28 @@ from monstertruck_planners.collision import Footprint, scan_points
 from monstertruck_planners.manage import mission as machine
 from monstertruck_planners.manage.config import PlannerConfig
 from monstertruck_planners.manage.escape import placed
-from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Pose, Setup
-from monstertruck_planners.manage.lookout import blocked, cut, way_ahead
+from monstertruck_planners.manage.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.manage.lookout import blocked, way_ahead
 from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import GoalPhase, GoalState, Path
+from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, GoalControl, GoalOrder, GoalRequest, Request, Role
+from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import GateMode, Grid, Odometry
+from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.gate.sources import Sequences, refusal
+from monstertruckd.goal_deform import Deformation, told_of
+from monstertruckd.goal_lead import ACTIVE, AT_REST, Lead
 from monstertruckd.goal_parts import Followed, Inputs, Outputs, goal_state, pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]
 
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
-AT_REST: Final = 0.01
-"""Speed of a truck at rest, m/s."""
-LEASE: Final = 0.25
-"""Of the wish to stand still, s."""
-STUB: Final = 0.01
-"""Length of a path that leads nowhere, m."""
 REPORT: Final = SECOND // 2
 """Between two reports without news, ns."""
 
@@ -59,6 +54,7 @@ class GoalService:
         max_age: see ``GateConfig.max_request_age``.
         inputs: topics read.
         outputs: topics written.
+        deformation: of the routes; None = they are driven as they are.
     """
 
     name = "goals"
@@ -76,16 +72,16 @@ class GoalService:
         max_age: float,
         inputs: Inputs,
         outputs: Outputs,
+        deformation: Deformation | None = None,
     ) -> None:
         self._config, self._clock, self._in, self._out = config, clock, inputs, outputs
-        self._place = actor
-        self._footprint, self._lidar, self._deceleration, self._max_age = footprint, lidar, deceleration, max_age
+        self._place, self._deformation = actor, deformation
+        self._footprint, self._lidar, self._max_age = footprint, lidar, max_age
         self._setup = Setup(config, geometry, footprint, timed=not isinstance(clock, VirtualClock))
         self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
         self._mission: Mission | None = None
         self._number = 0
-        self._paths = 0
-        self._followed: Followed | None = None
+        self._lead = Lead(clock, inputs, outputs, deceleration)
         self._told: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
         self._actor: Actor | None = None
@@ -102,6 +98,8 @@ class GoalService:
             await actor.start()
             async with asyncio.TaskGroup() as tasks:
                 self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
+                if self._deformation is not None:
+                    tasks.create_task(self._deformation.run(self._deformed))
                 self._report(self._clock.now())
                 ready()
                 await self._serve()
@@ -188,29 +186,30 @@ class GoalService:
     def _tick(self, now: int) -> None:
         mission = self._mission
         if mission is not None and mission.active:
-            if self._followed is not None and self._in.path.latest is not self._followed.message:
+            if self._lead.displaced:
                 self._do(machine.displaced(mission, "another path is followed now"))
+                if self._deformation is not None:
+                    self._deformation.end()
             else:
                 self._do(machine.tick(mission, self._facts(now), self._config))
-            self._stand_still(now)
+            self._stand_still(self._mission or mission)
         self._report(now)
 
     def _facts(self, now: int) -> Facts:
-        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._followed
+        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._lead.followed
         answer = None
         if self._planning is not None and self._planning.done():
             answer, self._planning = self._planning.result(), None
-        report = self._in.tracker.latest
-        ours = followed is not None and report is not None and report.path == followed.message.name
-        along = report.along if ours and report is not None else 0.0
+        report = None if followed is None else followed.told(self._in.tracker.latest)
+        along = 0.0 if report is None else report.along
         return Facts(
             now=now / SECOND,
             armed=gate is not None and gate.mode in ACTIVE and odometry is not None,
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
             pose=None if odometry is None else pose_of(odometry),
             answer=answer,
-            outcome=report.outcome if ours and report is not None else None,
-            along=along,
+            outcome=None if report is None else self._outcome(report.outcome),
+            along=along if followed is None else followed.before + along,
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
         )
 
@@ -218,7 +217,14 @@ class GoalService:
         odometry = self._in.pose.latest
         return odometry if odometry is not None and now - odometry.received <= ODOMETRY.fresh_for() * SECOND else None
 
+    def _outcome(self, outcome: Reason) -> Reason:
+        """The end of a deformed path is not that of the route."""
+        on_the_way = self._deformation is not None and not self._deformation.complete
+        return Reason.DRIVING if on_the_way and outcome is Reason.GOAL_REACHED else outcome
+
     def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
+        if self._deformation is not None and self._deformation.up:
+            return self._deformation.blocked(now)
         points = self._scan(now)
         if not len(points):
             return False
@@ -286,77 +292,45 @@ class GoalService:
         return answer
 
     def _follow(self, answer: PlanAnswer) -> None:
-        assert answer.poses is not None
-        assert answer.directions is not None
-        steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
-        self._publish(answer.poses, answer.directions, steering, "goal")
+        mission, deformation = self._mission, self._deformation
+        assert mission is not None
+        if deformation is not None:
+            deformation.end()
+            if mission.planned == "route":
+                deformation.begin(answer)
+        self._lead.follow(answer, f"goal-{self._number}")
+
+    def _deformed(self, was: Finding, answer: DeformAnswer) -> None:
+        """Drive what became of the route."""
+        followed, mission, deformation = self._lead.followed, self._mission, self._deformation
+        assert deformation is not None
+        if followed is None or mission is None or mission.phase is GoalPhase.BACKING_OUT:
+            return
+        before, name = followed.before + followed.along(self._in.tracker.latest), f"goal-{self._number}"
+        if answer.path is not None:
+            self._lead.follow(answer.path, f"{name}-deformed", before)
+        elif answer.finding == "free" and was not in ("idle", "free"):
+            self._lead.follow(deformation.rest(), name, before)
+        elif answer.finding == "blocked" and was != "blocked":
+            self._lead.brake(f"{name}-held-up")
+        told = told_of(was, answer)
+        if told is not None:
+            self._out.events(*told[:2], self.name, f"goal {mission.number}: {told[2]}", goal=mission.number)
 
     def _halt(self) -> None:
-        """Let what is followed end as soon as the tracker can brake; at rest, here."""
-        odometry, followed = self._in.pose.latest, self._followed
-        self._followed = None
-        if odometry is None or followed is None:
-            return
-        speed, report = abs(odometry.twist.vx), self._in.tracker.latest
-        if speed > AT_REST and report is not None and report.path == followed.message.name:
-            way = speed * speed / (2 * self._deceleration) + STUB
-            count = cut(followed.poses, followed.travelled, report.along, way)
-            steering = followed.message.steering[:count]
-            self._publish(followed.poses[:count], followed.message.directions[:count], steering, "halt")
-        else:
-            ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
-            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), "halt")
-        self._followed = None
+        if self._deformation is not None:
+            self._deformation.end()
+        self._lead.halt(f"halt-{self._number}")
 
-    def _publish(self, poses: Array, directions: Array, steering: tuple[Any, ...], what: str) -> None:
-        now, odometry = self._clock.now(), self._in.pose.latest
-        assert odometry is not None
-        self._paths += 1
-        message = Path(
-            stamp=now,
-            received=now,
-            seq=self._out.path.next_seq(),
-            frame=odometry.frame,
-            poses=np.ascontiguousarray(poses).ravel(),
-            directions=np.array(directions),
-            steering=steering,
-            name=f"{what}-{self._number}.{self._paths}",
-        )
-        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        self._followed = Followed(message, poses, np.concatenate(([0.0], np.cumsum(steps))))
-        self._out.path.put(message)
-
-    def _stand_still(self, now: int) -> None:
+    def _stand_still(self, mission: Mission) -> None:
         """Keep the truck armed while a way is looked for."""
-        mission, gate = self._mission, self._in.gate.latest
-        thinking = mission is not None and mission.phase in (GoalPhase.PLANNING, GoalPhase.WAITING)
-        report, followed = self._in.tracker.latest, self._followed
-        driving = (
-            followed is not None
-            and report is not None
-            and report.path == followed.message.name
-            and report.outcome is Reason.DRIVING
-        )
-        if not thinking or driving or gate is None or gate.mode not in ACTIVE:
-            return
-        self._out.wish.put(
-            DriveRequest(
-                stamp=now,
-                received=now,
-                seq=self._out.wish.next_seq(),
-                source=self.name,
-                role=Role.TRACKER,
-                lease=LEASE,
-                nonce=gate.nonce,
-                gate_stamp=gate.stamp,
-                speed=0.0,
-                front=0.0,
-                rear=0.0,
-            )
-        )
+        held_up = self._deformation is not None and self._deformation.held_up
+        if mission.phase in (GoalPhase.PLANNING, GoalPhase.WAITING) or held_up:
+            self._lead.stand_still(self.name)
 
     def _report(self, now: int) -> None:
-        state = goal_state(self._mission, now, self._followed, self._in)
+        left = 0.0 if self._deformation is None else self._deformation.left
+        state = goal_state(self._mission, now, self._lead.followed, self._in, left)
         same = ("phase", "outcome", "number", "routes", "recoveries")
         told = self._told
         unchanged = told is not None and all(getattr(told, name) == getattr(state, name) for name in same)

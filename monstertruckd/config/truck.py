@@ -196,10 +196,12 @@ class MapRender(Schema):
 
 
 class PlacementConfig(Schema):
-    """Where planner and tracker compute: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
+    """Where the planners compute: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
 
     planner: Literal["loop", "worker", "remote"] = "worker"
     """In the loop only for studies: it stands still meanwhile"""
+    deformer: Literal["loop", "worker", "remote"] = "worker"
+    """Likewise"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
 
 

@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 
 STEPS: Final = {
     "planning": "monstertruckd.workers.planning:PlanningWorker",
+    "deforming": "monstertruckd.workers.deforming:DeformingWorker",
     "tracking": "monstertruckd.workers.tracking:TrackingWorker",
 }
 """What it can compute."""

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_planners.deform.config import AnyDeformer
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import Steering
@@ -40,17 +41,39 @@ class EscapeConfig(Schema):
     """Kept to obstacles on the way, m; those that are nearer already may not come nearer."""
 
 
+class LocalConfig(Schema):
+    """When routes are deformed, and what is made of it."""
+
+    clearance: Share = 0.02
+    """A route with something nearer than this beside it is deformed, m; what the gate keeps beside the truck."""
+    rejoin: Share = 0.03
+    """More than that is needed to go back to the route, m..."""
+    beside: Positive = 0.06
+    """...and the truck may be this far from it, m, counting 0.3 m a radian."""
+    patience: Positive = 2.0
+    """Seconds without a way round something after which the route counts as blocked."""
+    detour: Positive = 45.0
+    """Seconds of deformation that do not bring the truck on along its route, after which the same holds."""
+    latency: Positive = 0.05
+    """Seconds a deformation takes on the virtual clock"""
+    deadline: Positive = 5.0
+    """Seconds after which a silent worker is killed"""
+
+
 class PlannerConfig(Schema):
     """How goals are reached."""
 
-    route: RouteKind = HybridConfig(margin=0.04, unknown="blocked")
-    """Route planner; its margin has to exceed what the gate keeps beside the truck"""
+    route: RouteKind = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
+    """Route planner; its margin has to exceed what the gate keeps beside the truck, and backward the lidar sees nothing"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.36
     """Greatest axle angle of routes, rad; what the truck has beyond is left to the tracker"""
     map: Path | None = None
     """map_server YAML file to plan on where there is no slam"""
+    deform: AnyDeformer | None = None
+    """What leads the truck round things that stand on its route; null = the route is planned anew"""
+    local: LocalConfig = LocalConfig()
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
     """Decisions per second."""
     position_tolerance: Positive = 0.2

@@ -11,6 +11,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.manage.config import PlannerConfig
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid
 
 Array = NDArray[np.float64]
@@ -69,3 +70,60 @@ class PlanAnswer:
     def ok(self) -> bool:
         """Whether there is something to drive."""
         return self.reason is Reason.OK and self.poses is not None
+
+
+@dataclass(frozen=True, slots=True)
+class DeformSetup:
+    """What the deforming step is made for; comes first, and again after every restart."""
+
+    config: PlannerConfig
+    geometry: FourWheelSteering
+    footprint: Footprint
+    lidar: Pose
+    """In base."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A route to be deformed."""
+
+    number: int
+    """Tells it from others."""
+    poses: Array
+    """Shape (n, 3): of the base."""
+    directions: Array
+    """Shape (n,): +1 or -1."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeformTask:
+    """One scan, with what is newer than at the scan before."""
+
+    scan: LaserScan
+    pose: Pose
+    """Of the base, in the map's frame."""
+    setup: DeformSetup | None = None
+    grid: Grid | None = None
+    way: Way | None = None
+
+
+Finding = Literal["idle", "free", "kept", "new", "blocked"]
+"""No route yet; the route is free; the deformed path is kept; here is a new one; there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeformAnswer:
+    """What becomes of the route."""
+
+    number: int
+    """The route's."""
+    finding: Finding
+    reason: Reason = Reason.OK
+    """Of a new path PATH_PARTIAL if only its beginning is free; of none why."""
+    text: str = ""
+    place: int = 0
+    """Index of the route's pose that the truck has come to."""
+    complete: bool = False
+    """The path leads to the route's end."""
+    path: PlanAnswer | None = None
+    """The new path."""

@@ -145,27 +145,13 @@ class PlanningStep:
         if result.path is None:
             return PlanAnswer(result.reason, result.text)
         self._route = result.path
-        return self._answer(result)
+        kept = bool(result.statistics.get("kept_route", 0.0))
+        return answer_of(result.path, result.cost, kept=kept)
 
     def _search(self, planner: RoutePlanner, ground: RouteMap, start: Array, goal: Array) -> RouteResult:
         if isinstance(planner, HybridPlanner):
             return replan(planner, ground, self._route, start, goal, self._now)
         return planner.plan(ground, start, goal, self._now)
-
-    def _answer(self, result: RouteResult) -> PlanAnswer:
-        path = result.path
-        assert path is not None
-        message = path.message(stamp=0, step=SAMPLE)
-        return PlanAnswer(
-            Reason.OK,
-            "",
-            np.array(message.poses).reshape(-1, 3),
-            np.array(message.directions),
-            message.steering,
-            path.length,
-            result.cost,
-            kept=bool(result.statistics.get("kept_route", 0.0)),
-        )
 
     def _escape(self, ground: Ground, task: PlanTask) -> PlanAnswer:
         setup = self._setup
@@ -188,3 +174,10 @@ class PlanningStep:
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         directions = np.full(len(poses), float(way.direction))
         return PlanAnswer(Reason.OK, "", poses, directions, steering, length, length)
+
+
+def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswer:
+    """A drivable path as an answer: poses of the base every few centimetres."""
+    message = path.message(stamp=0, step=SAMPLE)
+    poses, directions = np.array(message.poses).reshape(-1, 3), np.array(message.directions)
+    return PlanAnswer(Reason.OK, "", poses, directions, message.steering, path.length, cost, kept=kept)

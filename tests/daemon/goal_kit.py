@@ -1,0 +1,91 @@
+"""A truck in the rooms on the virtual clock, and somebody who asks it to go places."""
+
+import math
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+QUICK = {
+    "recorder": None,
+    "blackbox": None,
+    "planner": {"route": {"effort": 3000, "margin": 0.04}, "deform": None},
+    "placement": {"planner": "loop", "deformer": "loop"},
+}
+
+
+class Trip:
+    """A truck in the rooms, and somebody who asks it to go places."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.rig = rig
+        self.clock: VirtualClock = rig.clock
+        self.operator = LocalOperator(rig.bus, rig.clock)
+        self.states = rig.bus.subscribe(topics.GOAL, fifo(4096))
+        self.events = rig.bus.subscribe(topics.EVENT, fifo(4096))
+        self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
+        self._seq = 0
+
+    def header(self) -> dict[str, Any]:
+        gate, now = self._gate.latest, self.clock.now()
+        assert gate is not None
+        self._seq += 1
+        known = {"nonce": gate.nonce, "gate_stamp": gate.stamp}
+        who = {"seq": self._seq, "source": "tester", "role": "station", "lease": 1.0, "frame": "map"}
+        return {"stamp": now, "received": now, **who, **known}
+
+    async def goal(self, x: float, y: float, yaw: float) -> dict[str, Any]:
+        return await self.rig.daemon.rpc.call("goal", {**self.header(), "goal": {"x": x, "y": y, "yaw": yaw}})
+
+    async def order(self, order: str) -> None:
+        await self.rig.daemon.rpc.call("goal_control", {**self.header(), "order": order})
+
+    async def arm(self) -> None:
+        await self.operator.order(Order.ARM)
+
+    async def end(self, limit: float = 200.0) -> GoalState:
+        async with self.clock.deadline(limit):
+            while True:
+                state = await self.states.next()
+                if state.phase is GoalPhase.IDLE and state.outcome is not Reason.OK:
+                    return state
+
+    def reasons(self) -> list[Reason]:
+        drained = self.events.drain()
+        return [
+            event.reason for event in drained if event.source == "goals" and event.reason is not Reason.DEVICE_READY
+        ]
+
+
+def travel(story: Callable[[Trip], Awaitable[None]], **overlay: Any) -> VirtualRig:
+    base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
+    config = with_overlay(with_overlay(base, QUICK), {"planner": {"deform": {"kind": "rsband"}}} | overlay)
+
+    async def main(clock: VirtualClock) -> VirtualRig:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            trip = Trip(rig)
+            await clock.sleep(3.0)
+            await story(trip)
+        return rig
+
+    return run_virtual(main)
+
+
+def assert_at(rig: VirtualRig, x: float, y: float, yaw: float) -> None:
+    truth = rig.truth.array()
+    assert not truth[:, 5].any(), "collided"
+    assert math.dist(truth[-1, 1:3], (x, y)) < 0.2
+    assert abs(math.remainder(truth[-1, 3] - yaw, math.tau)) < 0.2

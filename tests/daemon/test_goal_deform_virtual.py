@@ -1,0 +1,87 @@
+"""The route under deformation, in the whole daemon: what is put onto it is passed, or there is another way, or none."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.world.obstacles import Box
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from tests.daemon.goal_kit import Trip, assert_at, travel
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
+
+
+async def surprise(trip: Trip, ahead: float, aside: float, size: float) -> None:
+    """Put a box before the driving truck, m."""
+    now = trip.clock.now()
+    truth = trip.rig.world.truth(now)
+    trip.rig.world.add(now, Box(truth.x + ahead, truth.y + aside, size, size))
+
+
+@pytest.mark.parametrize("kind", ["rsband", "teb"])
+def test_a_box_put_onto_the_route_is_passed_by_deformation(kind: str):
+    async def story(trip: Trip) -> None:
+        await trip.goal(6.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(5.0)
+        await surprise(trip, 1.3, 0.05, 0.25)
+        state = await trip.end()
+        assert (state.outcome, state.recoveries) == (Reason.GOAL_REACHED, 0)
+        reasons = trip.reasons()
+        assert reasons[:3] == [Reason.GOAL_ACCEPTED, Reason.ROUTE_FOUND, Reason.ROUTE_DEFORMED]
+        assert (Reason.ROUTE_FREE in reasons) or kind == "teb", "whose band need not come back"
+        assert Reason.PATH_BLOCKED not in reasons
+
+    rig = travel(story, planner={"deform": {"kind": kind}})
+    assert_at(rig, 6.0, 3.9, 0.0)
+    assert np.ptp(rig.truth.array()[:, 2]) > 0.2, "it went round"
+
+
+def test_without_a_deformer_the_route_is_planned_anew():
+    async def story(trip: Trip) -> None:
+        await trip.goal(6.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(5.0)
+        await surprise(trip, 1.3, 0.05, 0.25)
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+        reasons = trip.reasons()
+        assert Reason.PATH_BLOCKED in reasons
+        assert Reason.ROUTE_DEFORMED not in reasons
+
+    assert_at(travel(story, planner={"deform": None}), 6.0, 3.9, 0.0)
+
+
+def test_where_the_hall_is_blocked_the_truck_takes_the_way_through_the_rooms():
+    async def story(trip: Trip) -> None:
+        await trip.goal(7.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(4.0)
+        trip.rig.world.add(trip.clock.now(), Box(4.5, 3.95, 0.1, 1.55))
+        assert (await trip.end(250.0)).outcome is Reason.GOAL_REACHED
+        assert Reason.PATH_BLOCKED in trip.reasons()
+
+    rig = travel(story)
+    assert_at(rig, 7.0, 3.9, 0.0)
+    assert rig.truth.array()[:, 2].max() > 5.5
+
+
+def test_where_all_ways_are_blocked_the_ladder_is_climbed_to_its_end():
+    async def story(trip: Trip) -> None:
+        world, now = trip.rig.world, trip.clock.now
+        world.add(now(), Box(5.5, 6.65, 0.1, 1.0))
+        await trip.goal(7.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(4.0)
+        world.add(now(), Box(4.5, 3.95, 0.1, 1.55))
+        state = await trip.end(300.0)
+        assert state.outcome is Reason.GOAL_UNREACHABLE
+        assert state.text
+        told = [event for event in trip.events.drain() if event.source == "goals"]
+        rungs = [event.text.rpartition(": ")[2] for event in told if event.reason is Reason.RECOVERING]
+        climbed = [rung for rung, _ in itertools.groupby(rungs) if "backs out" not in rung]
+        assert climbed[-4:] == ["clear", "back out", "wait", "replan"]
+        assert told[-1].severity is Severity.WARNING
+
+    assert not travel(story).truth.array()[:, 5].any(), "collided"

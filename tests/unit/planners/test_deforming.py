@@ -1,0 +1,135 @@
+"""The deforming step: free routes stay as they are, what stands on them is passed, and what cannot be is said."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.deform.config import RsbandConfig
+from monstertruck_planners.manage.config import PlannerConfig
+from monstertruck_planners.manage.deforming import DeformStep
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformSetup, DeformTask, Way
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid
+
+HEAD = {"stamp": 5, "received": 5, "seq": 0}
+ROUTE = np.column_stack((np.arange(0.0, 4.01, 0.05), np.zeros(81), np.zeros(81)))
+ANGLES = np.radians(np.linspace(-120.0, 120.0, 481))
+ORIGIN = (0.0, 0.0, 0.0)
+Box = tuple[float, float, float, float]
+
+
+def scan_of(pose: tuple[float, float, float], *boxes: Box) -> LaserScan:
+    """What a lidar at the base sees of boxes x0, y0, x1, y1."""
+    ranges = np.full(len(ANGLES), math.inf)
+    course = ANGLES + pose[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for x0, y0, x1, y1 in boxes:
+            sides = [
+                np.sort(np.stack(((low - at) / step, (high - at) / step)), axis=0)
+                for low, high, at, step in ((x0, x1, pose[0], np.cos(course)), (y0, y1, pose[1], np.sin(course)))
+            ]
+            enter, leave = np.fmax(sides[0][0], sides[1][0]), np.fmin(sides[0][1], sides[1][1])
+            hit = (enter < leave) & (enter > 0.0) & (enter < 4.0)
+            ranges = np.where(hit, np.minimum(ranges, enter), ranges)
+    return LaserScan(
+        **HEAD, frame="lidar", start_angle=ANGLES[0], end_angle=ANGLES[-1], time_increment=0.0, scan_time=0.1,
+        range_min=0.02, range_max=4.1, ranges=ranges, codes=np.where(np.isfinite(ranges), 255, 0).astype(np.uint8),
+    )  # fmt: skip
+
+
+def room() -> Grid:
+    cells = np.zeros((80, 120), np.int8)
+    return Grid(
+        **HEAD, frame="map", resolution=0.05, width=120, height=80, origin=Pose2D(x=-1.0, y=-2.0, yaw=0.0),
+        cells=cells.ravel(),
+    )  # fmt: skip
+
+
+def begun(route: np.ndarray = ROUTE, directions: np.ndarray | None = None) -> tuple[DeformStep, DeformTask]:
+    """A step, and its first task."""
+    config = PlannerConfig(deform=RsbandConfig())
+    setup = DeformSetup(config, FourWheelSteering(), Footprint(), ORIGIN)
+    way = Way(1, route, np.ones(len(route)) if directions is None else directions)
+    return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way)
+
+
+def drive(step: DeformStep, until: str, *boxes: Box) -> tuple[DeformAnswer, set[str], tuple[float, float, float]]:
+    """Follow what the step says until it comes to a finding; also all findings, and where that was."""
+    pose, path, found = ORIGIN, ROUTE, set()
+    for _ in range(80):
+        answer = step.step(DeformTask(scan_of(pose, *boxes), pose))
+        found.add(answer.finding)
+        if answer.finding == until:
+            return answer, found, pose
+        if answer.path is not None:
+            assert answer.path.poses is not None
+            path = answer.path.poses
+        path = path[min(2, len(path) - 1) :]
+        pose = (float(path[0, 0]), float(path[0, 1]), float(path[0, 2]))
+    raise AssertionError(f"{until} expected, found {found}")
+
+
+def test_a_free_route_stays_as_it_is():
+    step, first = begun()
+    answer = step.step(first)
+    assert (answer.number, answer.finding, answer.place, answer.complete) == (1, "free", 0, True)
+    at = (1.02, 0.03, 0.05)
+    beside = (1.5, 0.25, 2.0, 0.5)
+    answer = step.step(DeformTask(scan_of(at, beside), at))
+    assert (answer.finding, answer.place) == ("free", 20)
+
+
+def test_what_stands_on_the_route_is_passed_and_then_the_route_is_driven_again():
+    step, first = begun()
+    step.step(first)
+    box = (1.2, -0.15, 1.5, 0.1)
+    answer = step.step(DeformTask(scan_of(ORIGIN, box), ORIGIN))
+    assert (answer.finding, answer.path is not None) == ("new", True)
+    assert answer.path is not None
+    assert answer.path.poses is not None
+    assert np.abs(answer.path.poses[0] - ORIGIN).max() < 1e-6, "from the truck on"
+    answer, found, pose = drive(step, "free", box)
+    assert found == {"kept", "new", "free"}
+    assert pose[0] > 1.5
+    assert abs(ROUTE[answer.place, 0] - pose[0]) < 0.06
+
+
+def test_where_there_is_no_way_round_the_beginning_is_driven_and_then_it_is_blocked():
+    step, first = begun()
+    step.step(first)
+    wall = (1.6, -2.5, 1.7, 2.5)
+    answer, found, pose = drive(step, "blocked", wall)
+    assert answer.reason is Reason.PATH_BLOCKED
+    assert answer.text
+    assert "new" in found
+    assert 0.5 < pose[0] < 1.6 - 0.235, "as far as it is free"
+    step.step(DeformTask(scan_of(pose), pose, way=Way(2, ROUTE, np.ones(81))))
+    answer = step.step(DeformTask(scan_of(pose), pose))
+    assert (answer.number, answer.finding) == (2, "free"), "what went away is forgotten"
+
+
+def test_the_place_on_the_route_does_not_go_beyond_a_cusp_that_is_not_reached():
+    there = np.column_stack((np.arange(0.0, 1.01, 0.05), np.zeros(21), np.zeros(21)))
+    back = there[::-1][1:]
+    step, first = begun(np.vstack((there, back)), np.concatenate((np.ones(21), -np.ones(20))))
+    step.step(first)
+    poses = [(x, 0.0, 0.0) for x in (0.0, 0.4, 0.8, 0.98, 0.7, 0.3)]
+    places = [step.step(DeformTask(scan_of(pose), pose)).place for pose in poses]
+    assert places == [0, 8, 16, 20, 26, 34]
+
+
+def test_a_setup_with_a_deformer_comes_first():
+    step, first = begun()
+    with pytest.raises(InputError, match="setup"):
+        step.step(DeformTask(first.scan, ORIGIN))
+    setup = DeformSetup(PlannerConfig(), FourWheelSteering(), Footprint(), ORIGIN)
+    with pytest.raises(InputError, match=r"planner\.deform"):
+        step.step(DeformTask(first.scan, ORIGIN, setup))
+    assert first.setup is not None
+    assert step.step(DeformTask(first.scan, ORIGIN, first.setup)).finding == "idle"
