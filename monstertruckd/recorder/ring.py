@@ -165,10 +165,9 @@ class _Part:
             self.oldest = self._blocks[0].time(self._at)
         return entry
 
-    def expired(self, now: int) -> Iterator[Entry]:
-        """Take out what is too old."""
-        while self._count and now - self.oldest > self._span:
-            yield self.popleft()
+    def expired(self, now: int) -> bool:
+        """Whether the oldest entry is too old."""
+        return self._count > 0 and now - self.oldest > self._span
 
     def view(self) -> _View:
         """What is here now; copies no entries."""
@@ -200,7 +199,7 @@ class Ring:
         self._journal = _Part(span.journal, block)
         self._fresh = _Part(span.pictures, block)
         self._thinned = _Part(span.everything, block)
-        self._parts = (self._rest, self._journal, self._thinned, self._fresh)
+        self._part_of: dict[str, _Part] = {}
         self._period = round(span.picture_period * SECOND)
         self._heads: dict[str, Entry] = {}
         self.lost = 0
@@ -209,35 +208,44 @@ class Ring:
     @property
     def size(self) -> int:
         """Bytes taken by blocks; the newest message of each retained topic comes on top."""
-        return sum(part.size for part in self._parts)
+        return self._rest.size + self._journal.size + self._thinned.size + self._fresh.size
 
     def add(self, entry: Entry) -> None:
         """Take the newest message, and let go what is too old or too much."""
-        self._part(entry).append(entry)
+        before = self.size
+        self._part(entry.topic).append(entry)
         self._expire(entry.log_time)
-        while self.size > self._limit and (crowded := self._fullest()) is not None:
-            self._drop(crowded.popleft())
-            self.lost += 1
+        if self.size > before:
+            self._make_room()
 
     def snapshot(self) -> Snapshot:
         """Everything kept; takes no longer however much it is than a list of its blocks."""
-        return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in self._parts))
+        parts = (self._rest, self._journal, self._thinned, self._fresh)
+        return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
 
-    def _part(self, entry: Entry) -> _Part:
-        if entry.topic.foxglove == PICTURES:
-            return self._fresh
-        return self._journal if entry.topic.group == JOURNAL else self._rest
+    def _part(self, topic: Topic[Any]) -> _Part:
+        part = self._part_of.get(topic.name)
+        if part is None:
+            part = self._journal if topic.group == JOURNAL else self._rest
+            self._part_of[topic.name] = part = self._fresh if topic.foxglove == PICTURES else part
+        return part
 
     def _expire(self, now: int) -> None:
         for part in (self._rest, self._journal, self._thinned):
-            for entry in part.expired(now):
-                self._drop(entry)
-        for picture in self._fresh.expired(now):
-            kept = self._thinned
+            while part.expired(now):
+                self._drop(part.popleft())
+        kept = self._thinned
+        while self._fresh.expired(now):
+            picture = self._fresh.popleft()
             if kept and picture.log_time - kept.newest < self._period:
                 self._drop(picture)
             else:
                 kept.append(picture)
+
+    def _make_room(self) -> None:
+        while self.size > self._limit and (crowded := self._fullest()) is not None:
+            self._drop(crowded.popleft())
+            self.lost += 1
 
     def _fullest(self) -> _Part | None:
         """Where to make room; never the newest message of its sort."""
