@@ -5,7 +5,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from monstertruck_estimation.odometry import DeadReckoning, OdometryService
+from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.fusion.service import FusionService
+from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.stabiliser import StabiliserService
@@ -75,16 +77,23 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         yield slam
     if config.missing_actuators() is not None:
         return
-    yield OdometryService(
-        DeadReckoning(config.odometry, body.chassis),
-        clock,
-        drives=[bus.subscribe(topic, latest()) for topic in DRIVES[: len(body.chassis.shafts)]],
-        steering=bus.subscribe(topics.STEERING, latest()) if body.chassis.linkage is not None else None,
-        compass=bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
-        odometry=bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
-        pose=bus.publisher(topics.POSE, Writer.ESTIMATION) if slam is None else None,
-        rate=config.odometry.rate,
-    )
+    yield _build_odometry(config, bus, clock, body.chassis)
+
+
+def _build_odometry(config: TruckConfig, bus: Bus, clock: Clock, chassis: Chassis) -> OdometryService:
+    odometry = config.odometry
+    ends: dict[str, Any] = {
+        "drives": [bus.subscribe(topic, latest()) for topic in DRIVES[: len(chassis.shafts)]],
+        "steering": bus.subscribe(topics.STEERING, latest()) if chassis.linkage is not None else None,
+        "compass": bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
+        "odometry": bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
+        "pose": bus.publisher(topics.POSE, Writer.ESTIMATION) if config.slam is None else None,
+        "rate": odometry.rate,
+    }
+    if isinstance(odometry, OdometryConfig):
+        return OdometryService(DeadReckoning(odometry, chassis), clock, **ends)
+    scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if config.slam is not None and odometry.scans else None
+    return FusionService(Fusion(odometry, chassis), clock, scans=scans, events=bus.event_sink(), **ends)
 
 
 def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
@@ -102,6 +111,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
         pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
         whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
         tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),
+        motion=bus.publisher(topics.SCAN_MOTION, Writer.ESTIMATION),
         health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
         events=bus.event_sink(),
     )

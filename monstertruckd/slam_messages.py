@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from monstertruck_estimation.mapping.exchange import Estimate, Patch
+from monstertruck_estimation.mapping.exchange import Estimate, Moved, Patch
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import SlamHealth
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import Grid, ScanMotion
 
 
 def grid_message(patch: Patch, now: int, seq: int) -> Grid:
@@ -26,6 +26,20 @@ def grid_message(patch: Patch, now: int, seq: int) -> Grid:
         height=rows,
         origin=Pose2D(x=x, y=y, yaw=0.0),
         cells=cells,
+    )
+
+
+def scan_motion(stamp: int, moved: Moved, now: int, seq: int) -> ScanMotion:
+    """Motion of base between two scans."""
+    x, y, yaw = moved.motion
+    return ScanMotion(
+        stamp=stamp,
+        received=now,
+        seq=seq,
+        frame="base",
+        since=moved.since,
+        motion=Pose2D(x=x, y=y, yaw=yaw),
+        covariance=np.array(moved.covariance),
     )
 
 

@@ -23,9 +23,9 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import SlamHealth, Standing
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
-from monstertruck_schemas.state import Grid, Odometry, Transform
+from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 from monstertruckd.config.truck import Mount
-from monstertruckd.slam_messages import grid_message, slam_health
+from monstertruckd.slam_messages import grid_message, scan_motion, slam_health
 from monstertruckd.workers.actor import WorkerActor
 
 TARGET: Final = "monstertruckd.workers.estimation:EstimationWorker"
@@ -52,6 +52,7 @@ class SlamService:
         pose: ``state/pose``.
         whole: ``state/map``.
         tiles: ``state/map_tiles``.
+        motion: ``state/scan_motion``.
         health: ``health/slam``.
         events: where closures, losses and unusable scans are told.
     """
@@ -71,11 +72,13 @@ class SlamService:
         pose: Publisher[Odometry],
         whole: Publisher[Grid],
         tiles: Publisher[Grid],
+        motion: Publisher[ScanMotion],
         health: Publisher[SlamHealth],
         events: EventSink,
     ) -> None:
         self._config, self._mount, self._clock = config, mount, clock
         self._scan, self._odometry, self._compass, self._joints = scan, odometry, compass, joints
+        self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
         self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
         self._body, self._angles = Track(), Track()
@@ -291,6 +294,8 @@ class SlamService:
         if estimate.map_from_odom is not None and estimate.standing is not Standing.SEARCHING:
             self._correction.aim(estimate.map_from_odom, at_once=found or self._newest is None)
         self._newest = estimate
+        if estimate.moved is not None:
+            self._motions.put(scan_motion(estimate.stamp, estimate.moved, now, self._motions.next_seq()))
         self._report(estimate, outputs)
         if self._odometry is None:
             self._tell_pose(estimate, scan)

@@ -17,6 +17,7 @@ from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
 from monstertruck_drivers.webcam.config import WebcamConfig
+from monstertruck_estimation.fusion.config import AnyOdometry
 from monstertruck_estimation.mapping.config import SlamConfig
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_kinematics.chassis import Chassis, build_chassis
@@ -225,7 +226,8 @@ class TruckConfig(Schema):
     levelling: StabiliserConfig = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
-    odometry: OdometryConfig = OdometryConfig()
+    odometry: AnyOdometry = OdometryConfig()
+    """Dead reckoning, or the fusion of wheels, compass and scans"""
     tracker: AnyTracker | None = None
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""

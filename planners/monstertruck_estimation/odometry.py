@@ -6,13 +6,14 @@ Between two drive readings the pose is a prediction, and its covariance grows wi
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_estimation.wheel_motion import WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND, Clock
@@ -49,6 +50,7 @@ class CompassConfig(Schema):
 class OdometryConfig(Schema):
     """Dead reckoning: start and trust."""
 
+    kind: Literal["reckoning"] = "reckoning"
     rate: Annotated[float, Field(gt=0, le=200)] = 50.0
     """Poses per second."""
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
@@ -88,6 +90,22 @@ class Estimate:
     sources: tuple[str, ...]
 
 
+class Reckoner(Protocol):
+    """What ``OdometryService`` drives."""
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take the servo angles being sent."""
+
+    def observe_drive(self, *shafts: DriveFeedback) -> None:
+        """Take a reading of every driven shaft."""
+
+    def observe_attitude(self, attitude: Attitude) -> None:
+        """Take heading and tilt."""
+
+    def estimate(self, now: int) -> Estimate | None:
+        """Pose at ``now`` (ns); None while nothing is known."""
+
+
 class DeadReckoning:
     """Extended Kalman filter of (x, y, yaw): the drive moves it, the compass corrects its yaw.
 
@@ -103,12 +121,7 @@ class DeadReckoning:
         self._covariance: Array = np.zeros((3, 3))
         self._slip = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2
         self._drift = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
-        self._turns: tuple[float, ...] | None = None
-        self._stamp = 0
-        self._steering_used: int | None = None
-        self._angles = (0.0, 0.0)
-        self._angles_then = (0.0, 0.0)
-        self._pace = (0.0,) * len(chassis.shafts)
+        self._wheels = WheelMotion(chassis, config.max_speed)
         self._driven = 0.0
         self._aligning: list[float] = []
         self._north: float | None = None
@@ -118,50 +131,31 @@ class DeadReckoning:
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent, unless the servo controller does not vouch for them."""
-        if not feedback.trusted:
-            return
-        self._angles = self._chassis.axles(feedback.front, feedback.rear)
-        self._steering_used = feedback.stamp
+        self._wheels.observe_steering(feedback)
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take the position of every motor and move the pose along the arc driven since the last ones.
-
-        Positions that were not read at one instant are brought to the newest by their own speeds; what that misses is
-        made up by the next ones.
-        """
-        stamp = max(shaft.stamp for shaft in shafts)
-        turns = tuple(shaft.position + shaft.velocity * ((stamp - shaft.stamp) / SECOND) for shaft in shafts)
-        before, angles_then = self._turns, self._angles_then
-        dt = (stamp - self._stamp) / SECOND
-        if before is not None and dt <= 0:
+        """Take the position of every motor and move the pose along the arc driven since the last ones."""
+        roll = self._wheels.observe_drive(*shafts)
+        if roll is None:
             return
-        self._turns, self._stamp, self._angles_then = turns, stamp, self._angles
-        if before is None:
-            return
-        drivetrain = self._chassis.drivetrain
-        rolled = [drivetrain.distance(now - then) for now, then in zip(turns, before, strict=True)]
-        if max(map(abs, rolled)) > self._config.max_speed * dt:
+        dt = roll.dt
+        if roll.lost:
             self._lose(dt)
             return
-        front = (angles_then[0] + self._angles[0]) / 2
-        rear = (angles_then[1] + self._angles[1]) / 2
-        self._pace = self._chassis.pace(tuple(way / dt for way in rolled), front, rear)
-        twist = self._chassis.twist(self._pace, front, rear)
-        way = max(map(abs, self._pace)) * dt
-        self._driven += way
-        by_pose, by_twist = integration_jacobians(self._pose, *twist, dt)
-        slipped = by_twist * (self._slip * way / dt**2) @ by_twist.T
+        self._driven += roll.way
+        by_pose, by_twist = integration_jacobians(self._pose, *roll.twist, dt)
+        slipped = by_twist * (self._slip * roll.way / dt**2) @ by_twist.T
         moved = by_pose @ self._covariance @ by_pose.T + slipped
         self._covariance = (moved + moved.T) / 2
-        self._pose = integrate(self._pose, *twist, dt)
+        self._pose = integrate(self._pose, *roll.twist, dt)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take a heading: the first ones find north, the others correct the yaw."""
         config = self._config.compass
-        if config is None or attitude.heading_disturbed or self._turns is None:
+        if config is None or attitude.heading_disturbed or not self._wheels.known:
             return
-        ahead = min(max((attitude.stamp - self._stamp) / SECOND, -1.0), self._config.max_prediction)
-        yaw = self._pose[2] + self._twist()[2] * ahead
+        ahead = min(max((attitude.stamp - self._wheels.stamp) / SECOND, -1.0), self._config.max_prediction)
+        yaw = self._pose[2] + self._wheels.twist[2] * ahead
         # The device counts clockwise from north.
         off = -attitude.heading - yaw
         if self._north is None:
@@ -184,15 +178,15 @@ class DeadReckoning:
 
     def estimate(self, now: int) -> Estimate | None:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
-        if self._turns is None:
+        if not self._wheels.known:
             return None
-        age = max((now - self._stamp) / SECOND, 0.0)
-        twist = self._twist()
+        age = max((now - self._wheels.stamp) / SECOND, 0.0)
+        twist = self._wheels.twist
         x, y, yaw = integrate(self._pose, *twist, min(age, self._config.max_prediction))
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
         swing = np.array(((1.0, 0.0, self._pose[1] - y), (0.0, 1.0, x - self._pose[0]), (0.0, 0.0, 1.0)))
         sources = ["drive"]
-        for name, used in (("steering", self._steering_used), ("compass", self._compass_used)):
+        for name, used in (("steering", self._wheels.steered), ("compass", self._compass_used)):
             if used is not None and now - used <= MEMORY:
                 sources.append(name)
         return Estimate(
@@ -204,12 +198,8 @@ class DeadReckoning:
             sources=tuple(sources),
         )
 
-    def _twist(self) -> Vector:
-        return self._chassis.twist(self._pace, *self._angles)
-
     def _lose(self, dt: float) -> None:
         """The drive counts from a new origin: what it did in between is not known."""
-        self._pace = (0.0,) * len(self._pace)
         lost = (self._config.max_speed * dt) ** 2
         turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
         self._covariance = self._covariance + np.diag((lost, lost, turned))
@@ -223,7 +213,7 @@ class DeadReckoning:
 
 
 class OdometryService:
-    """Publishes dead reckoning on an absolute schedule, in odom and, unless something localises, unchanged in map.
+    """Publishes odometry on an absolute schedule, in odom and, unless something localises, unchanged in map.
 
     Args:
         reckoning: the filter.
@@ -240,7 +230,7 @@ class OdometryService:
 
     def __init__(
         self,
-        reckoning: DeadReckoning,
+        reckoning: Reckoner,
         clock: Clock,
         *,
         drives: Sequence[Subscription[DriveFeedback]],
@@ -267,7 +257,7 @@ class OdometryService:
         schedule = Schedule(self._clock, self._rate)
         while True:
             await schedule.next()
-            self._take()
+            self.take()
             now = self._clock.now()
             estimate = self._reckoning.estimate(now)
             if estimate is not None:
@@ -276,7 +266,8 @@ class OdometryService:
                 if self._pose is not None:
                     self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
-    def _take(self) -> None:
+    def take(self) -> None:
+        """Hand on what is new."""
         steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen

@@ -42,6 +42,24 @@ class Odometry(Message):
         return self
 
 
+class ScanMotion(Message):
+    """How base moved between two scans, by the scans alone; ``stamp`` is that of the later one."""
+
+    since: Nanoseconds
+    """Stamp of the earlier scan."""
+    motion: Pose2D
+    """Base at ``stamp`` in base at ``since``."""
+    covariance: Float64Array
+    """Shape (9,), row-major covariance of (x, y, yaw): m^2, m rad, rad^2; huge along a corridor."""
+
+    @model_validator(mode="after")
+    def _shape(self) -> Self:
+        if self.covariance.shape != (9,):
+            msg = "covariance must have shape (9,)"
+            raise ValueError(msg)
+        return self
+
+
 class Transform(Schema):
     """Pose of ``child`` in ``parent``."""
 

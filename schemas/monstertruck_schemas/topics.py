@@ -21,7 +21,7 @@ from monstertruck_schemas.sensor import (
     StabiliserFeedback,
     SteeringFeedback,
 )
-from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, Transforms
+from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, ScanMotion, Transforms
 from monstertruck_schemas.usb import UsbTree
 
 M = TypeVar("M", bound=Message)
@@ -108,6 +108,9 @@ ODOMETRY: Final = Topic(
     foxglove="foxglove.PoseInFrame",
 )
 POSE: Final = Topic("state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, 0.2, foxglove="foxglove.PoseInFrame")
+SCAN_MOTION: Final = Topic(
+    "state/scan_motion", ScanMotion, W.ESTIMATION, "Motion of base between two scans, by the scans alone", 10
+)
 TRANSFORMS: Final = Topic(
     "state/transforms",
     Transforms,

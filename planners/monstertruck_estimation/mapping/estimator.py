@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.config import GridConfig, SlamConfig
-from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Vector
+from monstertruck_estimation.mapping.exchange import Estimate, Moved, Patch, ScanInput, Vector
+from monstertruck_estimation.mapping.increments import Increments
 from monstertruck_estimation.mapping.painter import Painter
 from monstertruck_estimation.mapping.storage import Graph, graph_of
 from monstertruck_estimation.mapping.time_offset import OffsetWatch
@@ -129,6 +130,7 @@ class MappingEstimator:
         self._redrawn = False
         self._misfits = 0
         self._offset = OffsetWatch()
+        self._increments = Increments()
 
     @property
     def twist(self) -> Vector:
@@ -154,6 +156,7 @@ class MappingEstimator:
             self.painter.add(step.scan, step.stamp, step.pose, inputs.mount)
             if inputs.odom is not None:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
+        moved = self._increments.take(step.stamp, step.match, step.pose, corrected=Event.CLOSED in step.events)
         standing = Standing.LOST if self._misfits >= LOST_AFTER else standing_of(step.match, Standing.MAPPING)
         return estimate(
             step.stamp,
@@ -162,6 +165,7 @@ class MappingEstimator:
             standing,
             tuple(map(str, step.events)),
             self._offset.offset,
+            moved,
         )
 
     def changes(self) -> tuple[list[Patch], bool]:
@@ -202,6 +206,7 @@ def estimate(
     standing: Standing,
     events: tuple[str, ...],
     offset: float | None,
+    moved: Moved | None = None,
 ) -> Estimate:
     """Plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
     pose, covariance, correction = placed
@@ -218,6 +223,7 @@ def estimate(
         verdict=str(match.verdict),
         events=events,
         offset=offset,
+        moved=moved,
     )
 
 

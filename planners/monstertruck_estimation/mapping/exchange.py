@@ -83,6 +83,18 @@ class WorkerInput:
 
 
 @dataclass(frozen=True, slots=True)
+class Moved:
+    """How base moved between two scans that fitted, by the scans alone."""
+
+    since: int
+    """Stamp of the earlier scan, ns."""
+    motion: Vector
+    """Base at the later one in base at the earlier one."""
+    covariance: tuple[float, ...]
+    """Row-major (3, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """What one scan told."""
 
@@ -102,6 +114,8 @@ class Estimate:
     events: tuple[str, ...] = ()
     offset: float | None = None
     """Seconds by which odometry runs ahead of the scans, as far as that was found."""
+    moved: Moved | None = None
+    """None for the first scan, and those that do not fit."""
 
 
 @dataclass(frozen=True, slots=True)

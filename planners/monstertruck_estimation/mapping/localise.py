@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.estimator import LOST_AFTER, estimate, standing_of
 from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Vector
+from monstertruck_estimation.mapping.increments import Increments
 from monstertruck_estimation.mapping.storage import Graph, SavedMap, elements
 from monstertruck_estimation.mapping.time_offset import OffsetWatch
 from monstertruck_estimation.slam.config import MapperConfig
@@ -161,6 +162,7 @@ class LocalisingEstimator:
         self._misfits = 0
         self._told = False
         self._offset = OffsetWatch()
+        self._increments = Increments()
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0, "searches": int(start is None)}
 
     @property
@@ -187,12 +189,15 @@ class LocalisingEstimator:
             events: tuple[str, ...] = () if match.accepted else ("rejected",)
         else:
             match, standing, events = self._search(scan, guess, covariance, odom)
+        if "found" in events:
+            self._increments.forget()
+        moved = self._increments.take(stamp, match, match.pose)
         self._pose, self._covariance = match.pose, match.covariance
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
         correction = None if odom is None else compose(self._pose, inverse(odom))
         placed = (self._pose, self._covariance, correction)
-        return estimate(stamp, placed, match, standing, events, self._offset.offset)
+        return estimate(stamp, placed, match, standing, events, self._offset.offset, moved)
 
     def changes(self) -> tuple[list[Patch], bool]:
         """See ``Estimator``: a saved map never changes, but is told once."""

@@ -73,6 +73,8 @@ class Match:
     direction: float
     """Yaw of the weakest direction in the submap's frame, rad, in [-pi/2, pi/2]."""
     verdict: Verdict
+    information: Array | None = None
+    """Shape (3, 3), inverse covariance by the scan alone, without the guess; None if the match is rejected."""
 
     @property
     def accepted(self) -> bool:
@@ -150,7 +152,7 @@ def judge(fit: Fit, guess: Array, covariance: Array) -> Match:
     posterior = np.linalg.inv(fit.information + np.linalg.inv(covariance))
     if verdict is not Verdict.ACCEPTED:
         return Match(guess, covariance, fit.overlap, fit.residual, ratio, direction, verdict)
-    return Match(fit.pose, posterior, fit.overlap, fit.residual, ratio, direction, verdict)
+    return Match(fit.pose, posterior, fit.overlap, fit.residual, ratio, direction, verdict, fit.information)
 
 
 def rejected(guess: Array, covariance: Array, verdict: Verdict) -> Match:

@@ -66,3 +66,13 @@ def interpolate(stamps: Array, poses: Array, at: Array) -> Array:
     result = np.stack([np.interp(at, stamps, column) for column in columns], axis=-1)
     result[:, 2] = wrap(result[:, 2])
     return result
+
+
+def between_jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
+    """Derivatives, shape (3, 3), of ``between(origin, target)`` by ``origin`` and by ``target``."""
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    by_target = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
+    x, y, _ = between(origin, target)
+    by_origin = -by_target
+    by_origin[0, 2], by_origin[1, 2] = y, -x
+    return by_origin, by_target

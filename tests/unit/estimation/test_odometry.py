@@ -12,7 +12,7 @@ from tests.unit.estimation.kit import DRIVETRAIN, Truck, drive_feedback, heading
 
 def test_nothing_is_known_before_the_first_drive_reading():
     truck = Truck()
-    truck.reckoning._turns = None
+    truck.reckoning._wheels._turns = None
     assert truck.estimate is None
 
 
@@ -153,7 +153,9 @@ def test_without_a_compass_the_heading_drifts_with_it_it_stays_bounded():
     drifting = Truck(compass=None)
     held = Truck(compass_error=noisy(math.radians(0.5)))
     for truck in (drifting, held):
-        truck.reckoning._chassis = build_chassis("truck", wheelbase=0.34, drivetrain=DRIVETRAIN)  # a wrong wheelbase
+        truck.reckoning._wheels._chassis = build_chassis(
+            "truck", wheelbase=0.34, drivetrain=DRIVETRAIN
+        )  # a wrong wheelbase
         lap(truck, laps=5)
     assert drifting.error()[1] > 0.3
     assert held.error()[1] < math.radians(5)
@@ -201,7 +203,7 @@ def test_a_sudden_turn_of_the_compass_alone_is_rejected():
 
 def test_headings_before_the_first_drive_reading_are_ignored():
     truck = Truck()
-    truck.reckoning._turns = None
+    truck.reckoning._wheels._turns = None
     truck.reckoning.observe_attitude(heading(truck.now, 0.1))
     assert truck.reckoning._aligning == []
 
@@ -249,7 +251,7 @@ def test_poses_go_out_50_times_a_second_in_odom_and_map():
 
     async def main(clock):
         truck = Truck()
-        truck.reckoning._turns = None
+        truck.reckoning._wheels._turns = None
         drive, steering, compass = Inbox(), Inbox(), Inbox()
         service = OdometryService(
             truck.reckoning, clock, drives=[drive], steering=steering, compass=compass, odometry=odometry, pose=pose

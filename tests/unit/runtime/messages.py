@@ -153,6 +153,8 @@ def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
         )
     if topic is t.SLAM:
         special["overlap"] = st.floats(0, 1)
+    if topic is t.SCAN_MOTION:
+        special |= {"motion": poses, "covariance": hnp.arrays(np.float64, 9, elements=number)}
     if topic is t.STOP:
         special |= {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)}
     return st.builds(topic.model, **special)

@@ -1,0 +1,256 @@
+"""The filter: an error-state extended Kalman filter with stochastic clones, as pure functions of a frozen belief.
+
+State: pose in odom (x, y, yaw), velocity in base (vx, vy, wz), north (yaw in odom at which the compass reads 0: the
+bias of the compass), trim (the bias of the wheels' curvature, rad/m), and two earlier poses: that at the last scan and
+that at the last wheel reading. All errors are additive, yaw on the circle.
+
+Wheels and scans tell motion between two instants, so they are compared with the pose and the clone of the earlier one;
+pose and clone stay correlated, and nothing is counted twice (Roumeliotis and Burdick, "Stochastic cloning", 2002).
+Covariances are updated in Joseph's form, which keeps them symmetric and positive.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.fusion.config import FusionConfig
+from monstertruck_estimation.fusion.heading import Evidence, Gate, Verdict, judged
+from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
+from monstertruck_estimation.slam.se2 import between, between_jacobians
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.motion import integrate, integration_jacobians
+from monstertruck_runtime.clock import SECOND
+
+Array = NDArray[np.float64]
+
+SIZE: Final = 14
+POSE: Final = slice(0, 3)
+TWIST: Final = slice(3, 6)
+YAW, NORTH, TRIM = 2, 6, 7
+SCAN: Final = slice(8, 11)
+WHEELS: Final = slice(11, 14)
+AT_REST: Final = 0.05
+"""Standard deviation of the velocity at the start, m/s and rad/s."""
+QUANTUM: Final = (1e-5, 1e-5)
+"""Standard deviation of a wheel reading that did not move, m and rad: standing costs no certainty."""
+MOVED_BY: Final = ("drive", "lidar")
+"""Sensors that tell motion."""
+STOPPING: Final = 0.1
+"""Time constant with which the velocity dies away when all of them are silent, s."""
+FRESH: Final = SECOND // 2
+"""Tilt counts for this long, ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What is believed at one instant."""
+
+    stamp: int
+    mean: Array
+    """Shape (14,)."""
+    covariance: Array
+    """Shape (14, 14)."""
+    scan: int | None = None
+    """Stamp of the clone at the last scan."""
+    wheels: int | None = None
+    """Stamp of the clone at the last wheel reading."""
+    gate: Gate = field(default_factory=Gate)
+    tilt: tuple[int, float, float] | None = None
+    """Stamp, roll, pitch."""
+    used: dict[str, int] = field(default_factory=dict)
+    """Stamp at which every sensor was last used."""
+    nis: float = 0.0
+    """Normalised innovation squared of the last update."""
+
+
+def initial(stamp: int, config: FusionConfig) -> Belief:
+    """The start: the pose is known by definition, the truck stands."""
+    mean = np.zeros(SIZE)
+    mean[POSE] = config.start.x, config.start.y, config.start.yaw
+    trim = config.wheels.trim if config.wheels is not None else 0.0
+    spread = np.zeros(SIZE)
+    spread[TWIST], spread[NORTH], spread[TRIM] = AT_REST, math.pi, trim
+    return Belief(stamp, mean, np.diag(spread**2))
+
+
+def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
+    """The belief at a later instant (ns): the velocity dies away (Gauss-Markov), the pose follows the arc."""
+    dt = (stamp - belief.stamp) / SECOND
+    if dt <= 0:
+        return belief
+    moved = max((belief.used[name] for name in MOVED_BY if name in belief.used), default=stamp)
+    blind = stamp - moved > config.max_prediction * SECOND
+    lasting = STOPPING if blind else config.persistence
+    keep = math.exp(-dt / lasting)
+    span = lasting * (1.0 - keep)
+    mean = belief.mean.copy()
+    x, y, yaw, vx, vy, wz = mean[:6].tolist()
+    by_pose, by_twist = integration_jacobians((x, y, yaw), vx, vy, wz, span)
+    mean[POSE] = integrate((x, y, yaw), vx, vy, wz, span)
+    mean[TWIST] *= keep
+    step = np.eye(SIZE)
+    step[POSE, POSE], step[POSE, TWIST] = by_pose, by_twist
+    step[TWIST, TWIST] *= keep
+    covariance = step @ belief.covariance @ step.T
+    agility = np.square(config.agility)
+    turned = by_twist / span
+    covariance[POSE, POSE] += turned * (agility * dt**3 / 3) @ turned.T
+    cross = turned * (agility * dt**2 / 2)
+    covariance[POSE, TWIST] += cross
+    covariance[TWIST, POSE] += cross.T
+    covariance[TWIST, TWIST] += np.diag(agility * dt)
+    covariance[NORTH, NORTH] += (config.compass.drift**2 if config.compass is not None else 0.0) * dt
+    covariance[TRIM, TRIM] += (config.wheels.trim_drift**2 if config.wheels is not None else 0.0) * dt
+    return replace(belief, stamp=stamp, mean=mean, covariance=covariance)
+
+
+def advanced(belief: Belief, operation: Operation, config: FusionConfig) -> Belief:
+    """The belief after an operation that is not earlier."""
+    belief = predicted(belief, operation.stamp, config)
+    match operation:
+        case WheelWay():
+            return _wheels(belief, operation, config)
+        case ScanWay():
+            return _scan(belief, operation)
+        case ScanMark():
+            return _cloned(belief, SCAN, scan=operation.stamp)
+        case Heading():
+            return _heading(belief, operation, config)
+
+
+def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> Belief:
+    """Kalman's update in Joseph's form.
+
+    Args:
+        belief: prior.
+        residual: shape (m,), measured minus expected.
+        by_state: shape (m, 14), derivative of the expected by the state.
+        noise: shape (m, m), covariance of the measurement.
+    """
+    spread = by_state @ belief.covariance
+    innovation = spread @ by_state.T + noise
+    gain = np.linalg.solve(innovation, spread).T
+    left = np.eye(SIZE) - gain @ by_state
+    covariance = left @ belief.covariance @ left.T + gain @ noise @ gain.T
+    mean = belief.mean + gain @ residual
+    nis = float(residual @ np.linalg.solve(innovation, residual))
+    return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2, nis=nis)
+
+
+def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
+    """Residual, shape (3,), and derivative, (3, 14), of a motion since a clone."""
+    then, now = belief.mean[clone], belief.mean[POSE]
+    residual = delta - between(then, now)
+    residual[2] = wrap_angle(float(residual[2]))
+    by_state = np.zeros((3, SIZE))
+    by_state[:, clone], by_state[:, POSE] = between_jacobians(then, now)
+    return residual, by_state
+
+
+def _wheels(belief: Belief, way: WheelWay, config: FusionConfig) -> Belief:
+    slip = config.slip
+    if belief.wheels == way.since:
+        level = np.array((*_level(belief), 1.0))
+        delta, dt = way.delta * level, (way.stamp - way.since) / SECOND
+        residual, by_state = _way(belief, WHEELS, delta)
+        signed = math.copysign(math.hypot(delta[0], delta[1]), delta[0])
+        residual[2] -= belief.mean[TRIM] * signed
+        by_state[2, TRIM] = signed
+        noise = way.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
+        if way.slipping:
+            noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
+        belief = updated(belief, residual, by_state, noise)
+        if not way.slipping:
+            belief = replace(belief, used={**belief.used, "drive": way.stamp})
+    return _cloned(belief, WHEELS, wheels=way.stamp)
+
+
+def _level(belief: Belief) -> tuple[float, float]:
+    """Share of a way along x and along y that is level."""
+    if belief.tilt is None or belief.stamp - belief.tilt[0] > FRESH:
+        return 1.0, 1.0
+    return math.cos(belief.tilt[2]), math.cos(belief.tilt[1])
+
+
+def _scan(belief: Belief, way: ScanWay) -> Belief:
+    if belief.scan == way.since:
+        residual, by_state = _way(belief, SCAN, way.delta)
+        belief = updated(belief, residual, by_state, way.covariance)
+        belief = replace(belief, used={**belief.used, "lidar": way.stamp})
+    return _cloned(belief, SCAN, scan=way.stamp)
+
+
+def _cloned(belief: Belief, clone: slice, *, scan: int | None = None, wheels: int | None = None) -> Belief:
+    """The pose as it is now becomes the clone."""
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    mean[clone] = mean[POSE]
+    covariance[clone, :] = covariance[POSE, :]
+    covariance[:, clone] = covariance[:, POSE]
+    return replace(
+        belief,
+        mean=mean,
+        covariance=covariance,
+        scan=belief.scan if scan is None else scan,
+        wheels=belief.wheels if wheels is None else wheels,
+    )
+
+
+def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
+    if heading.tilt is not None:
+        used = {**belief.used, "tilt": heading.stamp}
+        belief = replace(belief, tilt=(heading.stamp, *heading.tilt), used=used)
+    if config.compass is None:
+        return belief
+    mean, covariance = belief.mean, belief.covariance
+    by_state = np.zeros((1, SIZE))
+    by_state[0, YAW], by_state[0, NORTH] = 1.0, -1.0
+    residual = wrap_angle(heading.yaw - float(mean[YAW] - mean[NORTH]))
+    evidence = Evidence(
+        stamp=heading.stamp,
+        residual=residual,
+        variance=float((by_state @ covariance @ by_state.T).item()),
+        yaw_variance=float(covariance[YAW, YAW]),
+        north=(float(mean[NORTH]), float(covariance[NORTH, NORTH])),
+        flagged=heading.disturbed,
+        field=heading.field,
+    )
+    verdict, gate = judged(belief.gate, evidence, config.compass)
+    belief = replace(belief, gate=gate)
+    noise = config.compass.noise**2
+    if verdict is Verdict.LEFT_OUT:
+        return belief
+    if verdict is Verdict.ANCHORED:
+        belief = _anchored(belief, wrap_angle(float(mean[YAW]) - heading.yaw), noise)
+    elif verdict is Verdict.HOME and gate.home is not None:
+        belief = _returned(belief, *gate.home)
+        belief = updated(belief, _residual(belief, heading), by_state, np.array([[noise]]))
+    else:
+        belief = updated(belief, np.array([residual]), by_state, np.array([[noise]]))
+    return replace(belief, used={**belief.used, "compass": heading.stamp})
+
+
+def _residual(belief: Belief, heading: Heading) -> Array:
+    return np.array([wrap_angle(heading.yaw - float(belief.mean[YAW] - belief.mean[NORTH]))])
+
+
+def _anchored(belief: Belief, north: float, noise: float) -> Belief:
+    """North follows from yaw and heading: their errors add up in it."""
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    mean[NORTH] = north
+    covariance[NORTH, :] = covariance[YAW, :]
+    covariance[:, NORTH] = covariance[:, YAW]
+    covariance[NORTH, NORTH] = covariance[YAW, YAW] + noise
+    return replace(belief, mean=mean, covariance=covariance)
+
+
+def _returned(belief: Belief, north: float, variance: float) -> Belief:
+    """North is what it was before the disturbance."""
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    mean[NORTH] = north
+    covariance[NORTH, :] = 0.0
+    covariance[:, NORTH] = 0.0
+    covariance[NORTH, NORTH] = variance
+    return replace(belief, mean=mean, covariance=covariance)

@@ -1,0 +1,104 @@
+"""Settings of the fusion; light, for the daemon's start."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_schemas.base import Pose2D, Schema
+
+Share = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class WheelTrust(Schema):
+    """What the wheels are worth."""
+
+    shaft_noise: Positive = 0.02
+    """Standard deviation of every shaft's way per root metre it rolled, m."""
+    angle_noise: Share = 0.02
+    """Standard deviation of the mean angle of a steered axle over a metre, rad."""
+    slip_noise: tuple[Share, Share, Share] = (0.01, 0.01, 0.03)
+    """Standard deviations of what no wheel can tell, forward and sideways (m) and in yaw (rad), per root metre."""
+    trim: Positive = 0.1
+    """Standard deviation of the constant error of the curvature at the start (a servo off its centre), rad/m."""
+    trim_drift: Positive = 0.002
+    """How fast that may change, rad/m per root second."""
+
+
+class HeadingTrust(Schema):
+    """What the compass is worth, and when it is left out."""
+
+    noise: Positive = 0.05
+    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors last."""
+    drift: Positive = 0.001
+    """How fast its north may wander, rad per root second."""
+    gate: Positive = 3.0
+    """A heading further off than this many standard deviations is left out."""
+    field: Positive = 0.15
+    """Share by which the strength of the magnetic field may differ from what it was at the start."""
+    recover: Annotated[int, Field(ge=1)] = 10
+    """Good headings in a row until a compass that was disturbed counts again."""
+    patience: Positive = 10.0
+    """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
+
+
+class SlipConfig(Schema):
+    """When the wheels are held to slip."""
+
+    window: Positive = 0.4
+    """Seconds over which wheels and scans are compared."""
+    gate: Positive = 4.5
+    """They slip when they are apart by more than this many standard deviations twice in a row, and"""
+    release: Positive = 2.5
+    """no longer when they are closer than this"""
+    calm: Annotated[int, Field(ge=1)] = 5
+    """so many times in a row."""
+    timing: Positive = 0.01
+    """Standard deviation of the offset between the stamps of both, s."""
+    speed: Positive = 0.5
+    """Standard deviation of the speed at which wheels that slip are wrong, m/s,"""
+    turn: Positive = 1.0
+    """and rad/s."""
+
+
+class FusionConfig(Schema):
+    """Odometry from wheels, compass and scans, whichever there are."""
+
+    kind: Literal["fusion"]
+    rate: Annotated[float, Field(gt=0, le=200)] = 50.0
+    """Poses per second."""
+    start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
+    """Pose of base in odom at the start, m and rad."""
+    max_speed: Positive = 0.6
+    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a way."""
+    max_turn: Positive = 3.0
+    """Scans that would need a greater yaw rate than this, rad/s, or a greater speed, are mismatched"""
+    max_prediction: Positive = 0.3
+    """Seconds the last motion is carried on without a reading; then the pose waits, its covariance grows on."""
+    agility: tuple[Positive, Positive, Positive] = (0.7, 0.3, 1.5)
+    """How fast the velocity may change, forward and sideways (m/s) and in yaw (rad/s), per root second."""
+    persistence: Positive = 2.0
+    """Time constant with which an unobserved velocity dies away, s."""
+    horizon: Positive = 1.5
+    """Measurements may come this late, s."""
+    slew: tuple[Positive, Positive] = (0.5, 1.0)
+    """The published pose follows corrections no faster than this, m/s and rad/s: it never jumps."""
+    wheels: WheelTrust | None = WheelTrust()
+    """Null leaves the wheels out"""
+    compass: HeadingTrust | None = HeadingTrust()
+    """Null leaves the compass out"""
+    scans: bool = True
+    """Whether the motion between scans is used, where `slam` finds it"""
+    slip: SlipConfig = SlipConfig()
+
+
+def _kind(section: Any) -> Any:
+    """Which odometry a section means; dead reckoning if it does not say."""
+    return section.get("kind", "reckoning") if isinstance(section, dict) else getattr(section, "kind", None)
+
+
+AnyOdometry = Annotated[
+    Annotated[OdometryConfig, Tag("reckoning")] | Annotated[FusionConfig, Tag("fusion")], Discriminator(_kind)
+]
+"""The daemon's section `odometry`."""

@@ -1,0 +1,268 @@
+"""All sensors to one pose: checks what comes in, keeps it in order, and tells a pose that never jumps."""
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.fusion.beliefs import MOVED_BY, POSE, TRIM, TWIST, Belief, advanced, initial, predicted
+from monstertruck_estimation.fusion.config import FusionConfig
+from monstertruck_estimation.fusion.history import History
+from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
+from monstertruck_estimation.fusion.slip import Change, SlipWatch
+from monstertruck_estimation.mapping.correction import Correction
+from monstertruck_estimation.odometry import MEMORY, Estimate
+from monstertruck_estimation.slam.se2 import compose, inverse
+from monstertruck_estimation.wheel_motion import Roll, WheelMotion, way_covariance
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.motion import integrate
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.state import ScanMotion
+
+Array = NDArray[np.float64]
+
+MARGIN: Final = (0.1, 0.1)
+"""By which two scans may be wrong beside that, m and rad."""
+NAMES: Final = ("drive", "steering", "compass", "tilt", "lidar")
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How the sensors are doing."""
+
+    slipping: bool
+    """The wheels do not hold the ground."""
+    disturbed: bool
+    """The compass is left out."""
+    north: float | None
+    """Yaw in odom of the compass's zero, rad; None until it was found."""
+    trim: float
+    """Estimated error of the wheels' curvature, rad/m."""
+    left_out: dict[str, int]
+    """Readings that could not be used, by sensor and reason."""
+
+
+class Fusion:
+    """Odometry from any subset of wheels, compass and scans.
+
+    Args:
+        config: noise and limits.
+        chassis: from motors and servos to the body's motion; None = no wheels.
+    """
+
+    def __init__(self, config: FusionConfig, chassis: Chassis | None) -> None:
+        self._config = config
+        self._chassis = chassis
+        use = chassis is not None and config.wheels is not None
+        self._wheels = WheelMotion(chassis, config.max_speed) if use and chassis is not None else None
+        self._slip = SlipWatch(config.slip)
+        self._history: History | None = None
+        self._last: dict[str, int] = {}
+        self._shown: tuple[int, Array] | None = None
+        self._correction = Correction(config.slew, math.inf)
+        self._left_out: Counter[str] = Counter()
+        self._changes: deque[Change] = deque()
+
+    # What comes in
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        if self._wheels is not None:
+            self._wheels.observe_steering(feedback)
+
+    def observe_drive(self, *shafts: DriveFeedback) -> None:
+        """Take the position of every driven shaft."""
+        if self._wheels is None or self._chassis is None or self._config.wheels is None:
+            return
+        known, stamp = self._wheels.known, self._wheels.stamp
+        roll = self._wheels.observe_drive(*shafts)
+        if roll is None:
+            if self._wheels.stamp == stamp and known:
+                self._left_out["drive: not later, or no number"] += 1
+            elif self._wheels.known:
+                self._begin(self._wheels.stamp)
+            return
+        if roll.lost:
+            self._left_out["drive: counts from a new origin"] += 1
+            return
+        way = self._way(roll, self._chassis)
+        self._slip.wheels(way)
+        if not self._insert(replace(way, slipping=self._slip.slipping)):
+            self._left_out["drive: too late"] += 1
+
+    def observe_attitude(self, attitude: Attitude) -> None:
+        """Take heading and tilt."""
+        values = (attitude.heading, attitude.roll, attitude.pitch)
+        if not all(map(math.isfinite, values)):
+            self._left_out["compass: no number"] += 1
+            return
+        if not self._later("compass", attitude.stamp):
+            return
+        field = attitude.magnetic_field
+        strength = None if field is None else math.hypot(field.x, field.y, field.z)
+        heading = Heading(
+            stamp=attitude.stamp,
+            # The device counts clockwise from north.
+            yaw=-attitude.heading,
+            disturbed=attitude.heading_disturbed,
+            field=strength if strength is not None and math.isfinite(strength) and strength > 0 else None,
+            tilt=(attitude.roll, attitude.pitch) if attitude.tilt_valid else None,
+        )
+        if self._config.compass is None:
+            heading = replace(heading, disturbed=True)
+        elif heading.field is not None and not heading.disturbed and not self._disturbed:
+            self._heed(self._slip.heading(attitude.stamp, heading.yaw))
+        else:
+            self._slip.forget_headings()
+        if not self._insert(heading):
+            self._left_out["compass: too late"] += 1
+
+    def observe_scan(self, motion: ScanMotion) -> None:
+        """Take the motion between two scans, some time after the later of them."""
+        if not self._config.scans:
+            return
+        way = _scan_way(motion)
+        if way is None:
+            self._left_out["lidar: no motion with a covariance"] += 1
+            return
+        if not self._later("lidar", way.stamp):
+            return
+        dt = (way.stamp - way.since) / SECOND
+        x, y, yaw = np.abs(way.delta).tolist()
+        if max(x, y) > self._config.max_speed * dt + MARGIN[0] or yaw > self._config.max_turn * dt + MARGIN[1]:
+            self._left_out["lidar: faster than the truck can be"] += 1
+            return
+        self._heed(self._slip.scans(way))
+        history = self._begin(way.since)
+        if history.before(way.stamp).scan != way.since:
+            # The clone of the earlier pose has to be made where it was.
+            self._insert(ScanMark(way.since))
+        if not self._insert(way):
+            self._left_out["lidar: too late"] += 1
+
+    # What comes out
+
+    def changes(self) -> list[Change]:
+        """Onsets and ends of slip since the last call."""
+        told = list(self._changes)
+        self._changes.clear()
+        return told
+
+    def standing(self) -> Standing:
+        """How the sensors are doing."""
+        belief = None if self._history is None else self._history.newest
+        gate = None if belief is None else belief.gate
+        return Standing(
+            slipping=self._slip.slipping,
+            disturbed=gate is not None and gate.disturbed,
+            north=None if belief is None or not belief.gate.anchored else float(belief.mean[6]),
+            trim=0.0 if belief is None else float(belief.mean[TRIM]),
+            left_out=dict(self._left_out),
+        )
+
+    @property
+    def belief(self) -> Belief | None:
+        """What the filter believes at its newest measurement."""
+        return None if self._history is None else self._history.newest
+
+    def estimate(self, now: int) -> Estimate | None:
+        """Pose at ``now`` (ns), continuous over corrections; None before the first reading."""
+        if self._history is None:
+            return None
+        belief, config = self._history.newest, self._config
+        moved = max((belief.used[name] for name in MOVED_BY if name in belief.used), default=belief.stamp)
+        last = max(moved, belief.stamp)
+        ahead = predicted(belief, min(now, last + round(config.max_prediction * SECOND)), config)
+        grown = predicted(belief, now, config).covariance
+        pose = self._continuous(ahead, now)
+        off = pose - ahead.mean[POSE]
+        off[2] = math.remainder(off[2], math.tau)
+        vx, vy, wz = ahead.mean[TWIST].tolist()
+        return Estimate(
+            pose=(float(pose[0]), float(pose[1]), math.remainder(float(pose[2]), math.tau)),
+            twist=(vx, vy, wz),
+            pose_covariance=grown[POSE, POSE] + np.outer(off, off),
+            twist_covariance=grown[TWIST, TWIST].copy(),
+            age=max((now - moved) / SECOND, 0.0),
+            sources=self._sources(belief, now),
+        )
+
+    def _continuous(self, ahead: Belief, now: int) -> Array:
+        """The published pose: carried on by the twist, drawn to the belief at a limited pace."""
+        target = ahead.mean[POSE].copy()
+        if self._shown is None:
+            self._shown = (now, target)
+            self._correction.aim((0.0, 0.0, 0.0), at_once=True)
+            return target
+        then, carried = self._shown
+        dt = max((now - then) / SECOND, 0.0)
+        x, y, yaw = carried.tolist()
+        vx, vy, wz = ahead.mean[TWIST].tolist()
+        carried = np.array(integrate((x, y, yaw), vx, vy, wz, dt))
+        self._shown = (max(now, then), carried)
+        x, y, yaw = compose(target, inverse(carried)).tolist()
+        self._correction.aim((x, y, yaw))
+        return np.array(self._correction.pose((carried[0], carried[1], carried[2]), dt))
+
+    def _sources(self, belief: Belief, now: int) -> tuple[str, ...]:
+        used = dict(belief.used)
+        if self._wheels is not None and self._wheels.steered is not None and "drive" in used:
+            used["steering"] = self._wheels.steered
+        return tuple(name for name in NAMES if name in used and now - used[name] <= MEMORY)
+
+    # Order
+
+    def _begin(self, stamp: int) -> History:
+        if self._history is None:
+            advance = partial(advanced, config=self._config)
+            self._history = History(initial(stamp, self._config), advance, round(self._config.horizon * SECOND))
+        return self._history
+
+    def _insert(self, operation: Operation) -> bool:
+        stamp = operation.since if isinstance(operation, WheelWay | ScanWay) else operation.stamp
+        return self._begin(stamp).insert(operation)
+
+    def _later(self, sensor: str, stamp: int) -> bool:
+        if stamp <= self._last.get(sensor, -1):
+            self._left_out[f"{sensor}: not later than the one before"] += 1
+            return False
+        self._last[sensor] = stamp
+        return True
+
+    @property
+    def _disturbed(self) -> bool:
+        return self._history is not None and self._history.newest.gate.disturbed
+
+    def _heed(self, change: Change | None) -> None:
+        if change is None:
+            return
+        self._changes.append(change)
+        if change.slipping and self._history is not None:
+            self._history.rewrite(change.since, _slipping)
+
+    def _way(self, roll: Roll, chassis: Chassis) -> WheelWay:
+        assert self._config.wheels is not None
+        trust = self._config.wheels
+        delta = np.array(integrate((0.0, 0.0, 0.0), *roll.twist, roll.dt))
+        noise = way_covariance(chassis, roll, trust.shaft_noise, trust.angle_noise, trust.slip_noise)
+        return WheelWay(roll.since, roll.stamp, delta, noise)
+
+
+def _slipping(operation: Operation) -> Operation:
+    return replace(operation, slipping=True) if isinstance(operation, WheelWay) else operation
+
+
+def _scan_way(motion: ScanMotion) -> ScanWay | None:
+    delta = np.array((motion.motion.x, motion.motion.y, motion.motion.yaw))
+    covariance = np.array(motion.covariance).reshape(3, 3)
+    covariance = (covariance + covariance.T) / 2
+    if motion.since >= motion.stamp or not (np.isfinite(delta).all() and np.isfinite(covariance).all()):
+        return None
+    if float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
+        return None
+    return ScanWay(motion.since, motion.stamp, delta, covariance)

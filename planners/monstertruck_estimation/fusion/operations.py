@@ -1,0 +1,59 @@
+"""What may happen to the belief, each at its instant."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WheelWay:
+    """The base moved by ``delta`` (dx, dy, dyaw in base at ``since``), say the wheels."""
+
+    since: int
+    stamp: int
+    delta: Array
+    """Shape (3,), m and rad, as if on level ground."""
+    covariance: Array
+    """Shape (3, 3)."""
+    slipping: bool = False
+    """The wheels are known not to hold the ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanWay:
+    """The base moved by ``delta`` between two scans."""
+
+    since: int
+    stamp: int
+    delta: Array
+    """Shape (3,), m and rad."""
+    covariance: Array
+    """Shape (3, 3); huge along a corridor."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMark:
+    """A scan was taken; a later one will tell how the base moved since."""
+
+    stamp: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A reading of the compass."""
+
+    stamp: int
+    yaw: float
+    """Counter-clockwise from magnetic north, rad."""
+    disturbed: bool = False
+    """The device itself says so."""
+    field: float | None = None
+    """Strength of the magnetic field, in the device's unit."""
+    tilt: tuple[float, float] | None = None
+    """Roll and pitch, rad, while they are tilt."""
+
+
+Operation = WheelWay | ScanWay | ScanMark | Heading

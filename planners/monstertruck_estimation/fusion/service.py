@@ -1,0 +1,71 @@
+"""The fusion on the bus."""
+
+from collections.abc import Sequence
+
+from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.odometry import OdometryService
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Subscription
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.state import Odometry, ScanMotion
+
+
+class FusionService(OdometryService):
+    """``OdometryService`` that also takes the motion between scans, and tells slip and a disturbed compass.
+
+    Args:
+        fusion: the filter.
+        clock: time.
+        drives: feedback of every driven shaft.
+        steering: servo feedback, of a body that steers.
+        compass: headings and tilt, if there is a compass.
+        scans: motion between scans, bounded and counted, if something finds it.
+        odometry: ``state/odometry``.
+        pose: ``state/pose``; None = something else publishes it.
+        events: where slip and disturbances are told.
+        rate: poses per second.
+    """
+
+    def __init__(
+        self,
+        fusion: Fusion,
+        clock: Clock,
+        *,
+        drives: Sequence[Subscription[DriveFeedback]],
+        steering: Subscription[SteeringFeedback] | None,
+        compass: Subscription[Attitude] | None,
+        scans: Mailbox[ScanMotion] | None,
+        odometry: Publisher[Odometry],
+        pose: Publisher[Odometry] | None,
+        events: EventSink,
+        rate: float = 50.0,
+    ) -> None:
+        super().__init__(
+            fusion, clock, drives=drives, steering=steering, compass=compass, odometry=odometry, pose=pose, rate=rate
+        )
+        self._fusion = fusion
+        self._scans = scans
+        self._events = events
+        self._disturbed = False
+
+    def take(self) -> None:
+        """Hand on what is new, and tell what has changed."""
+        super().take()
+        for motion in self._scans.drain() if self._scans is not None else ():
+            self._fusion.observe_scan(motion)
+        for change in self._fusion.changes():
+            reason = Reason.WHEEL_SLIP if change.slipping else Reason.WHEEL_GRIP
+            severity = Severity.WARNING if change.slipping else Severity.INFO
+            self._events(reason, severity, self.name, change.text)
+        standing = self._fusion.standing()
+        if standing.disturbed is not self._disturbed:
+            self._disturbed = standing.disturbed
+            if standing.disturbed:
+                self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, "the yaw goes on without it")
+            else:
+                self._events(
+                    Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {standing.north or 0:.2f} rad in odom"
+                )

@@ -1,0 +1,159 @@
+"""Whether the wheels hold the ground: their motion against that between scans, or their yaw against the compass."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.fusion.config import SlipConfig
+from monstertruck_estimation.fusion.operations import ScanWay, WheelWay
+from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, interpolate
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_runtime.clock import SECOND
+
+Array = NDArray[np.float64]
+
+MEMORY: Final = 3 * SECOND
+"""Wheel motion is remembered for this long, ns."""
+AHEAD: Final = SECOND // 8
+"""A scan may be so much newer than the wheels, ns; they are taken to go on."""
+BLIND: Final = SECOND
+"""Without scans for so long, the compass is the judge, ns."""
+FLOOR: Final = (0.003, 0.005)
+"""Standard deviation of any comparison, m and rad."""
+JITTER: Final = 0.01
+"""Standard deviation of a compass heading against one a second before, rad."""
+SPAN: Final = SECOND
+"""Wheels and compass are compared over this long, ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """The wheels began to slip, or ceased to."""
+
+    slipping: bool
+    since: int
+    """ns from which the wheels are not to be trusted."""
+    text: str
+    """What disagreed, in words."""
+
+
+class SlipWatch:
+    """Compares, and remembers with hysteresis.
+
+    Args:
+        config: thresholds.
+    """
+
+    def __init__(self, config: SlipConfig) -> None:
+        self._config = config
+        self._trail: deque[tuple[int, Array, Array]] = deque()
+        """Stamp, pose, and the sum of the ways' covariances: over a window too short to turn them into each other."""
+        self._ways: deque[ScanWay] = deque()
+        self._headings: deque[tuple[int, float]] = deque()
+        self._suspicious = 0
+        self._calm = 0
+        self._scanned: int | None = None
+        self.slipping = False
+        self.distance = 0.0
+        """Last distance between the two, in standard deviations."""
+
+    def wheels(self, way: WheelWay) -> None:
+        """Take what the wheels say."""
+        if not self._trail or self._trail[-1][0] != way.since:
+            self._trail.clear()
+            self._trail.append((way.since, np.zeros(3), np.zeros((3, 3))))
+        _, pose, spread = self._trail[-1]
+        self._trail.append((way.stamp, compose(pose, way.delta), spread + way.covariance))
+        while self._trail[0][0] < way.stamp - MEMORY:
+            self._trail.popleft()
+
+    def scans(self, way: ScanWay) -> Change | None:
+        """Take the motion between two scans; tells a change of verdict."""
+        self._scanned = way.stamp
+        if self._ways and self._ways[-1].stamp != way.since:
+            self._ways.clear()
+        self._ways.append(way)
+        while len(self._ways) > 1 and way.stamp - self._ways[1].since >= self._config.window * SECOND:
+            self._ways.popleft()
+        since = self._ways[0].since
+        told = self._told(since, way.stamp)
+        if told is None:
+            return None
+        moved, spread = np.zeros(3), np.zeros((3, 3))
+        for one in self._ways:
+            by_pose, by_way = compose_jacobians(moved, one.delta)
+            spread = by_pose @ spread @ by_pose.T + by_way @ one.covariance @ by_way.T
+            moved = compose(moved, one.delta)
+        delta, noise = told
+        off = delta - moved
+        off[2] = wrap_angle(float(off[2]))
+        distance = math.sqrt(float(off @ np.linalg.solve(spread + noise, off)))
+        seconds = (way.stamp - since) / SECOND
+        text = f"wheels and scans differ by {math.hypot(off[0], off[1]):.3f} m and {off[2]:+.3f} rad in {seconds:.1f} s"
+        return self._judged(distance, since, text)
+
+    def heading(self, stamp: int, yaw: float) -> Change | None:
+        """Take an undisturbed heading (counter-clockwise, rad); it is the judge where there are no scans."""
+        self._headings.append((stamp, yaw))
+        while len(self._headings) > 1 and stamp - self._headings[1][0] >= SPAN:
+            self._headings.popleft()
+        since, before = self._headings[0]
+        if self._scanned is not None and stamp - self._scanned < BLIND:
+            return None
+        told = self._told(since, stamp) if stamp - since >= SPAN * 3 // 4 else None
+        if told is None:
+            return None
+        delta, noise = told
+        off = wrap_angle(float(delta[2]) - wrap_angle(yaw - before))
+        distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * JITTER**2)
+        text = f"wheels and compass differ by {off:+.3f} rad in {(stamp - since) / SECOND:.1f} s"
+        return self._judged(distance, since, text)
+
+    def forget_headings(self) -> None:
+        """The compass was disturbed: what comes next is not to be compared with what was."""
+        self._headings.clear()
+
+    def _told(self, since: int, stamp: int) -> tuple[Array, Array] | None:
+        """Way of the wheels between two instants and its covariance, (3,) and (3, 3); None if they are not known."""
+        trail = self._trail
+        if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + AHEAD:
+            return None
+        stamps = np.array([row[0] - since for row in trail], dtype=np.float64)
+        poses = np.array([row[1] for row in trail])
+        if stamp > trail[-1][0]:
+            share = (stamp - trail[-1][0]) / (trail[-1][0] - trail[-2][0])
+            further = compose(poses[-1], between(poses[-2], poses[-1]) * share)
+            stamps, poses = np.append(stamps, stamp - since), np.vstack((poses, further))
+        begin, end = interpolate(stamps, poses, np.array((0.0, stamp - since), dtype=np.float64))
+        delta = between(begin, end)
+        first, last = np.searchsorted(stamps[: len(trail)], (0, stamp - since))
+        grown = trail[min(int(last), len(trail) - 1)][2] - trail[max(int(first) - 1, 0)][2]
+        place, turn = max(grown[0, 0], grown[1, 1], 0.0), max(grown[2, 2], 0.0)
+        speed, rate = (abs(delta) / ((stamp - since) / SECOND))[[0, 2]]
+        timing = self._config.timing
+        return delta, np.diag(
+            (
+                place + FLOOR[0] ** 2 + (timing * speed) ** 2,
+                place + FLOOR[0] ** 2 + (timing * speed) ** 2,
+                turn + FLOOR[1] ** 2 + (timing * rate) ** 2,
+            )
+        )
+
+    def _judged(self, distance: float, since: int, text: str) -> Change | None:
+        self.distance = distance
+        config = self._config
+        if not self.slipping:
+            self._suspicious = self._suspicious + 1 if distance > config.gate else 0
+            if self._suspicious >= 2 or distance > 2 * config.gate:
+                self.slipping, self._suspicious, self._calm = True, 0, 0
+                return Change(slipping=True, since=since, text=text)
+            return None
+        self._calm = self._calm + 1 if distance < config.release else 0
+        if self._calm < config.calm:
+            return None
+        self.slipping = False
+        return Change(slipping=False, since=since, text=text)

@@ -1,0 +1,140 @@
+"""What the wheels did between two readings, of any drive family, and how far that is to be trusted.
+
+The covariance comes from the family's own kinematics: the noise of every driven shaft and of both axle angles goes
+through the derivatives of the body's twist, and what no wheel can tell (sideways slip, scrubbing) is added to it.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.chassis import Chassis, Speeds
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+_ANGLE_STEP = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Roll:
+    """Motion of base between two readings of all driven shafts."""
+
+    since: int
+    """ns."""
+    stamp: int
+    """ns."""
+    twist: Vector
+    """Mean vx, vy (m/s) and wz (rad/s) in between."""
+    way: float
+    """Of the fastest shaft, m, not negative."""
+    pace: Speeds
+    """What the family makes of its shafts, see ``Chassis.pace``."""
+    angles: tuple[float, float]
+    """Mean axle angles, rad."""
+    lost: bool = False
+    """The drive counts from a new origin: what it did is not known, and the twist is 0."""
+
+    @property
+    def dt(self) -> float:
+        """Seconds."""
+        return (self.stamp - self.since) / SECOND
+
+
+class WheelMotion:
+    """Turns drive and steering feedback into the base's motion.
+
+    Args:
+        chassis: from motors and servos to the body's motion.
+        max_speed: a position that would need more than this, m/s, is a new origin, not a way.
+    """
+
+    def __init__(self, chassis: Chassis, max_speed: float) -> None:
+        self._chassis = chassis
+        self._max_speed = max_speed
+        self._turns: Speeds | None = None
+        self._angles = (0.0, 0.0)
+        self._angles_then = (0.0, 0.0)
+        self._pace: Speeds = (0.0,) * len(chassis.shafts)
+        self.stamp = 0
+        """Of the newest reading that was used, ns."""
+        self.steered: int | None = None
+        """Stamp of the newest servo angles, ns."""
+
+    @property
+    def known(self) -> bool:
+        """Whether the shafts' positions have been read."""
+        return self._turns is not None
+
+    @property
+    def twist(self) -> Vector:
+        """Velocity (vx, vy, wz) at the newest pace and the newest axle angles; m/s, rad/s."""
+        return self._chassis.twist(self._pace, *self._angles)
+
+    def observe_steering(self, feedback: SteeringFeedback) -> None:
+        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        if not feedback.trusted or not math.isfinite(feedback.front + feedback.rear):
+            return
+        self._angles = self._chassis.axles(feedback.front, feedback.rear)
+        self.steered = feedback.stamp
+
+    def observe_drive(self, *shafts: DriveFeedback) -> Roll | None:
+        """Motion since the last reading; None for the first, one that is not later, or one that is not a number.
+
+        Positions that were not read at one instant are brought to the newest by their own speeds; what that misses is
+        made up by the next ones.
+        """
+        stamp = max(shaft.stamp for shaft in shafts)
+        turns = tuple(shaft.position + shaft.velocity * ((stamp - shaft.stamp) / SECOND) for shaft in shafts)
+        before, since, then = self._turns, self.stamp, self._angles_then
+        dt = (stamp - since) / SECOND
+        if not all(map(math.isfinite, turns)) or (before is not None and dt <= 0):
+            return None
+        self._turns, self.stamp, self._angles_then = turns, stamp, self._angles
+        if before is None:
+            return None
+        drivetrain = self._chassis.drivetrain
+        rolled = [drivetrain.distance(now - last) for now, last in zip(turns, before, strict=True)]
+        angles = ((then[0] + self._angles[0]) / 2, (then[1] + self._angles[1]) / 2)
+        if max(map(abs, rolled)) > self._max_speed * dt:
+            self._pace = (0.0,) * len(self._pace)
+            return Roll(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
+        self._pace = self._chassis.pace(tuple(way / dt for way in rolled), *angles)
+        way = max(map(abs, self._pace)) * dt
+        return Roll(since, stamp, self._chassis.twist(self._pace, *angles), way, self._pace, angles)
+
+
+def way_covariance(chassis: Chassis, roll: Roll, shaft: float, angle: float, slip: Vector) -> Array:
+    """Covariance, shape (3, 3), of the way (dx, dy, dyaw) that ``roll`` stands for, in base; m and rad.
+
+    It grows with the way, not with the number of readings the way is cut into.
+
+    Args:
+        chassis: the body.
+        roll: what the wheels did.
+        shaft: standard deviation of every shaft's way per root metre it rolled, m.
+        angle: standard deviation of the mean angle of every axle over one metre, rad.
+        slip: standard deviations of what the wheels cannot tell, forward and sideways (m) and in yaw (rad), per root
+            metre.
+    """
+    dt, (front, rear) = roll.dt, roll.angles
+    result = np.diag(np.square(slip) * roll.way)
+    for k, pace in enumerate(roll.pace):
+        unit = tuple(float(k == i) for i in range(len(roll.pace)))
+        by_shaft = np.array(chassis.twist(unit, front, rear))
+        result += np.outer(by_shaft, by_shaft) * (shaft**2 * abs(pace) * dt)
+    if chassis.linkage is None or roll.way <= 0:
+        return result
+    # An axle that is coupled to the other, or not steered, has no error of its own.
+    steered = {"both": ((1, 0), (0, 1)), "front": ((1, 0),), "parallel": ((1, 1),)}[chassis.freedom]
+    for one, other in steered:
+        step = (one * _ANGLE_STEP, other * _ANGLE_STEP)
+        ahead = np.array(chassis.twist(roll.pace, front + step[0], rear + step[1]))
+        behind = np.array(chassis.twist(roll.pace, front - step[0], rear - step[1]))
+        by_angle = (ahead - behind) * (dt / (2 * _ANGLE_STEP))
+        result += np.outer(by_angle, by_angle) * (angle**2 / roll.way)
+    return result

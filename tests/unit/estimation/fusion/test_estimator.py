@@ -1,0 +1,243 @@
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_runtime.clock import SECOND
+from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, scan_motion, wander
+from tests.unit.estimation.kit import CHASSIS, drive_feedback, servo_feedback
+
+NAMES = {"wheels": {"drive", "steering"}, "compass": {"compass", "tilt"}, "scans": {"lidar"}}
+SUBSETS = [subset for size in (1, 2, 3) for subset in combinations(ALL, size)]
+
+
+@pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
+def test_any_subset_gives_an_estimate_that_names_it(sensors):
+    rig = wander(Rig(sensors), seconds=6)
+    assert set(rig.estimate.sources) == set().union(*(NAMES[sensor] for sensor in sensors))
+    assert np.isfinite(rig.estimate.pose).all()
+    assert np.linalg.eigvalsh(rig.estimate.pose_covariance)[0] > 0
+    if sensors != ("compass",):
+        assert rig.error()[0] < 0.25
+    if "compass" in sensors:
+        assert rig.error()[1] < 0.1
+
+
+def test_more_sensors_err_less():
+    def rms(sensors):
+        errors = [wander(Rig(sensors, seed=seed), seconds=12).error()[0] for seed in range(3)]
+        return math.sqrt(np.mean(np.square(errors)))
+
+    assert rms(ALL) < rms(("wheels",))
+    assert rms(ALL) < rms(("scans",))
+
+
+def test_the_errors_are_as_great_as_the_covariance_says():
+    """Bar-Shalom's consistency test: the mean NEES of 12 runs of 3 degrees of freedom lies in its 99.9 % bounds."""
+    runs = np.array([wander(Rig(ALL, seed=seed), seconds=12).nees()[-1] for seed in range(12)])
+    assert runs.mean() < 3 * (1 + 3.3 * math.sqrt(2 / (3 * 12)))
+    assert runs.mean() > 0.3, "much too modest"
+
+
+def test_a_corridor_does_not_collapse_what_the_wheels_say_along_it():
+    rig = Rig(("wheels", "scans"))
+    rig.degenerate = 0.0
+    rig.drive(0.3, 0.0, 0.0, 20.0)
+    wheels = Rig(("wheels",)).drive(0.3, 0.0, 0.0, 20.0)
+    along, across = np.sqrt(np.diag(rig.estimate.pose_covariance)[:2])
+    assert along > 0.8 * math.sqrt(wheels.estimate.pose_covariance[0, 0])
+    assert across < 0.7 * math.sqrt(wheels.estimate.pose_covariance[1, 1])
+    assert rig.error()[0] < 4 * max(along, across)
+
+
+def test_a_trim_of_the_steering_is_learned():
+    learned, blind = Rig(ALL), Rig(("wheels",))
+    for rig in (learned, blind):
+        rig.crooked = 0.01
+        rig.drive(0.3, 0.0, 0.0, 15.0)
+    assert learned.fusion.standing().trim == pytest.approx(2 * math.tan(0.01) / 0.32, abs=0.02)
+    learned.sensors = {"wheels"}
+    turned, off = learned.error()[1], blind.error()[1]
+    for rig in (learned, blind):
+        rig.drive(0.3, 0.0, 0.0, 5.0)
+    assert abs(learned.error()[1] - turned) < 0.3 * (blind.error()[1] - off)
+
+
+def test_the_pose_never_jumps_though_slip_is_corrected():
+    rig = Rig(ALL).drive(0.3, 0.1, -0.1, 4.0)
+    rig.slip = 1.8
+    rig.drive(0.3, 0.1, -0.1, 1.5)
+    rig.slip = 1.0
+    rig.drive(0.3, 0.1, -0.1, 4.0)
+    assert rig.steps().max() < (0.3 * 1.8 + 0.5) / 50 + 1e-3
+    assert [change.slipping for change in rig.changes] == [True, False]
+    assert "wheels and scans differ by" in rig.changes[0].text
+
+
+def test_slip_that_the_scans_show_costs_little():
+    def error(sensors):
+        rig = Rig(sensors).drive(0.3, 0.1, -0.1, 4.0)
+        rig.slip = 1.8
+        rig.drive(0.3, 0.1, -0.1, 1.5)
+        rig.slip = 1.0
+        return rig.drive(0.3, 0.1, -0.1, 2.0).error()[0]
+
+    assert error(ALL) < 0.05
+    assert error(("wheels",)) > 0.2
+
+
+def test_wheels_that_slip_do_not_count_as_a_source():
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 4.0)
+    rig.slip = 1.8
+    rig.drive(0.3, 0.0, 0.0, 2.5)
+    assert rig.fusion.standing().slipping
+    assert "drive" not in rig.estimate.sources
+    assert "lidar" in rig.estimate.sources
+
+
+def test_good_wheels_never_count_as_slipping():
+    for seed in range(2):
+        assert wander(Rig(ALL, seed=seed)).changes == []
+
+
+def test_a_turn_that_only_the_wheels_make_is_slip_by_the_compass():
+    rig = Rig(("wheels", "compass")).drive(0.3, 0.0, 0.0, 4.0)
+    rig.crooked = 0.3
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    assert [change.slipping for change in rig.changes] == [True]
+    assert "compass" in rig.changes[0].text
+    assert rig.error()[1] < 0.25
+
+
+def test_a_sensor_that_falls_silent_is_done_without():
+    rig = Rig(ALL).drive(0.3, 0.1, -0.1, 4.0)
+    rig.sensors = {"compass", "scans"}
+    rig.drive(0.3, 0.1, -0.1, 4.0)
+    assert rig.estimate.sources == ("compass", "tilt", "lidar")
+    assert rig.error()[0] < 0.08
+    rig.sensors = {"compass"}
+    there = rig.estimate.pose
+    rig.drive(0.0, 0.0, 0.0, 4.0)
+    assert rig.estimate.sources == ("compass", "tilt")
+    assert math.dist(there[:2], rig.estimate.pose[:2]) < 0.3, "the last motion is not carried on for ever"
+    assert rig.estimate.age > 3.0
+
+
+def test_tilt_shortens_the_way_over_a_ramp():
+    def way(pitch):
+        fusion = Fusion(config(), CHASSIS)
+        for k in range(200):
+            now = SECOND + k * 5 * TICK
+            fusion.observe_steering(servo_feedback(now, 0.0, 0.0))
+            fusion.observe_attitude(attitude(now - 1, 0.0, pitch=pitch))
+            fusion.observe_drive(drive_feedback(now, k * 100.0))
+        return fusion.belief.mean[0]
+
+    assert way(-0.3) == pytest.approx(way(0.0) * math.cos(0.3), rel=1e-3)
+
+
+# Bad input
+
+
+def test_late_measurements_give_what_punctual_ones_give():
+    early, late = Rig(ALL, seed=3), Rig(ALL, seed=3)
+    early.delay, late.delay = 0, 60
+    for rig in (early, late):
+        rig.drive(0.3, 0.1, -0.1, 6.0)
+        for motion in rig.waiting:
+            rig.fusion.observe_scan(motion)
+        rig.waiting.clear()
+    assert late.fusion.belief.mean == pytest.approx(early.fusion.belief.mean, abs=1e-9)
+    assert late.fusion.belief.covariance == pytest.approx(early.fusion.belief.covariance, abs=1e-12)
+
+
+def test_what_is_too_late_is_left_out():
+    rig = Rig(("wheels", "compass")).drive(0.3, 0.0, 0.0, 6.0)
+    before = rig.fusion.belief
+    rig.fusion.observe_scan(scan_motion(SECOND, SECOND + 10 * TICK, (0.05, 0.0, 0.0), np.eye(3) * 1e-6))
+    assert rig.fusion.belief.mean == pytest.approx(before.mean)
+    assert rig.fusion.standing().left_out == {"lidar: too late": 1}
+
+
+@pytest.mark.parametrize("step", [0, -SECOND // 2])
+def test_duplicates_and_time_that_goes_back_change_nothing(step):
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
+    before = rig.fusion.belief
+    stamp = rig.fusion._last["lidar"] + step
+    rig.fusion.observe_drive(drive_feedback(rig.now + step, rig.motor + 100.0))
+    rig.fusion.observe_attitude(attitude(rig.fusion._last["compass"] + step, 2.0))
+    rig.fusion.observe_scan(scan_motion(stamp - 10 * TICK, stamp, (1.0, 0.0, 0.0), np.eye(3) * 1e-6))
+    assert rig.fusion.belief is before
+    assert sum(rig.fusion.standing().left_out.values()) == 3
+
+
+def test_an_estimate_for_an_earlier_instant_does_not_move_the_pose():
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
+    pose = rig.estimate.pose
+    assert rig.fusion.estimate(rig.now - SECOND).pose == pytest.approx(pose, abs=0.02)
+    assert rig.fusion.estimate(rig.now).pose == pytest.approx(pose, abs=0.02)
+
+
+def test_what_is_no_number_is_left_out():
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
+    before, now = rig.fusion.belief, rig.now + TICK
+    nan = math.nan
+    rig.fusion.observe_drive(drive_feedback(now, 0.0).model_copy(update={"position": nan}))
+    rig.fusion.observe_steering(servo_feedback(now, 0.0, 0.0).model_copy(update={"front": nan}))
+    for name in ("heading", "roll", "pitch"):
+        rig.fusion.observe_attitude(attitude(now, 0.0).model_copy(update={name: nan}))
+    good = scan_motion(now - 10 * TICK, now, (0.0, 0.0, 0.0), np.eye(3))
+    for covariance in (np.full(9, nan), -np.eye(3).ravel(), np.zeros(9)):
+        rig.fusion.observe_scan(good.model_copy(update={"covariance": covariance}))
+    rig.fusion.observe_scan(good.model_copy(update={"motion": good.motion.model_copy(update={"x": nan})}))
+    rig.fusion.observe_scan(good.model_copy(update={"since": now}))
+    assert rig.fusion.belief is before
+    assert sum(rig.fusion.standing().left_out.values()) == 9
+    rig.drive(0.3, 0.0, 0.0, 1.0)
+    assert rig.error()[0] < 0.05
+
+
+def test_missing_scans_are_stepped_over():
+    rig = Rig(ALL, seed=2).drive(0.3, 0.1, -0.1, 3.0)
+    rig.sensors.remove("scans")
+    rig.drive(0.3, 0.1, -0.1, 3.0)
+    rig.sensors.add("scans")
+    rig.drive(0.3, 0.1, -0.1, 1.0)
+    assert rig.error()[0] < 0.05
+    assert rig.steps().max() < 0.02
+    assert "lidar" in rig.estimate.sources
+
+
+def test_a_drive_that_counts_anew_does_not_move_the_truck():
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
+    rig.motor = -1000.0
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    assert rig.error()[0] < 0.05
+    assert rig.steps().max() < 0.02
+    assert rig.fusion.standing().left_out == {"drive: counts from a new origin": 1}
+
+
+def test_a_scan_motion_of_nowhere_makes_no_jump():
+    rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
+    since, _ = rig.last
+    rig.waiting.clear()
+    rig.fusion.observe_scan(scan_motion(since, since + 5 * TICK, (3.0, -2.0, 1.0), np.eye(3) * 1e-5))
+    rig.drive(0.0, 0.0, 0.0, 0.2)
+    assert rig.steps().max() < 0.03
+
+
+def test_nothing_is_known_before_the_first_reading():
+    fusion = Fusion(config(), CHASSIS)
+    assert fusion.estimate(SECOND) is None
+    assert fusion.belief is None
+    assert fusion.standing().north is None
+
+
+def test_sections_set_null_leave_sensors_out():
+    rig = Rig(ALL, wheels=None, compass=None).drive(0.3, 0.0, 0.0, 3.0)
+    assert rig.estimate.sources == ("tilt", "lidar")
+    assert rig.error()[0] < 0.08
+    rig = Rig(ALL, scans=False).drive(0.3, 0.0, 0.0, 3.0)
+    assert "lidar" not in rig.estimate.sources
