@@ -16,8 +16,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.topics import Topic
 from monstertruckd.recorder.file import Entry
 
-BLOCK: Final = 256 * 1024
-"""Bytes of entries that are freed together."""
+BLOCK: Final = 120 * 1024
+"""Bytes of entries that are freed together; so many come from the heap, which keeps them, not from the kernel."""
 SHARE: Final = 32
 """Part of the whole memory that a block takes at most."""
 
