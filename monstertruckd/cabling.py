@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from monstertruck_drivers.host_health.readings import Disk, disk_of
 from monstertruck_drivers.link import Port, SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator
@@ -36,6 +37,8 @@ class Computer:
     """Folder with its proc and sys."""
     watch: Callable[[], Watcher] = open_watcher
     """Opens the source of USB announcements."""
+    disk: Callable[[Path], Disk] = disk_of
+    """Its file system at a path."""
 
     @classmethod
     def at(cls, root: Path, clock: Clock) -> Self:

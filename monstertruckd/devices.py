@@ -85,4 +85,6 @@ def build_monitors(config: TruckConfig, computer: Computer, clock: Clock, bus: B
         yield LinkQualityDriver(monitors.link, clock, link, events, root=computer.root, offload=beside)
     if monitors.host is not None:
         host = bus.publisher(topics.HOST, Writer.DRIVER)
-        yield HostHealthDriver(monitors.host, clock, host, events, root=computer.root, offload=beside)
+        yield HostHealthDriver(
+            monitors.host, clock, host, events, root=computer.root, disk=computer.disk, offload=beside
+        )

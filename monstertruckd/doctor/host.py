@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.host_health.readings import read_host
+from monstertruck_drivers.host_health.readings import disk_of, read_host
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.interfaces import choose, read_interfaces
 from monstertruck_drivers.link_quality.judge import LinkJudge
@@ -50,7 +50,7 @@ def condition(patient: Patient) -> Iterator[Finding]:
     limits = (config.monitors.host if config is not None else None) or HostHealthConfig()
     folder = patient.logs()
     try:
-        host = read_host(patient.computer.root, folder)
+        host = read_host(patient.computer.root, disk_of(folder))
     except DeviceError as error:
         yield warn("host", error.reason, str(error))
         return

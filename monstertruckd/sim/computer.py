@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
+from monstertruck_drivers.host_health.readings import Disk
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.tree import ancestors
@@ -23,6 +24,8 @@ IDENTITIES = {
 }
 """USB identity, product and kind of node by kind of device."""
 HUB_PORTS = 7
+DISK = Disk(total=64_000_000_000, free=32_000_000_000)
+"""Of an emulated computer; on the real one, every run would record something else."""
 HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
 
 
@@ -99,7 +102,7 @@ class EmulatedComputer:
 
     def computer(self) -> Computer:
         """What a daemon in this process takes for its computer."""
-        return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher)
+        return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
 
     def command(self, words: list[str]) -> None:
         """Obey one word on the USB tree, see ``HELP``; a hub that returns takes its time.

@@ -1,7 +1,9 @@
 """Stops of the whole daemon, told with their causes and kept in black boxes, on the virtual clock."""
 
+import os
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -110,6 +112,26 @@ def shutdown_after_estop(folder: Path) -> tuple[str, bytes]:
     messages = [message for message in open_log(box.path) if message.topic == "cmd/drive"]
     assert b"quick_stop" in messages[-1].payload, "the farewell is in it"
     return digest, b"".join(message.payload for message in open_log(box.path))
+
+
+def three_seconds(folder: Path) -> str:
+    """Digest of a short run of the whole truck with its hubs and its computer."""
+    config = with_overlay(base("full"), {"recorder": {"directory": str(folder)}, "map": None})
+
+    async def main(clock: VirtualClock) -> str:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            await clock.sleep(3.0)
+        return rig.daemon.digest.hexdigest()
+
+    return run_virtual(main)
+
+
+def test_the_whole_truck_records_the_same_whatever_the_real_computer_does(tmp_path: Path, monkeypatch):
+    first = three_seconds(tmp_path / "a")
+    found = os.statvfs(tmp_path)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_frsize=1, f_blocks=found.f_blocks, f_bavail=7))
+    assert three_seconds(tmp_path / "b") == first
 
 
 def test_an_emergency_stop_and_the_end_at_once_leave_a_box_the_same_in_every_run(tmp_path: Path):

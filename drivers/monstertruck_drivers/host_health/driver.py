@@ -1,10 +1,11 @@
 """Host monitor: looks once a second, reports what gets short."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
+from monstertruck_drivers.host_health.readings import Disk, Reading, busy_share, disk_of, read_host
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_runtime.schedule import Schedule
@@ -27,6 +28,7 @@ class HostHealthDriver:
         out: host health.
         events: what gets short, and when it is over.
         root: folder that holds ``proc`` and ``sys``.
+        disk: asks for the file system of a path.
         offload: where files are read.
         name: service name.
     """
@@ -39,6 +41,7 @@ class HostHealthDriver:
         events: EventSink,
         *,
         root: Path = Path("/"),
+        disk: Callable[[Path], Disk] = disk_of,
         offload: Offload = in_thread,
         name: str = "host",
     ) -> None:
@@ -48,6 +51,7 @@ class HostHealthDriver:
         self._out = out
         self._events = events
         self._root = root
+        self._disk = disk
         self._offload = offload
         self._before: Reading | None = None
         self._alarms = {
@@ -69,7 +73,7 @@ class HostHealthDriver:
         while True:
             await schedule.next()
             stamp = self._clock.now()
-            reading = await self._offload(lambda: read_host(self._root, self._config.disk_path))
+            reading = await self._offload(lambda: read_host(self._root, self._disk(self._config.disk_path)))
             health = self._health(stamp, reading)
             self._out.put(health)
             self._judge(health)

@@ -24,8 +24,6 @@ class HostEmulator:
     clock), ``firmware HEX``, ``throttle`` (one more event of the counter), ``blind`` (no /sys at all), ``broken``
     (/proc/stat is empty).
 
-    The disk is the real one that ``disk_path`` of the driver is on.
-
     Args:
         root: folder that stands for /.
         clock: time.

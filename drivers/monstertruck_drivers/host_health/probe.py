@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from monstertruck_drivers.host_health.readings import read_host
+from monstertruck_drivers.host_health.readings import disk_of, read_host
 from monstertruck_runtime.threads import Offload, in_thread
 
 
@@ -17,4 +17,4 @@ async def probe(root: Path = Path("/"), disk_path: Path = Path(), offload: Offlo
     Raises:
         DeviceError: /proc cannot be read.
     """
-    return asdict(await offload(lambda: read_host(root, disk_path)))
+    return asdict(await offload(lambda: read_host(root, disk_of(disk_path))))

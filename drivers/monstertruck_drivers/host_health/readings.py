@@ -61,12 +61,12 @@ class Reading:
     daemon_files: int
 
 
-def read_host(root: Path, disk_path: Path) -> Reading:
+def read_host(root: Path, disk: Disk) -> Reading:
     """Read everything once.
 
     Args:
         root: folder that holds ``proc`` and ``sys``.
-        disk_path: file or folder whose file system counts; if it does not exist, its nearest parent.
+        disk: the file system that counts.
 
     Raises:
         DeviceError: no /proc.
@@ -86,7 +86,7 @@ def read_host(root: Path, disk_path: Path) -> Reading:
         firmware_throttled=_firmware_throttled(root / FIRMWARE_THROTTLED),
         memory_total=total,
         memory_available=available,
-        disk=_disk(disk_path),
+        disk=disk,
         daemon_memory=_resident(_required(root / "proc/self/statm")),
         daemon_files=sum(1 for _ in (root / "proc/self/fd").glob("*")),
     )
@@ -182,8 +182,12 @@ def _firmware_throttled(file: Path) -> bool:
         return False
 
 
-def _disk(path: Path) -> Disk:
-    """The file system of ``path`` or of its nearest parent that exists."""
+def disk_of(path: Path) -> Disk:
+    """The file system of ``path`` or of its nearest parent that exists.
+
+    Raises:
+        DeviceError: it cannot be asked.
+    """
     while not path.exists() and path != path.parent:
         path = path.parent
     try:

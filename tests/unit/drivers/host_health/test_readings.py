@@ -12,6 +12,7 @@ from monstertruck_drivers.host_health.probe import probe
 from monstertruck_drivers.host_health.readings import (
     Times,
     busy_share,
+    disk_of,
     parse_meminfo,
     parse_stat,
     read_host,
@@ -55,7 +56,7 @@ def test_everything_of_a_board(tmp_path: Path):
     emulator.inject("cap", "0.5")
     emulator.inject("throttle")
     emulator.inject("firmware", "50001")
-    reading = read_host(tmp_path, tmp_path)
+    reading = read_host(tmp_path, disk_of(tmp_path))
     assert (reading.cores, reading.load) == (4, 1.0)
     assert reading.temperature == 50.0, "the zone of -274 degrees is no zone"
     assert reading.frequency == pytest.approx(0.81e9)
@@ -71,12 +72,12 @@ def test_everything_of_a_board(tmp_path: Path):
 def test_the_firmwares_word_of_the_past_does_not_count(tmp_path: Path, word: str, now: bool):
     HostEmulator(tmp_path, WallClock())
     (tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled").write_text(word)
-    assert read_host(tmp_path, tmp_path).firmware_throttled is now
+    assert read_host(tmp_path, disk_of(tmp_path)).firmware_throttled is now
 
 
 def test_what_sys_does_not_tell_is_none(tmp_path: Path):
     HostEmulator(tmp_path, WallClock()).inject("blind")
-    reading = read_host(tmp_path, tmp_path)
+    reading = read_host(tmp_path, disk_of(tmp_path))
     assert (reading.temperature, reading.frequency, reading.frequency_share) == (None, None, None)
     assert (reading.throttle_events, reading.firmware_throttled) == (0, False)
 
@@ -86,16 +87,16 @@ def test_proc_must_be_as_documented(tmp_path: Path, file: str):
     HostEmulator(tmp_path, WallClock())
     (tmp_path / "proc" / file).write_text("")
     with pytest.raises(ProtocolError):
-        read_host(tmp_path, tmp_path)
+        read_host(tmp_path, disk_of(tmp_path))
     (tmp_path / "proc" / file).unlink()
     with pytest.raises(DeviceError, match="cannot be read"):
-        read_host(tmp_path, tmp_path)
+        read_host(tmp_path, disk_of(tmp_path))
 
 
 def test_a_disk_path_that_does_not_exist_yet_counts_as_its_parent(tmp_path: Path):
     HostEmulator(tmp_path, WallClock())
-    assert read_host(tmp_path, tmp_path / "a/b/c").disk.total == read_host(tmp_path, tmp_path).disk.total
-    assert read_host(tmp_path, Path("no-such-folder")).disk.total > 0
+    assert disk_of(tmp_path / "a/b/c").total == disk_of(tmp_path).total
+    assert disk_of(Path("no-such-folder")).total > 0
 
 
 async def test_the_probe_on_this_computer():
