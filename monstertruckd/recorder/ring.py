@@ -1,7 +1,7 @@
 """The newest messages in memory, by time and by size: what a black box is written from.
 
 Messages lie one behind the other in blocks: times, number of the topic, payload. Blocks are pages of their own, which
-the kernel gets back at once. As objects on the heap messages left it in crumbs, and the daemon grew by megabytes an hour.
+the kernel gets back at once; as objects on the heap messages left it in crumbs, and the daemon grew for hours.
 """
 
 from collections import deque
