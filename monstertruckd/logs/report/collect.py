@@ -14,7 +14,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Event, Severity, Stop
+from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -33,6 +33,8 @@ _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.T
 """Topics that are decoded no more often than this, ns: they come thick and cost most of the time."""
 _EVENTS: Final = 400
 """Events kept of each severity."""
+_JOURNAL: Final = 400
+"""Warnings and worse kept of the journal."""
 
 
 @dataclass(slots=True)
@@ -57,6 +59,10 @@ class Run:
     states: States = field(default_factory=States)
     events: list[Event] = field(default_factory=list)
     event_counts: dict[Severity, int] = field(default_factory=lambda: dict.fromkeys(Severity, 0))
+    journal: list[LogRecord] = field(default_factory=list)
+    """The first warnings and worse."""
+    journal_count: int = 0
+    """All of them."""
     stops: dict[int, Stop] = field(default_factory=dict)
     """By number, each as it was told last."""
     drops: int = 0
@@ -112,6 +118,7 @@ class Collector:
                 self._on(curve.topic.name, _plotter(curve, trace))
         takers: tuple[tuple[Topic[Any], Callable[[int, Any], None]], ...] = (
             (t.EVENT, self._event),
+            (t.LOG, self._record),
             (t.STOP, self._stop),
             (t.CLOCK, self._clock),
             (t.ODOMETRY, self._odometry),
@@ -155,6 +162,13 @@ class Collector:
         counts[event.severity] += 1
         if counts[event.severity] <= _EVENTS:
             self._run.events.append(event)
+
+    def _record(self, _: int, record: LogRecord) -> None:
+        if record.level in {LogLevel.DEBUG, LogLevel.INFO}:
+            return
+        self._run.journal_count += 1
+        if len(self._run.journal) < _JOURNAL:
+            self._run.journal.append(record)
 
     def _stop(self, _: int, stop: Stop) -> None:
         if stop.number in self._run.stops or len(self._run.stops) < _EVENTS:

@@ -10,7 +10,7 @@ from typing import Any
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.event import Cause, Event, Severity, Stop
+from monstertruck_schemas.event import Cause, Event, LogLevel, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruckd.logs.report.collect import Run, collect
 from monstertruckd.logs.report.drawing import SEVERITY_TONE, Lines, plots, plotted, scene, timeline
@@ -96,6 +96,7 @@ def page(run: Run) -> str:
             f'<div><h2>Way</h2><div class="card map">{scene(run) or "No poses and no scans in this log."}</div></div>',
             f'<div><h2>Events</h2><div class="card events">{_events(run)}</div></div></div>',
             _stops(run),
+            _journal(run),
             f'<h2>States</h2><div class="card">{timeline(run)}</div>',
             f'<h2>Signals</h2><div class="card plots">{plots(run, chosen)}</div>' if chosen else "",
             _services(run),
@@ -212,6 +213,20 @@ def _cause(run: Run, cause: Cause) -> str:
         f"{escape(cause.source)}: {escape(cause.text)} <code>{escape(cause.reason.value)} since {since}"
         f"{behind}</code>" + (f" <small>{escape(measured)}</small>" if measured else "")
     )
+
+
+def _journal(run: Run) -> str:
+    """What the daemon warned of."""
+    rows = "".join(
+        f'<li data-at="{1e3 * (seconds := max(record.stamp - run.start, 0) / SECOND):.0f}">'
+        f"<time>{clock_text(seconds, 2)}</time><div>"
+        f'<span class="dot {(Tone.WARNING if record.level is LogLevel.WARNING else Tone.BAD).name.lower()}"></span>'
+        f"<b>{escape(record.name)}</b> {escape(record.text)}</div></li>"
+        for record in run.journal
+    )
+    left_out = run.journal_count - len(run.journal)
+    note = f'<p class="note">&emsp;{left_out} more warnings are in the log.</p>' if left_out else ""
+    return f'<h2>Journal</h2><div class="card events"><ol>{rows}</ol>{note}</div>' if rows else ""
 
 
 def _services(run: Run) -> str:

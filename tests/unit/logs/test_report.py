@@ -12,7 +12,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
+from monstertruck_schemas.event import Cause, Event, LogLevel, LogRecord, Measurement, Severity, Stop
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -132,6 +132,22 @@ def test_page_is_well_formed_and_asks_nobody_for_anything(log):
     assert all(link.startswith("data:") for link in tags.links)
     assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|https?://", text)
     assert "default-src 'none'" in text
+
+
+def test_page_tells_what_the_journal_warned_of(tmp_path):
+    file = tmp_path / "run-000001-000.mcap"
+    writer = Writer(file)
+    for number in range(500):
+        for level in LogLevel:
+            header = {"stamp": number * SECOND, "received": number * SECOND, "seq": number}
+            text = f"{level} <{number}>"
+            writer.put(t.LOG, LogRecord(**header, level=level, name="monstertruckd.stall", text=text))
+    writer.log.finish()
+    shown = report(file).file.read_text()
+    assert "warning &lt;0&gt;" in shown
+    assert "fatal &lt;0&gt;" in shown
+    assert "info &lt;0&gt;" not in shown
+    assert "1100 more warnings are in the log" in shown
 
 
 def test_page_tells_events_states_losses_and_config(log):
