@@ -45,7 +45,7 @@ class Tracker(Protocol):
     """Follows lines. It remembers its own requests only, to know what the wheels are still about to do."""
 
     def reset(self) -> None:
-        """Forget: the requests were not obeyed, or another line begins."""
+        """Forget: the requests were not obeyed."""
         ...
 
     def control(self, state: TruckState, line: Line, progress: Progress, t: float) -> Command:

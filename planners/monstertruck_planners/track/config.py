@@ -65,6 +65,9 @@ class TrackerConfig(Schema):
     steering_rate: Positive = 1.0
     """Greatest turning rate of the axles, rad/s."""
 
+    turn_within: Positive = 0.05
+    """Way in which the axles can turn as the path asks at the speed chosen, m."""
+
     @property
     def reach(self) -> float:
         """How far ahead of its last place on the path the truck is looked for, m."""

@@ -73,6 +73,9 @@ class Course:
                 yaw[where], turn[where] = lagged[where], bend[where]
         slip = np.remainder(heading - yaw + math.pi, math.tau) - math.pi
         self._table = Reference(heading, yaw, slip, turn, curvature)
+        side = np.tan(slip)
+        lever = turn / np.cos(slip)
+        self._axles = np.arctan([side + geometry.l_f * lever, side - geometry.l_r * lever])
 
     def steering(self, s: float) -> Steering:
         """How the axles steer at ``s`` metres."""
@@ -85,6 +88,11 @@ class Course:
     def at(self, s: Array | float) -> Reference:
         """Values at ``s`` metres; outside the run those of its ends."""
         return Reference(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
+
+    def turned(self, s: Array, ahead: float) -> Array:
+        """How far the axles have to turn over the ``ahead`` metres behind each place, rad; the further one's."""
+        change = [np.abs(np.interp(s + ahead, self._s, axle) - np.interp(s, self._s, axle)) for axle in self._axles]
+        return np.asarray(np.maximum(*change))
 
     def section_end(self, s: float) -> float:
         """Where the steering changes next, m; the end of the way if it does not."""

@@ -5,6 +5,7 @@ rest at the end, and starts to roll when the wheels have turned. No bearing deci
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
@@ -17,7 +18,7 @@ from monstertruck_planners.track.actuator import Angles, Axles, Pose
 from monstertruck_planners.track.api import Command, TruckState
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.course import Course, Reference
-from monstertruck_planners.track.line import Foot, Line, Progress, Run
+from monstertruck_planners.track.line import MAX_RUNS, Foot, Line, Progress, Run
 from monstertruck_planners.track.speed import wanted_speed
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
@@ -71,7 +72,7 @@ class Here:
         return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
 
 
-class Law(Generic[C]):
+class Law(ABC, Generic[C]):
     """Base of the trackers: subclasses steer.
 
     Args:
@@ -93,9 +94,9 @@ class Law(Generic[C]):
         self.axles.reset()
         self._courses.clear()
 
+    @abstractmethod
     def steer(self, here: Here) -> Angles:
         """Wanted angles of front and rear axle, rad, not yet limited."""
-        raise NotImplementedError
 
     def control(self, state: TruckState, line: Line, progress: Progress, t: float) -> Command:
         """See ``Tracker``."""
@@ -147,6 +148,8 @@ class Law(Generic[C]):
         """Reference of a run, computed once."""
         known = self._courses.get(id(run))
         if known is None or known[0] is not run:
+            if len(self._courses) >= MAX_RUNS:
+                self._courses.clear()
             known = self._courses[id(run)] = (run, Course(run, self.geometry, self.config.steering))
         return known[1]
 
@@ -178,7 +181,7 @@ class Law(Generic[C]):
             run=run,
             course=course,
             s=foot.s,
-            steering=course.steering(foot.s),
+            steering=_freed(course, foot.s),
             offset=math.cos(normal) * dy - math.sin(normal) * dx,
             reference=reference,
             turned=wrap_angle(pose[2] - float(reference.yaw)),
@@ -186,7 +189,7 @@ class Law(Generic[C]):
 
     def _turning_at_rest(self, state: TruckState, angles: Angles) -> bool:
         """Whether the truck stands with its wheels still turning to where they are wanted."""
-        if abs(state.speed) > REST or self.axles.lag + self.axles.dead_time == 0.0:
+        if abs(state.speed) > REST:
             return False
         now = self.axles.angles
         return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > TURNED
@@ -212,3 +215,9 @@ class Law(Generic[C]):
             heading_error=wrap_angle(state.pose[2] - float(here.course.at(foot.s).yaw)),
             outcome=outcome,
         )
+
+
+def _freed(course: Course, s: float) -> Steering:
+    """How the axles steer: where a path crabs its headings are meant, so they may differ to keep them."""
+    steering = course.steering(s)
+    return "hybrid" if steering == "crab" and course.given else steering

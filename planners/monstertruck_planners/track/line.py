@@ -1,4 +1,4 @@
-"""A path prepared for tracking: runs of one driving direction, measured by arc length.
+"""A path prepared for tracking: runs of one direction, all crab or none of it, measured by arc length.
 
 Progress along it only grows and is looked for near the present one, so a path may cross or repeat itself.
 """
@@ -31,7 +31,7 @@ MAX_COORDINATE: Final = 10_000.0
 MAX_STEP: Final = 100.0
 """Metres between two poses."""
 MAX_RUNS: Final = 64
-"""Runs of one driving direction; each costs some 20 us to prepare."""
+"""Runs; each costs some 20 us to prepare."""
 MAX_NAME: Final = 128
 
 
@@ -69,7 +69,7 @@ class Steps(NamedTuple):
 
 
 class Run:
-    """Part of a path driven in one direction, with a straight or given way on beyond its end.
+    """Part of a path driven without a stop, with a straight or given way on beyond its end.
 
     Args:
         points: shape (n, 2), n >= 2, m; from index ``last`` on they are the way beyond.
@@ -203,8 +203,8 @@ def check_path(path: Path) -> None:
         _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
     if len(path.steering) not in (0, count):
         _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
-    if np.count_nonzero(np.diff(path.directions)) >= MAX_RUNS:
-        _refuse(path, f"direction changes too often: expected at most {MAX_RUNS} runs forward and backward")
+    if np.count_nonzero(_stops(path.directions, path.steering)) >= MAX_RUNS:
+        _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
     if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
         _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m from the origin")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
@@ -260,7 +260,7 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
 
 
 def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
-    cuts = [0, *(np.flatnonzero(np.diff(steps.directions)) + 1).tolist(), len(steps.directions)]
+    cuts = [0, *(np.flatnonzero(_stops(steps.directions, steps.steering)) + 1).tolist(), len(steps.directions)]
     lap = closed and len(cuts) == 2
     runs: list[Run] = []
     before = 0.0
@@ -283,6 +283,19 @@ def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
         runs.append(run)
         before += run.length
     return tuple(runs)
+
+
+def _stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
+    """Whether the truck has to come to rest between each two steps."""
+    stops = np.diff(directions) != 0.0
+    if steering and len(stops):
+        stops = stops | np.array([_must_stand(a, b) for a, b in pairwise(steering)], np.bool_)
+    return np.asarray(stops)
+
+
+def _must_stand(before: Steering, after: Steering) -> bool:
+    """Whether the axles turn so far between two ways of steering that the truck has to stand meanwhile."""
+    return before != after and "crab" in (before, after) and "hybrid" not in (before, after)
 
 
 def _reach(points: Array, beyond: float) -> int:

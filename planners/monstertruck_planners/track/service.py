@@ -144,7 +144,6 @@ class TrackerService:
                 raise InputError(msg)
             start = (pose.pose.x, pose.pose.y, pose.pose.yaw)
             self._line = Line(path, start, self._config.beyond)
-            self._law.reset()
             self._progress = self._line.start
         except InputError as error:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))

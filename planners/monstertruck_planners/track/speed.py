@@ -31,9 +31,10 @@ def comfort(amount: float, limit: float) -> float:
 
 
 def _for_curves(config: TrackerConfig, course: Course, run: Run, s: float, speed: float) -> float:
-    """Speed from which every curve ahead is reached at what its curvature allows."""
+    """Speed from which every curve ahead is reached at what its curvature allows, and at which the axles keep up."""
     braking = 0.5 * speed * speed / config.deceleration
     ahead = np.linspace(0.0, min(braking, run.end - s) if run.end > s else 0.0, LOOKS)
     curvature = np.abs(course.at(s + ahead).curvature)
     allowed = config.lateral_acceleration / np.maximum(curvature, 1e-6)
-    return float(np.sqrt((allowed + 2 * config.deceleration * ahead).min()))
+    turning = config.turn_within * config.steering_rate / np.maximum(course.turned(s + ahead, config.turn_within), 1e-6)
+    return float(np.sqrt((np.minimum(allowed, turning**2) + 2 * config.deceleration * ahead).min()))

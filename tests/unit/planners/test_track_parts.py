@@ -77,9 +77,9 @@ def test_points_rounded_to_millimetres_do_not_shake_the_reference():
 
 
 def test_sections_end_where_the_steering_changes():
-    found = course(path(straight(1.0, 0.1), steering=["counter"] * 6 + ["crab"] * 5))
+    found = course(path(straight(1.0, 0.1), steering=["counter"] * 6 + ["hybrid"] * 5))
     assert (found.section_end(0.2), found.section_end(0.7)) == pytest.approx((0.5, 1.0))
-    assert (found.steering(0.2), found.steering(0.7)) == ("counter", "crab")
+    assert (found.steering(0.2), found.steering(0.7)) == ("counter", "hybrid")
 
 
 def test_rough_ground_is_felt_and_forgotten():
