@@ -19,7 +19,7 @@ from monstertruckd.logs import info
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "tests" / "data" / "replay"
 RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8)}
-"""Logs by name: configuration, and metres of the path: a rocking truck that keeps its lidar level, and one that maps."""
+"""Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and one that maps."""
 
 
 def short_config(source: Path, folder: Path, length: float) -> Path:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from mcap.records import Attachment, Metadata
 from pydantic import ValidationError
@@ -83,15 +83,17 @@ def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:
     """
     data = attachments.get(CONFIG)
     if data is None:
-        msg = f"{log}: {CONFIG} is not attached: expected a log that the daemon recorded; `--config` names another"
-        raise InputError(msg)
+        raise InputError(f"{log}: {CONFIG} is not attached: expected a log that the daemon recorded")
     try:
-        values: dict[str, Any] = json.loads(data)
-        values.pop(SIMULATION, None)
+        values = json.loads(data)
+    except ValueError as error:
+        raise ConfigError(f"{log}: {CONFIG}: {error}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{log}: {CONFIG}: expected an object")
+    values.pop(SIMULATION, None)
+    try:
         return TruckConfig.model_validate_json(json.dumps(values))
     except ValidationError as error:
         faults = error.errors(include_url=False)
         lines = (f"{log}: {CONFIG}: {'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in faults)
         raise ConfigError("\n".join(lines)) from None
-    except (ValueError, AttributeError) as error:
-        raise InputError(f"{log}: {CONFIG} is no configuration: {error}") from None

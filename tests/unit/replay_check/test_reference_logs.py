@@ -1,0 +1,141 @@
+"""Recorded runs computed again: all of it equal, and nothing that was changed stays unfound."""
+
+import json
+
+import pytest
+
+from monstertruck_runtime import wire
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.logs import open_log
+from monstertruckd.replay_check import check_log
+from monstertruckd.replay_check.difference import Kind
+from tests.unit.replay_check.log_surgery import LEVEL, SLAM, attachments_of, changed, chunks, digit, flip
+
+pytestmark = pytest.mark.timeout(120)
+
+ANOTHER_COMPUTER = 1e-6
+"""Its maths library may round otherwise than the one the stored logs were recorded on."""
+
+
+@pytest.mark.parametrize(
+    ("log", "computed"),
+    [
+        (LEVEL, {topics.SCAN, topics.PLAN_STABILISER, topics.ODOMETRY, topics.POSE, topics.TRACKER}),
+        (SLAM, {topics.SLAM, topics.MAP, topics.MAP_TILES, topics.POSE, topics.TRANSFORMS, topics.PLAN_DRIVE}),
+    ],
+    ids=["level", "slam"],
+)
+def test_a_stored_run_comes_again(log, computed):
+    check = check_log(log, tolerance=ANOTHER_COMPUTER)
+    assert check.agrees, check.first
+    assert check.compared >= 1000
+    assert check.reason is Reason.OK
+    assert {topic.name for topic in computed} <= {row.topic.name for row in check.topics if row.compared}
+    recorded = [entry for entry in open_log(log) if entry.topic in {row.topic.name for row in check.topics}]
+    assert check.compared == len(recorded)
+
+
+@pytest.mark.parametrize(
+    ("topic", "key", "shown"),
+    [
+        (topics.DRIVE, "position", topics.ODOMETRY),
+        (topics.STEERING, "front", topics.ODOMETRY),
+        (topics.COMPASS, "heading", topics.ODOMETRY),
+        (topics.COMPASS, "pitch", topics.PLAN_STABILISER),
+        (topics.STABILISER, "pitch", topics.SCAN),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_one_flipped_byte_is_found_by_what_is_computed_from_it(tmp_path, topic, key, shown):
+    number = next(e.sequence for e in open_log(LEVEL) if e.topic == topic.name and e.log_time > 4.5e9)
+    log = changed(LEVEL, tmp_path / "flipped.mcap", flip(topic.name, number, digit(key)))
+    check = check_log(log)
+    assert check.damage is None
+    assert check.reason is Reason.REPLAY_DIFFERS
+    (row,) = (row for row in check.topics if row.topic is shown)
+    assert row.first is not None
+    assert row.first.sequence > 0
+    assert 3.4 < check.first.at <= row.first.at < 4.5
+    assert row.first.fields
+
+
+def test_one_flipped_byte_of_a_scan_is_found_by_the_map(tmp_path):
+    def byte_of_a_range(payload: bytes) -> int:
+        scan = wire.decode(topics.SCAN, payload)
+        value = next(r for r in scan.ranges if 0.5 < r < 3.0)
+        return payload.index(value.tobytes()) + 6
+
+    log = changed(SLAM, tmp_path / "flipped.mcap", flip("sensor/scan", 30, byte_of_a_range))
+    check = check_log(log)
+    assert check.reason is Reason.REPLAY_DIFFERS
+    assert check.first.topic in {"health/slam", "state/map_tiles", "state/pose", "state/transforms"}
+    odometry = next(row for row in check.topics if row.topic is topics.ODOMETRY)
+    assert odometry.equal == odometry.compared  # it rests on no scan
+
+
+def test_a_byte_that_makes_a_message_unreadable_is_named(tmp_path):
+    log = changed(LEVEL, tmp_path / "broken.mcap", flip("sensor/drive", 20, lambda payload: 0, bit=0x10))
+    check = check_log(log)
+    (message,) = check.unreadable
+    assert (message.topic, message.sequence) == ("sensor/drive", 20)
+    assert check.reason is Reason.REPLAY_DIFFERS
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_flipped_byte_of_the_file_is_damage(tmp_path, share):
+    data = bytearray(LEVEL.read_bytes())
+    places = [place for chunk in chunks(data) for place in chunk]
+    data[places[int(share * len(places))]] ^= 1
+    log = tmp_path / "damaged.mcap"
+    log.write_bytes(data)
+    check = check_log(log, tolerance=ANOTHER_COMPUTER)
+    assert check.reason is Reason.LOG_DAMAGED
+    assert "damaged after byte" in check.damage
+    assert check.compared > 100
+    assert check.agrees  # as far as it goes
+
+
+def test_a_changed_output_is_found_as_well(tmp_path):
+    log = changed(LEVEL, tmp_path / "other.mcap", flip("plan/drive", 50, digit("front", 3)))
+    check = check_log(log)
+    row = next(row for row in check.topics if row.topic is topics.PLAN_DRIVE)
+    assert (row.differing, row.first.sequence, row.first.fields) == (1, 50, ("front",))
+    assert 0 < row.greatest[Kind.ANGLE].value < 0.01
+    assert check_log(log, tolerance=0.01).agrees
+
+
+def test_a_lost_reading_is_named(tmp_path):
+    def lose(one):
+        return None if (one.topic, one.sequence) == ("sensor/drive", 60) else one
+
+    check = check_log(changed(LEVEL, tmp_path / "lossy.mcap", lose))
+    assert check.lost == {"sensor/drive": 1}
+    assert check.first.topic in {"state/odometry", "state/pose"}
+
+
+def test_missing_and_extra_outputs_are_counted(tmp_path):
+    def without_scans(one):
+        return None if one.topic == "sensor/scan" and one.sequence > 40 else one
+
+    check = check_log(changed(SLAM, tmp_path / "blind.mcap", without_scans))
+    rows = {row.topic: row for row in check.topics}
+    assert rows[topics.SLAM].missing > 20
+    assert not check.agrees
+    told = check_log(changed(SLAM, tmp_path / "told.mcap", lambda one: None if one.topic == "health/slam" else one))
+    assert {row.topic: row for row in told.topics}[topics.SLAM].surplus(told.end) > 60
+    assert not told.agrees
+
+
+def test_another_configuration_shows_what_it_would_have_changed(tmp_path):
+    config = attachments_of(LEVEL)["config.json"]
+    config["geometry"]["wheel_radius"] *= 1.1
+    del config["sim"], config["path"], config["tracker"]
+    file = tmp_path / "larger.yaml"
+    file.write_text(json.dumps(config))
+    check = check_log(LEVEL, file)
+    row = next(row for row in check.topics if row.topic is topics.POSE)
+    assert row.greatest[Kind.LENGTH].value == pytest.approx(0.02, rel=0.3)  # a tenth of the way
+    assert row.greatest[Kind.LENGTH].at > 4.0
+    assert not check.agrees
+    assert check.reason is Reason.OK
