@@ -13,6 +13,7 @@ from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic
 from monstertruckd.autonomy import Body, build_estimation, build_planners
@@ -20,8 +21,9 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
 from monstertruckd.devices import scan_publisher
 from monstertruckd.logs import LogMessage
-from monstertruckd.replay_check.pace import Pace, PacedClock
+from monstertruckd.replay_check.pace import Pace, PacedClock, RecordedTurns
 from monstertruckd.replay_check.recorded import Survey
+from monstertruckd.workers.agenda import use_agenda
 from monstertruckd.workers.placement import Places
 from monstertruckd.workers.remote import RemoteDesk
 
@@ -35,6 +37,9 @@ TICKS: Final[Mapping[str, tuple[str, ...]]] = {
 
 WORKER: Final = (topics.SLAM.name, topics.MAP.name, topics.MAP_TILES.name)
 """Outputs of the estimation worker, which come when it is done."""
+
+LINKS: Final = 16
+"""Turns of the loop after which a worker's answer has certainly been told."""
 
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by what is."""
@@ -107,14 +112,22 @@ class Chain:
         config: of the robot; see ``replayable``.
         clock: of the running replay.
         early: ticks nobody recorded.
+        log: what the log told beforehand.
     """
 
-    def __init__(self, config: TruckConfig, clock: PacedClock, early: Early) -> None:
+    def __init__(self, config: TruckConfig, clock: PacedClock, early: Early, log: Survey) -> None:
         config = replayable(config)
         self._clock = clock
+        self._ready = log.ready
+        self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None
+        if self._turns is not None:
+            use_agenda(clock, self._turns)
+        self._answering = False
+        self._answers = 0
         self.bus = Bus(clock)
         self._scans: Publisher[LaserScan] = scan_publisher(config, self.bus)
         self._services = list(self._build(config))
+        self.bus.listen(topics.SLAM, self._count_answer)
         self._paces = {service.name: Pace() for service in self._services if service.name in TICKS}
         self._by_topic = {name: self._paces[service] for service in self._paces for name in TICKS[service]}
         self._early = list(reversed(early.instants)) if early.service in self._paces else []
@@ -133,6 +146,8 @@ class Chain:
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(self._run(service)) for service in self._services]
                 yield
+                if self._turns is not None:
+                    self._turns.open()  # a service that ends awaits its worker
                 for task in running:
                     task.cancel()
         except* TruckError as group:
@@ -156,6 +171,20 @@ class Chain:
                 await pace.release(output.stamp)
         await asyncio.sleep(0)
 
+    async def answer(self, output: LogMessage) -> None:
+        """The worker's result counted now, as its first output shows; its last one is how well the scan fitted."""
+        await self._catch_up(output.log_time)
+        if self._turns is None:
+            return
+        if not self._answering:
+            before = self._answers
+            self._turns.next()
+            for _ in range(LINKS):
+                if self._answers != before:
+                    break
+                await asyncio.sleep(0)
+        self._answering = output.topic != topics.SLAM.name
+
     async def finish(self, end: int) -> None:
         """Let workers go on until ``end``, ns."""
         await self._catch_up(end)
@@ -172,6 +201,9 @@ class Chain:
     def takes(self, topic: str) -> bool:
         """Whether a recorded message is an input."""
         return topic in self._inputs
+
+    def _count_answer(self, _: SlamHealth) -> None:
+        self._answers += 1
 
     async def _catch_up(self, instant: int) -> None:
         while self._early and self._early[-1] < instant and self._early_pace is not None:
@@ -191,6 +223,8 @@ class Chain:
         pace = self._paces.get(service.name)
         if pace is not None:
             pace.adopt()
+        elif (ready := self._ready.get(service.name)) is not None:
+            await self._clock.reach(ready)
         await service.run(_nothing)
 
 

@@ -55,11 +55,13 @@ class TopicComparison:
         topic: its row of the table.
         tolerance: greatest difference of a field that agrees, SI units; 0 = equal bit for bit.
         begin: start of the log, ns.
+        judged: whether a difference matters.
     """
 
     topic: Topic[Message]
     tolerance: float
     begin: int
+    judged: bool = True
     compared: int = 0
     equal: int = 0
     differing: int = 0
@@ -95,6 +97,10 @@ class TopicComparison:
     def surplus(self, end: int) -> int:
         """Outputs of the replay that were not recorded, until ``end``, ns."""
         return sum(output.time <= end for output in self._again.values())
+
+    def agrees(self, end: int) -> bool:
+        """Whether every output came again, until ``end``, ns, within the tolerance."""
+        return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
     def _compare(self, sequence: int, recorded: _Output, again: _Output) -> None:
         self.compared += 1

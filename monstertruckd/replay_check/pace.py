@@ -7,10 +7,11 @@ has come to that output, and its time is then that output's stamp.
 """
 
 import asyncio
+from collections import deque
 from contextvars import ContextVar
 from typing import Final
 
-from monstertruck_runtime.clock import ReplayClock
+from monstertruck_runtime.clock import ReplayClock, VirtualClock
 
 _PACE: Final[ContextVar["Pace | None"]] = ContextVar("pace", default=None)
 
@@ -43,6 +44,37 @@ class Pace:
             await asyncio.sleep(0)
         self.instant = instant
         self._held.set_result(None)
+
+
+class RecordedTurns:
+    """Results of the worker count when the log shows them, however long the worker takes now."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[asyncio.Future[None]] = deque()
+        self._open = False
+
+    async def wait(self, _: VirtualClock, due: int) -> None:
+        """Wait for ``next``; when the worker was thought to be done, ``due``, does not matter."""
+        del due
+        if self._open:
+            return
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.append(turn)
+        await turn
+
+    def next(self) -> None:
+        """The oldest result that waits counts now; none waits = the recorded one came of what the log does not hold."""
+        while self._waiting:
+            turn = self._waiting.popleft()
+            if not turn.done():
+                turn.set_result(None)
+                return
+
+    def open(self) -> None:
+        """Nothing waits any longer: the log is at its end."""
+        self._open = True
+        while self._waiting:
+            self.next()
 
 
 class PacedClock(ReplayClock):

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -9,7 +10,10 @@ from typing import Final
 from mcap.records import Attachment, Metadata
 from pydantic import ValidationError
 
-from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.errors import ConfigError, InputError, TruckError
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage, LogReader
 
@@ -31,6 +35,8 @@ class Survey:
     newest: dict[str, LogMessage] = field(default_factory=dict)
     """Last message of every topic."""
     counts: dict[str, int] = field(default_factory=dict)
+    ready: dict[str, int] = field(default_factory=dict)
+    """When each service was first ready, log time, ns."""
     damage: str | None = None
 
     def lost(self) -> dict[str, int]:
@@ -53,6 +59,8 @@ def survey(log: LogReader) -> Survey:
         found.first.setdefault(entry.topic, entry)
         found.newest[entry.topic] = entry
         found.counts[entry.topic] = found.counts.get(entry.topic, 0) + 1
+        if entry.topic == EVENT.name:
+            _note_ready(entry, found.ready)
     why = f" ({log.damage})" if log.damage else ""
     if found is None:
         raise InputError(f"{log.path}: holds no messages{why}")
@@ -60,6 +68,13 @@ def survey(log: LogReader) -> Survey:
         raise InputError(f"{log.path}: holds no messages of sensors, so nothing can be computed again{why}")
     found.damage = log.damage
     return found
+
+
+def _note_ready(entry: LogMessage, ready: dict[str, int]) -> None:
+    with suppress(TruckError):
+        event = entry.decode()
+        if isinstance(event, Event) and event.reason is Reason.DEVICE_READY:
+            ready.setdefault(event.source, entry.log_time)
 
 
 def preamble(log: LogReader) -> tuple[dict[str, bytes], dict[str, str]]:

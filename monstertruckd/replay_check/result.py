@@ -54,8 +54,7 @@ class Check:
     @property
     def agrees(self) -> bool:
         """Whether everything came again within the tolerance."""
-        rows = all(row.differing == row.missing == row.surplus(self.end) == 0 for row in self.topics)
-        return rows and not self.unreadable
+        return all(row.agrees(self.end) for row in self.topics) and not self.unreadable
 
     @property
     def reason(self) -> Reason:
@@ -84,6 +83,7 @@ class Check:
     def _row(self, row: TopicComparison) -> dict[str, Any]:
         return {
             "tolerance": row.tolerance,
+            "judged": row.judged,
             "compared": row.compared,
             "equal": row.equal,
             "differing": row.differing,

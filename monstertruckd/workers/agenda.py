@@ -4,8 +4,17 @@ import asyncio
 import heapq
 import itertools
 import weakref
+from typing import Protocol
 
 from monstertruck_runtime.clock import SECOND, VirtualClock
+
+
+class Turns(Protocol):
+    """Says when a worker's result counts."""
+
+    async def wait(self, clock: VirtualClock, due: int) -> None:
+        """Wait for the turn of a result that is due at ``due``, ns."""
+        ...
 
 
 class Agenda:
@@ -37,9 +46,14 @@ class Agenda:
                 turn.set_result(None)
 
 
-_agendas: "weakref.WeakKeyDictionary[VirtualClock, Agenda]" = weakref.WeakKeyDictionary()
+_agendas: "weakref.WeakKeyDictionary[VirtualClock, Turns]" = weakref.WeakKeyDictionary()
 
 
-def agenda_of(clock: VirtualClock) -> Agenda:
+def agenda_of(clock: VirtualClock) -> Turns:
     """The one agenda all workers of a clock share."""
     return _agendas.setdefault(clock, Agenda())
+
+
+def use_agenda(clock: VirtualClock, agenda: Turns) -> None:
+    """Let ``agenda`` say when the results of all workers of ``clock`` count."""
+    _agendas[clock] = agenda
