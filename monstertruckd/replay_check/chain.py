@@ -35,7 +35,7 @@ TICKS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Services that read and publish without waiting in between, and the outputs that show when they did."""
 
-WORKER: Final = (topics.SLAM.name, topics.MAP.name, topics.MAP_TILES.name)
+WORKER: Final = (topics.SLAM.name, topics.SCAN_MOTION.name, topics.MAP.name, topics.MAP_TILES.name)
 """Outputs of the estimation worker, which come when it is done."""
 
 LINKS: Final = 16
