@@ -92,6 +92,7 @@ def goal_state(
         phase=mission.phase,
         outcome=mission.outcome,
         text=mission.text,
+        waypoints=len(mission.via) if mission.active else 0,
         remaining=remaining,
         elapsed=mission.elapsed,
         routes=mission.routes,

@@ -143,7 +143,8 @@ class GoalService:
         if self._mission is not None and self._mission.active:
             self._do(machine.order(self._mission, GoalOrder.CANCEL, request.source, self._seconds()))
         self._number += 1
-        self._do(machine.begin(self._number, goal, request.source, self._seconds()))
+        via = tuple((place.x, place.y, place.yaw) for place in request.waypoints)
+        self._do(machine.begin(self._number, goal, request.source, self._seconds(), via))
         return self._number
 
     def control(self, request: GoalControl) -> None:
@@ -276,6 +277,8 @@ class GoalService:
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             clear=plan.clear,
+            afresh=plan.afresh,
+            via=mission.via,
         )
         self._fresh, self._sent_grid = False, grid
         self._planning = self._tasks.create_task(self._ask(task))

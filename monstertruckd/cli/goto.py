@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, ViaOption, parse_pose
 from monstertruckd.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def goto(
     x: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
     y: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
     yaw: Annotated[float, typer.Argument(help="Radians.", show_default=False)],
+    via: ViaOption = None,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = ENDPOINT,
@@ -35,7 +36,12 @@ def goto(
     """
     from monstertruckd.cli.goto_session import drive_to
 
-    _run(lambda client, clock: drive_to(client, clock, (x, y, yaw), arm=arm), robot, endpoint, json_output=json_output)
+    places = [parse_pose(text, yaw_needed=False) for text in via or ()]
+
+    def drive(client: "TruckClient", clock: Clock) -> Coroutine[Any, Any, "Arrival"]:
+        return drive_to(client, clock, (x, y, yaw), places, arm=arm)
+
+    _run(drive, robot, endpoint, json_output=json_output)
 
 
 def track(

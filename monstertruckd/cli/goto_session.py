@@ -1,7 +1,7 @@
 """One drive to a goal or along a path, seen from outside."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Protocol, TypeVar
 
@@ -43,8 +43,10 @@ class Driver(Protocol):
         """Send an order."""
         ...
 
-    async def go(self, goal: tuple[float, float, float], frame: str = "map") -> dict[str, Any]:
-        """Ask to drive to a pose."""
+    async def go(
+        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
+    ) -> dict[str, Any]:
+        """Ask to drive to a pose, by way of places."""
         ...
 
     async def goal_control(self, order: GoalOrder) -> None:
@@ -74,7 +76,9 @@ class Arrival:
         return asdict(self)
 
 
-async def drive_to(driver: Driver, clock: Clock, goal: tuple[float, float, float], *, arm: bool) -> Arrival:
+async def drive_to(
+    driver: Driver, clock: Clock, goal: tuple[float, float, float], via: Sequence[tuple[float, ...]] = (), *, arm: bool
+) -> Arrival:
     """Send a goal and wait for its end; cancelled, it cancels the goal.
 
     Raises:
@@ -82,7 +86,7 @@ async def drive_to(driver: Driver, clock: Clock, goal: tuple[float, float, float
         NoAnswerError: the robot does not answer.
     """
     with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
-        number = int((await driver.go(goal))["number"])
+        number = int((await driver.go(goal, via=via))["number"])
         return await _watched(
             driver,
             clock,

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from monstertruck_runtime.errors import InputError
+
 ENDPOINT = "tcp/127.0.0.1:7447"
 
 
@@ -62,4 +64,25 @@ TopicArgument = Annotated[
     typer.Argument(
         help="Name from `monstertruckd topics`, e.g. state/pose.", show_default=False, autocompletion=complete_topic
     ),
+]
+
+
+def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
+    """Numbers of a pose; nan and inf are let through for the planner to refuse by name.
+
+    Raises:
+        InputError: something else than numbers, or not enough of them.
+    """
+    expected = "x,y,yaw" if yaw_needed else "x,y or x,y,yaw"
+    try:
+        values = tuple(map(float, text.split(",")))
+    except ValueError:
+        values = ()
+    if len(values) != 3 and (yaw_needed or len(values) != 2):
+        raise InputError(f"pose {text!r}: expected {expected}, m and rad")
+    return values
+
+
+ViaOption = Annotated[
+    list[str] | None, typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way; may be repeated.")
 ]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.errors import InputError
+from monstertruckd.cli.options import ViaOption, parse_pose
 from monstertruckd.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
@@ -52,9 +53,7 @@ def plan(
     steering: Annotated[
         SteeringChoice, typer.Option(help="Front axle alone, both axles opposite, or both in every way.")
     ] = SteeringChoice.BOTH,
-    via: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way; may be repeated.")
-    ] = None,
+    via: ViaOption = None,
     unknown: Annotated[UnknownChoice, typer.Option(help="What unknown cells are.")] = UnknownChoice.BLOCKED,
     budget: Annotated[float, typer.Option(min=0.01, help="Time for the route and its improvement, s.")] = 1.0,
     reproducible: Annotated[
@@ -81,7 +80,7 @@ def plan(
     if not reproducible:
         warm_up(planning)
     now = None if reproducible else (lambda: clock.now() / SECOND)
-    result = _route(planning, ground, vehicle, (_pose(start), _pose(goal)), via or [], now)
+    result = _route(planning, ground, vehicle, (parse_pose(start), parse_pose(goal)), via or [], now)
     if picture is not None:
         _draw(picture, world, vehicle, result, map_file.stem)
     if json_output:
@@ -89,22 +88,6 @@ def plan(
     elif result.ok:
         _tell(result)
     finish(result.reason, f"{result.reason.text}: {result.text}")
-
-
-def _pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
-    """Numbers of a pose; nan and inf are let through for the planner to refuse by name.
-
-    Raises:
-        InputError: something else than numbers, or not enough of them.
-    """
-    expected = "x,y,yaw" if yaw_needed else "x,y or x,y,yaw"
-    try:
-        values = tuple(map(float, text.split(",")))
-    except ValueError:
-        values = ()
-    if len(values) != 3 and (yaw_needed or len(values) != 2):
-        raise InputError(f"pose {text!r}: expected {expected}, m and rad")
-    return values
 
 
 def _route(
@@ -119,7 +102,7 @@ def _route(
         return planner.plan(ground, start, goal, now)
     if not isinstance(planner, HybridPlanner):
         raise InputError("--via: expected the planner hybrid")
-    poses = [_pose(text, yaw_needed=False) for text in via]
+    poses = [parse_pose(text, yaw_needed=False) for text in via]
     places = [Waypoint(*(pose if len(pose) == 2 else vehicle.reference_pose(pose).tolist())) for pose in poses]
     return plan_through(planner, ground, start, [*places, Waypoint(*goal.tolist())], now)
 

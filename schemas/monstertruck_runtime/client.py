@@ -7,7 +7,7 @@ import logging
 import os
 import re
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -23,7 +23,16 @@ from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message, Pose2D, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalOrder, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.req import (
+    ControlRequest,
+    DriveRequest,
+    GoalOrder,
+    GoalRequest,
+    Order,
+    PathRequest,
+    Role,
+    Waypoint,
+)
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import (
     GATE,
@@ -209,14 +218,20 @@ class TruckClient:
         header = self._header(lease) if order is Order.ESTOP else await self._answered(lease)
         self._put(REQ_CONTROL, ControlRequest(**header, order=order))
 
-    async def goal(self, goal: Pose2D, frame: str = "map", lease: float = 1.0) -> None:
-        """Ask to drive to a pose in ``frame``. Raises as ``drive`` does."""
-        self._put(REQ_GOAL, GoalRequest(**await self._answered(lease), frame=frame, goal=goal))
+    async def goal(
+        self, goal: Pose2D, frame: str = "map", lease: float = 1.0, waypoints: Sequence[Waypoint] = ()
+    ) -> None:
+        """Ask to drive to a pose in ``frame``, by way of places. Raises as ``drive`` does."""
+        header = await self._answered(lease)
+        self._put(REQ_GOAL, GoalRequest(**header, frame=frame, goal=goal, waypoints=tuple(waypoints)))
 
-    async def go(self, goal: tuple[float, float, float], frame: str = "map") -> dict[str, Any]:
+    async def go(
+        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
+    ) -> dict[str, Any]:
         """Ask to drive to x, y (m), yaw (rad), and wait for the first route; returns the goal's ``number``.
 
-        Progress is ``plan/goal``. Numbers that are not finite reach the robot, which refuses them by name.
+        ``via`` are places to be passed, x, y and, if it matters, yaw. Progress is ``plan/goal``. Numbers that are not
+        finite reach the robot, which refuses them by name.
 
         Raises:
             RequestRefusedError: no way leads there, or why the robot does not go.
@@ -225,7 +240,13 @@ class TruckClient:
         """
         x, y, yaw = goal
         return await self.call(
-            "goal", {**await self._answered(1.0), "frame": frame, "goal": {"x": x, "y": y, "yaw": yaw}}
+            "goal",
+            {
+                **await self._answered(1.0),
+                "frame": frame,
+                "goal": {"x": x, "y": y, "yaw": yaw},
+                "waypoints": [dict(zip(("x", "y", "yaw"), place, strict=False)) for place in via],
+            },
         )
 
     async def goal_control(self, order: GoalOrder) -> None:

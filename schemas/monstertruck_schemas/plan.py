@@ -68,6 +68,8 @@ class GoalState(Message):
     """DRIVING while it is pursued, then GOAL_REACHED, CANCELLED, or why it was given up."""
     text: str = ""
     """The outcome in words."""
+    waypoints: Annotated[int, Field(ge=0)] = 0
+    """Still to be passed."""
     remaining: Annotated[float, Field(ge=0)] = 0.0
     """Metres left of the present path."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0

@@ -143,6 +143,7 @@ class Reason(StrEnum):
     ROUTE_FOUND = "route_found", 0, "a route was planned"
     ROUTE_DEFORMED = "route_deformed", 0, "the way leads round something that stands on the route"
     ROUTE_FREE = "route_free", 0, "the route is driven as it was planned again"
+    WAYPOINT_PASSED = "waypoint_passed", 0, "a waypoint on the way to the goal was passed"
     RECOVERING = "recovering", 0, "a way out of trouble is tried"
     PAUSED = "paused", 0, "the way to the goal is interrupted"
     RESUMED = "resumed", 0, "the way to the goal goes on"

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Message, Nanoseconds, Pose2D
+from monstertruck_schemas.base import Message, Nanoseconds, Pose2D, Schema
 from monstertruck_schemas.plan import Path
 
 
@@ -66,10 +66,23 @@ class ControlRequest(Request):
     order: Order
 
 
+class Waypoint(Schema):
+    """A place to pass on the way to a goal."""
+
+    x: float
+    """M."""
+    y: float
+    """M."""
+    yaw: float | None = None
+    """Rad; None = that of the way there and on."""
+
+
 class GoalRequest(Request):
     """A pose to drive to, in ``frame``."""
 
     goal: Pose2D
+    waypoints: Annotated[tuple[Waypoint, ...], Field(max_length=32)] = ()
+    """Passed in this order before it."""
 
 
 class GoalOrder(StrEnum):

@@ -1,7 +1,7 @@
 """A truck in the rooms on the virtual clock, and somebody who asks it to go places."""
 
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,10 @@ class Trip:
         who = {"seq": self._seq, "source": "tester", "role": "station", "lease": 1.0, "frame": "map"}
         return {"stamp": now, "received": now, **who, **known}
 
-    async def goal(self, x: float, y: float, yaw: float) -> dict[str, Any]:
-        return await self.rig.daemon.rpc.call("goal", {**self.header(), "goal": {"x": x, "y": y, "yaw": yaw}})
+    async def goal(self, x: float, y: float, yaw: float, via: Sequence[tuple[float, ...]] = ()) -> dict[str, Any]:
+        waypoints = [dict(zip(("x", "y", "yaw"), place, strict=False)) for place in via]
+        goal = {"goal": {"x": x, "y": y, "yaw": yaw}, "waypoints": waypoints}
+        return await self.rig.daemon.rpc.call("goal", {**self.header(), **goal})
 
     async def order(self, order: str) -> None:
         await self.rig.daemon.rpc.call("goal_control", {**self.header(), "order": order})

@@ -1,7 +1,9 @@
 """Goals of the whole daemon on the virtual clock: reached, refused, cancelled, paused."""
 
 import asyncio
+import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalOrder, PathRequest, Role
+from monstertruck_schemas.req import GoalOrder, GoalRequest, PathRequest, Role
 from monstertruckd.cli.goto_session import drive_to, follow
 from monstertruckd.demo.operator import LocalOperator
 from monstertruckd.paths import load_path
@@ -32,6 +34,31 @@ def test_a_goal_in_another_room_is_reached():
         assert trip.reasons() == [Reason.GOAL_ACCEPTED, Reason.ROUTE_FOUND, Reason.GOAL_REACHED]
 
     assert_at(travel(story), 2.4, 1.5, -1.57)
+
+
+def test_waypoints_are_passed_in_their_order_asked_for_by_call_or_by_topic():
+    async def story(trip: Trip) -> None:
+        answer = await trip.goal(3.5, 3.9, 0.0, via=[(2.4, 1.6), (2.4, 3.8, 1.57)])
+        assert 5.0 < answer["length"] < 8.0
+        assert trip.states.latest is not None
+        assert trip.states.latest.waypoints == 2
+        await trip.arm()
+        state = await trip.end()
+        assert (state.outcome, state.waypoints) == (Reason.GOAL_REACHED, 0)
+        assert trip.reasons().count(Reason.WAYPOINT_PASSED) == 2
+        goal = {**trip.header(), "goal": {"x": 5.0, "y": 3.9, "yaw": 0.0}, "waypoints": [{"x": 4.2, "y": 3.5}]}
+        trip.rig.bus.inject(topics.REQ_GOAL, GoalRequest.model_validate_json(json.dumps(goal)))
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+        assert trip.reasons().count(Reason.WAYPOINT_PASSED) == 1
+        with pytest.raises(RequestRefusedError, match="waypoint 1 of 2") as refused:
+            await trip.goal(6.0, 3.9, 0.0, via=[(4.7, 2.5)])
+        assert refused.value.refusal is Reason.GOAL_BLOCKED
+
+    rig = travel(story)
+    assert_at(rig, 5.0, 3.9, 0.0)
+    truth = rig.truth.array()
+    assert np.hypot(truth[:, 1] - 2.4, truth[:, 2] - 1.6).min() < 0.05
+    assert np.hypot(truth[:, 1] - 4.2, truth[:, 2] - 3.5).min() < 0.05
 
 
 def test_bad_goals_are_refused_with_the_reason_and_nothing_moves():
@@ -100,8 +127,10 @@ class LocalDriver(LocalOperator):
     async def get_retained(self, topic: Any) -> Any:
         return self._trip.rig.bus.newest(topic)
 
-    async def go(self, goal: tuple[float, float, float], frame: str = "map") -> dict[str, Any]:
-        return await self._trip.goal(*goal)
+    async def go(
+        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
+    ) -> dict[str, Any]:
+        return await self._trip.goal(*goal, via=via)
 
     async def goal_control(self, order: GoalOrder) -> None:
         await self._trip.order(order)
@@ -123,10 +152,14 @@ def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: P
         assert arrival.length == pytest.approx(1.5)
         arrival = await drive_to(driver, trip.clock, (3.0, 3.9, 0.0), arm=True)
         assert (arrival.reason, arrival.routes, arrival.recoveries) == (Reason.GOAL_REACHED, 1, 0)
+        assert (
+            await drive_to(driver, trip.clock, (5.5, 3.9, 0.0), [(4.2, 3.7)], arm=True)
+        ).reason is Reason.GOAL_REACHED
+        assert Reason.WAYPOINT_PASSED in trip.reasons()
         with pytest.raises(RequestRefusedError, match="off the map"):
             await drive_to(driver, trip.clock, (30.0, 3.9, 0.0), arm=True)
         trip.states.drain()
-        driving = asyncio.create_task(drive_to(driver, trip.clock, (6.0, 3.9, 0.0), arm=True))
+        driving = asyncio.create_task(drive_to(driver, trip.clock, (8.5, 3.9, 0.0), arm=True))
         await trip.clock.sleep(5.0)
         driving.cancel()
         await asyncio.wait([driving])

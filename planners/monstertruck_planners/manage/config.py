@@ -64,7 +64,7 @@ class PlannerConfig(Schema):
     """How goals are reached."""
 
     route: RouteKind = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
-    """Route planner; its margin has to exceed what the gate keeps beside the truck, and backward the lidar sees nothing"""
+    """Route planner; its margin has to exceed what the gate keeps beside the truck; backward the lidar sees nothing"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.36
@@ -80,6 +80,8 @@ class PlannerConfig(Schema):
     """The goal is reached if the truck stands this near, m..."""
     yaw_tolerance: Positive = 0.2
     """...and is turned away from it by no more than this, rad."""
+    waypoint_radius: Positive = 0.3
+    """A waypoint has been passed if the truck was this near, m."""
     aim: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Share of these beyond which it corrects its place first."""
     corrections: Annotated[int, Field(ge=0)] = 1

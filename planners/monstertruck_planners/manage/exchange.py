@@ -16,6 +16,8 @@ from monstertruck_schemas.state import Grid
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
+Place = tuple[float, float, float | None]
+"""x, y (m), and yaw (rad) if it matters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,10 @@ class PlanTask:
     """A newer map than before."""
     clear: bool = False
     """Forget the obstacles of older scans, and the route so far."""
+    afresh: bool = False
+    """Forget the route so far."""
+    via: tuple[Place, ...] = ()
+    """Places of the base to be passed before the goal."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import PlanAnswer, Pose
+from monstertruck_planners.manage.exchange import Place, PlanAnswer, Pose
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.reasons import Reason
@@ -41,6 +41,9 @@ class Plan:
 
     what: Literal["route", "escape"] = "route"
     clear: bool = False
+    """Forget older obstacles and the route so far..."""
+    afresh: bool = False
+    """...or only the latter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +99,8 @@ class Mission:
     goal: Pose
     source: str
     now: float
+    via: tuple[Place, ...] = ()
+    """Still to be passed."""
     phase: GoalPhase = GoalPhase.PLANNING
     outcome: Reason = Reason.DRIVING
     text: str = ""
@@ -128,11 +133,12 @@ class Mission:
 Step = tuple[Mission, tuple[Action, ...]]
 
 
-def begin(number: int, goal: Pose, source: str, now: float) -> Step:
+def begin(number: int, goal: Pose, source: str, now: float, via: tuple[Place, ...] = ()) -> Step:
     """Take on a goal."""
-    mission = Mission(number, goal, source, now, since=now, moved=now)
+    mission = Mission(number, goal, source, now, via, since=now, moved=now)
     x, y, yaw = goal
-    text = f"goal {number} of {source}: ({x:.2f}, {y:.2f}, {yaw:.2f})"
+    by_way_of = f" by way of {len(via)} waypoints" if via else ""
+    text = f"goal {number} of {source}: ({x:.2f}, {y:.2f}, {yaw:.2f}){by_way_of}"
     return mission, (Tell(Reason.GOAL_ACCEPTED, Severity.INFO, text), Plan(clear=True))
 
 
@@ -199,6 +205,10 @@ def _drive(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
     if not facts.armed:
         return mission, ()
     backing = mission.phase is GoalPhase.BACKING_OUT
+    if _at_waypoint(mission, facts.pose, config):
+        left = len(mission.via) - 1
+        told = Tell(Reason.WAYPOINT_PASSED, Severity.INFO, f"goal {mission.number}: waypoint passed, {left} left")
+        return replace(mission, via=mission.via[1:]), (told,)
     if facts.outcome is Reason.GOAL_REACHED and facts.at_rest:
         return _plan(mission, config) if backing else _arrived(mission, facts, config)
     if facts.outcome is Reason.PATH_LOST:
@@ -221,6 +231,10 @@ def _drive(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
     return mission, ()
 
 
+def _at_waypoint(mission: Mission, pose: Pose | None, config: PlannerConfig) -> bool:
+    return bool(mission.via) and pose is not None and math.dist(pose[:2], mission.via[0][:2]) < config.waypoint_radius
+
+
 def _arrived(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
     """The end of the route: is it the goal?"""
     assert facts.pose is not None
@@ -233,7 +247,7 @@ def _arrived(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
         return _end(mission, Reason.GOAL_MISSED, off)
     mission = replace(mission, misses=mission.misses + 1)
     told = Tell(Reason.GOAL_MISSED, Severity.WARNING, f"goal {mission.number}: {off}; plans anew")
-    return _with(_plan(mission, config), told)
+    return _with(_plan(mission, config, afresh=True), told)
 
 
 def _trouble(mission: Mission, reason: Reason, text: str, config: PlannerConfig) -> Step:
@@ -254,10 +268,10 @@ def _trouble(mission: Mission, reason: Reason, text: str, config: PlannerConfig)
             return _with(_plan(mission, config, clear=rung == "clear"), told, Halt())
 
 
-def _plan(mission: Mission, config: PlannerConfig, *, clear: bool = False) -> Step:
+def _plan(mission: Mission, config: PlannerConfig, *, clear: bool = False, afresh: bool = False) -> Step:
     if mission.routes >= config.routes:
         return _end(mission, Reason.STUCK, f"{mission.routes} routes did not lead there")
-    return _enter(replace(mission, planned="route"), GoalPhase.PLANNING), (Plan(clear=clear),)
+    return _enter(replace(mission, planned="route"), GoalPhase.PLANNING), (Plan(clear=clear, afresh=afresh),)
 
 
 def _set_off(mission: Mission, phase: GoalPhase) -> Mission:

@@ -16,7 +16,7 @@ from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, Route
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.replan import replan
+from monstertruck_planners.route.replan import Waypoint, replan, with_headings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
@@ -102,10 +102,12 @@ class PlanningStep:
             self._ground = Ground.of(task.grid)
         if self._ground is None:
             return PlanAnswer(Reason.NO_MAP, "no map yet")
-        if not np.isfinite((*task.pose, *task.goal)).all():
-            return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose and goal")
+        places = [value for place in task.via for value in place if value is not None]
+        if not np.isfinite((*task.pose, *task.goal, *places)).all():
+            return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
         if task.clear:
             self._scans.clear()
+        if task.clear or task.afresh:
             self._route = None
         news = self._ground.news(task.points, self._setup.config.scan_tolerance)
         self._scans.append(news)
@@ -139,18 +141,24 @@ class PlanningStep:
         cells = ground.with_points(points) if len(points) else ground.cells
         route_map = RouteMap.from_cells(cells, ground.resolution, ground.origin, self._setup.config.route.unknown)
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
-        result = self._search(self._planner, route_map, start, goal)
+        way = with_headings(task.pose, [Waypoint(*place) for place in (*task.via, task.goal)])
+        via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
+        result = self._search(self._planner, route_map, start, via, goal)
         if result.reason is Reason.START_BLOCKED:
-            result = self._search(self._tight, route_map, start, goal)
+            result = self._search(self._tight, route_map, start, via, goal)
         if result.path is None:
             return PlanAnswer(result.reason, result.text)
         self._route = result.path
         kept = bool(result.statistics.get("kept_route", 0.0))
         return answer_of(result.path, result.cost, kept=kept)
 
-    def _search(self, planner: RoutePlanner, ground: RouteMap, start: Array, goal: Array) -> RouteResult:
+    def _search(
+        self, planner: RoutePlanner, ground: RouteMap, start: Array, via: list[Array], goal: Array
+    ) -> RouteResult:
         if isinstance(planner, HybridPlanner):
-            return replan(planner, ground, self._route, start, goal, self._now)
+            return replan(planner, ground, self._route, start, goal, self._now, via=via)
+        if via:
+            return RouteResult(Reason.BAD_INPUT, text="waypoints: expected planner.route.kind hybrid")
         return planner.plan(ground, start, goal, self._now)
 
     def _escape(self, ground: Ground, task: PlanTask) -> PlanAnswer:

@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 SAME_GOAL = 1e-3
 """Goals nearer than this are the same, m and rad."""
 
+PASSING = 0.1
+"""A route passes a place that it comes this near to, m."""
+
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
@@ -51,7 +54,7 @@ def plan_through(
     here = np.asarray(start, dtype=np.float64)
     legs: list[MotionPath] = []
     cost, statistics = 0.0, dict[str, float]()
-    for number, goal in enumerate(_with_headings(here, waypoints), start=1):
+    for number, goal in enumerate(with_headings(here, waypoints), start=1):
         result = leg_planner.plan(ground, here, goal, now)
         for name, value in result.statistics.items():
             statistics[name] = statistics.get(name, 0.0) + value
@@ -63,7 +66,9 @@ def plan_through(
     return RouteResult(Reason.OK, joined(legs), cost=cost, statistics=statistics)
 
 
-def _with_headings(start: Array, waypoints: Sequence[Waypoint]) -> list[Array]:
+def with_headings(start: ArrayLike, waypoints: Sequence[Waypoint]) -> list[Array]:
+    """Poses of all waypoints: where one has no heading, from the place before to the one after."""
+    start = np.asarray(start, dtype=np.float64)
     places = [(float(start[0]), float(start[1])), *((w.x, w.y) for w in waypoints)]
     goals = []
     for i, waypoint in enumerate(waypoints, start=1):
@@ -93,14 +98,28 @@ def replan(
     goal: ArrayLike,
     now: Clock | None = None,
     policy: KeepPolicy | None = None,
+    via: Sequence[Array] = (),
 ) -> RouteResult:
     """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
 
     So a truck before an obstacle does not waver between left and right. ``statistics["kept_route"]`` tells which it is.
+
+    Args:
+        planner: of both.
+        ground: the map as it is now.
+        previous: the route so far.
+        pose: of the reference point now.
+        goal: where it is to go.
+        now: see ``plan``.
+        policy: when a route is kept.
+        via: poses of the reference point to be passed before the goal.
     """
     policy = policy or KeepPolicy()
     kept = None if previous is None else rest_of(planner, ground, previous, pose, goal, policy.reach)
-    fresh = planner.plan(ground, pose, goal, now)
+    if kept is not None and not all(_passes(kept, place) for place in via):
+        kept = None
+    stops = [Waypoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
+    fresh = plan_through(planner, ground, pose, stops, now) if stops else planner.plan(ground, pose, goal, now)
     if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * planner.cost(ground, kept)):
         return replace(fresh, statistics={**fresh.statistics, "kept_route": 0.0})
     return RouteResult(
@@ -136,6 +155,11 @@ def rest_of(
     ways = [steer.path(here, rest.start).then(rest) for rest in rests]
     ways = [way for way in ways if planner.free(ground, way)]
     return min(ways, key=lambda way: planner.cost(ground, way), default=None)
+
+
+def _passes(path: MotionPath, place: Array) -> bool:
+    poses = path.sample(PASSING / 2).poses
+    return bool(np.hypot(*(poses[:, :2] - place[:2]).T).min() < PASSING)
 
 
 def _apart(a: Array, b: Array) -> float:

@@ -337,3 +337,46 @@ def test_backing_out_sees_the_map_behind_the_truck_too():
     assert np.allclose(out.poses[-1], (0.5, 1.5, 0.0), atol=0.03)
     near = step.step(task(what="escape", pose=(0.36, 1.5, 0.0), points=[(x - 0.65, y) for x, y in wall]))
     assert (near.ok, near.reason) == (False, Reason.STUCK)
+
+
+def test_waypoints_are_passed_one_by_one_and_asked_for_until_then():
+    story = Story()
+    story.mission, _ = machine.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
+    story.tell(answer=WAY)
+    assert story.tell(pose=(0.5, 0.0, 0.0)) == ()
+    assert told(story.tell(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
+    assert story.mission.via == ((1.5, 0.0, 0.0),)
+    assert story.tell(pose=(1.0, 0.1, 0.0), along=1.0) == ()
+
+
+def test_a_miss_is_corrected_by_another_route():
+    story = Story()
+    story.tell(answer=WAY)
+    assert Plan(afresh=True) in story.tell(outcome=Reason.GOAL_REACHED, pose=(1.85, 0.0, 0.0))
+
+
+def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does():
+    step = PlanningStep()
+    cells = np.zeros((80, 120), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    grid = Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=120, height=80, cells=cells.ravel(),
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
+    )  # fmt: skip
+    setup = Setup(PlannerConfig(route=HybridConfig(effort=500, margin=0.04)), FourWheelSteering(), Footprint(), False)
+    at, goal, none = (1.0, 2.0, 0.0), (5.0, 2.0, 0.0), np.empty((0, 2))
+
+    def nearest(answer: Any, x: float, y: float) -> float:
+        return float(np.hypot(answer.poses[:, 0] - x, answer.poses[:, 1] - y).min())
+
+    straight = step.step(PlanTask("route", at, goal, none, setup, grid))
+    over = step.step(PlanTask("route", at, goal, none, via=((3.0, 3.0, None),)))
+    assert nearest(straight, 3.0, 3.0) > 0.5
+    assert (over.kept, nearest(over, 3.0, 3.0) < 0.06) == (False, True)
+    assert step.step(PlanTask("route", at, goal, none, via=((3.0, 3.0, None),))).kept
+    assert step.step(PlanTask("route", at, goal, none, via=((math.nan, 3.0, None),))).reason is Reason.NOT_FINITE
+    blocked = step.step(PlanTask("route", at, goal, none, via=((9.0, 3.0, 0.0),)))
+    assert (blocked.reason, "waypoint 1 of 2" in blocked.text) == (Reason.GOAL_OUTSIDE, True)
+    lattice = Setup(PlannerConfig(route=LatticeConfig()), FourWheelSteering(), Footprint(), False)
+    refused = step.step(PlanTask("route", at, goal, none, lattice, grid, via=((3.0, 3.0, None),)))
+    assert refused.reason is Reason.BAD_INPUT
