@@ -1,6 +1,6 @@
 """Navigation against its peers: motions, routes, deformation, tracking, whole runs.
 
-    python benchmarks/navigation.py [--data DIR] [--only PART ...] [--quick]
+    python benchmarks/navigation.py [--data DIR] [--only PART ...] [--runs N] [--quick]
 
 DIR holds ``maps/NAME.yaml`` and ``planning/queries.json``. Times are processor time of the calling thread. Plots go to
 runs/navigation. The last line is JSON.
@@ -25,10 +25,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=None)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--runs", type=int, default=2000, help="of the part harness")
     parser.add_argument("--quick", action="store_true", help="fewer runs, for a look")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
-    options = Options(arguments.data, OUT, arguments.quick)
+    options = Options(arguments.data, OUT, arguments.quick, arguments.runs)
     whole = Part()
     for name in arguments.only:
         part = importlib.import_module(f"navigation_parts.{name}").run(options)

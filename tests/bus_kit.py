@@ -34,12 +34,14 @@ class Robot:
 
 
 @asynccontextmanager
-async def running_robot(endpoint: str | None = None, *, robot: str = "truck", **config: object) -> AsyncIterator[Robot]:
-    """A bridge that is ready; cancelled and awaited at the end."""
+async def running_robot(
+    endpoint: str | None = None, *, robot: str = "truck", deadline: float = 0.3, **config: object
+) -> AsyncIterator[Robot]:
+    """A bridge that is ready; cancelled and awaited at the end. Calls may take ``deadline`` seconds."""
     endpoint = endpoint or free_endpoint()
     clock = WallClock()
     bus = Bus(clock)
-    rpc = Rpc(clock, deadline=0.3)
+    rpc = Rpc(clock, deadline=deadline)
     bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,), **config), clock, rpc)
     ready = asyncio.Event()
     events = bus.subscribe(EVENT, fifo(100))

@@ -13,6 +13,8 @@ class Options:
     out: Path
     """Folder for plots."""
     quick: bool = False
+    runs: int = 2000
+    """Of the harness."""
 
 
 @dataclass

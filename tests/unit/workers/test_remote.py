@@ -9,26 +9,17 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Setup
+from monstertruck_planners.manage.exchange import PlanAnswer
 from monstertruck_planners.manage.planning import PlanningStep
-from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.track.config import LqrConfig
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
-from monstertruck_schemas.base import Pose2D, Schema, Twist2D
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 from monstertruckd.workers import codec, plan_server
 from monstertruckd.workers.codec import from_json, to_json
 from monstertruckd.workers.remote import RemoteDesk
-from monstertruckd.workers.tracking import TrackingWorker, TrackInput, TrackSetup
-
-BODY, TRUCK = Footprint(), FourWheelSteering()
-HEAD = {"stamp": 5, "received": 5, "seq": 0}
+from monstertruckd.workers.tracking import TrackingWorker, TrackInput
+from tests.unit.workers.step_kit import numbers, plan_task, track_inputs
 
 
 class Wire:
@@ -40,50 +31,6 @@ class Wire:
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
         assert rpc == "remote_step"
         return json.loads(json.dumps(await self._desk.serve(json.loads(json.dumps(payload)))))
-
-
-def plan_task() -> PlanTask:
-    cells = np.zeros((60, 120), np.int8)
-    cells[[0, -1]] = cells[:, [0, -1]] = 100
-    grid = Grid(
-        **HEAD, frame="map", resolution=0.05, width=120, height=60, origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
-        cells=cells.ravel(),
-    )  # fmt: skip
-    setup = Setup(PlannerConfig(route=HybridConfig(effort=1000, margin=0.04)), TRUCK, BODY, timed=False)
-    points = np.array([[2.75, 1.5], [2.75, 1.45]])
-    return PlanTask("route", (1.0, 1.5, 0.1), (4.5, 1.4, 0.3), points, setup=setup, grid=grid)
-
-
-def track_inputs() -> list[TrackInput]:
-    xs = np.linspace(0.0, 2.0, 41)
-    path = Path(
-        **HEAD, frame="odom", poses=np.column_stack((xs, 0.1 * xs**2, 0.2 * xs)).ravel(), directions=np.ones(41)
-    )
-    gate = GateState(**HEAD, mode=GateMode.DRIVING, nonce="n", speed_limit=0.2)
-    setup = TrackSetup(LqrConfig(kind="lqr"), TRUCK, BODY, (0.0, 0.0, 0.0), scan=False, attitude=False)
-    inputs = []
-    for i in range(5):
-        odometry = Odometry(
-            **{**HEAD, "received": 50_000_000 * i}, frame="odom", pose=Pose2D(x=0.01 * i, y=0.02, yaw=0.0),
-            twist=Twist2D(vx=0.1, vy=0.0, wz=0.0), pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
-        )  # fmt: skip
-        news = {"pose": odometry} | ({"path": path, "gate": gate} if i == 0 else {})
-        inputs.append(TrackInput(50_000_000 * i, news, setup if i == 0 else None))
-    return inputs
-
-
-def numbers(value: Any) -> list[float]:
-    """All numbers of a tree."""
-    match value:
-        case {"array": _}:
-            return from_json(value).ravel().tolist()
-        case dict():
-            return [number for inner in value.values() for number in numbers(inner)]
-        case list():
-            return [number for inner in value for number in numbers(inner)]
-        case bool() | str() | None:
-            return []
-    return [float(value)]
 
 
 def test_planner_and_tracker_give_the_same_on_another_machine():

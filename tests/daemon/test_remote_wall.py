@@ -1,0 +1,67 @@
+"""Steps in another process, over a real Zenoh session, give what they give in the loop and in a worker."""
+
+import asyncio
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.manage.exchange import DeformAnswer, PlanAnswer
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruckd.goal_build import DEFORMER
+from monstertruckd.goal_build import TARGET as PLANNER
+from monstertruckd.placed_tracker import TARGET as TRACKER
+from monstertruckd.workers.codec import to_json
+from monstertruckd.workers.placement import Placement, Places
+from monstertruckd.workers.remote import RPC, RemoteDesk
+from tests.bus_kit import running_robot
+from tests.unit.workers.step_kit import deform_tasks, numbers, plan_task, track_inputs
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+
+STEPS = {
+    "planning": (PLANNER, [plan_task()]),
+    "deforming": (DEFORMER, deform_tasks()),
+    "tracking": (TRACKER, track_inputs()),
+}
+
+
+async def outputs(places: Places, placement: Placement, name: str) -> list[Any]:
+    target, inputs = STEPS[name]
+    async with places.actor(placement, name, target, latency=0.0, deadline=60.0, patience=120.0) as actor:
+        await actor.start()
+        return [await actor.step(one) for one in inputs]
+
+
+def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
+    async def main(clock: Clock) -> tuple[int, dict[str, list[list[Any]]]]:
+        desk = RemoteDesk()
+        places = Places(clock, desk)
+        remote = {}
+        async with running_robot(deadline=5.0) as robot:
+            robot.rpc.register(RPC, desk.serve)
+            server = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "monstertruckd", "plan-server", "--endpoint", robot.endpoint
+            )
+            try:
+                for name in STEPS:
+                    remote[name] = await outputs(places, "remote", name)
+            finally:
+                server.terminate()
+                ended = await server.wait()
+        here: tuple[Placement, ...] = ("worker", "loop")
+        return ended, {name: [remote[name], *[await outputs(places, place, name) for place in here]] for name in STEPS}
+
+    ended, found = run_wall(main)
+    assert ended == 0
+    for name, (remote, worker, loop) in found.items():
+        for elsewhere in (remote, worker):
+            a, b = (numbers(to_json(outputs)) for outputs in (elsewhere, loop))
+            assert len(a) == len(b) > 3, name
+            assert np.abs(np.subtract(a, b)).max() < 1e-9, name
+    plan, last = found["planning"][0][0], found["deforming"][0][0]
+    assert isinstance(plan, PlanAnswer)
+    assert isinstance(last, DeformAnswer)
+    assert (plan.ok, last.finding) == (True, "new")
+    assert found["tracking"][0][-1].drive[0].speed > 0.0
