@@ -1,0 +1,167 @@
+"""The whole daemon on the virtual clock: random goals in the rooms, each run twice, decisions compared.
+
+Devices are the emulated ones, byte for byte; planner, deformer and tracker run in the loop. Every other run puts a post
+onto the route while the truck drives. Errors are those of the true pose, with odometry's in them, as there is no slam.
+"""
+
+import asyncio
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from monstertruck_drivers.world.obstacles import Disc
+from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.map_files import load_map
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruckd.config.validate import load_config
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.faults_drill import with_overlay
+from monstertruckd.sim.rig import VirtualRig
+from navigation_parts import Options, Part
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+RUNS = 40
+LIMIT = 700.0
+POST = 0.1
+"""Radius, m."""
+GAP = 0.9
+"""From the truck's middle to the post, m."""
+QUICK: dict[str, Any] = {
+    "recorder": None,
+    "blackbox": None,
+    "planner": {"route": {"effort": 8000}},
+    "placement": {"planner": "loop", "deformer": "loop", "tracker": "loop"},
+}
+
+Goal = tuple[float, float, float]
+
+
+def run(options: Options) -> Part:
+    world = load_map(CONFIGS / "worlds" / "rooms.yaml")
+    truth = DistanceField((world.cells >= OCCUPIED) | (world.cells < 0), world.resolution, (*world.origin, 0.0))
+    rows = []
+    for number in range(2 if options.quick else RUNS):
+        rng = np.random.default_rng([2, number])
+        goal = random_goal(truth, np.array(world.origin), world.size, rng)
+        first, second = (drive(goal, number, surprise=number % 2 == 1) for _ in range(2))
+        first["equal"] = first["digest"] == second["digest"]
+        rows.append(first)
+        print(f"{number:3} {np.round(goal, 2)} {told(first)}", flush=True)
+    part = Part()
+    possible = [row for row in rows if row["outcome"] != Reason.GOAL_UNREACHABLE.value or row["routes"]]
+    reached = [row for row in possible if row["reached"]]
+    part.add("runs", len(rows))
+    part.add("not_reached_share", 1.0 - len(reached) / max(len(possible), 1), 0.02)
+    part.add("collisions", sum(row["collided"] for row in rows), 0)
+    part.add("unequal_decisions", sum(not row["equal"] for row in rows), 0)
+    for name, unit in (("away", "m"), ("turned", "rad")):
+        values = np.array([row[name] for row in reached] or [math.inf])
+        part.add(f"{name}_p50_{unit}", float(np.median(values)))
+        part.add(f"{name}_p95_{unit}", float(np.percentile(values, 95)))
+        part.add(f"{name}_max_{unit}", float(values.max()), 0.2)
+    part.add("deformed_runs", sum(row["deformed"] for row in rows))
+    part.add("recoveries", sum(row["recoveries"] for row in rows))
+    (options.out / "daemon.json").write_text(json.dumps(rows, indent=1))
+    return part
+
+
+def random_goal(truth: DistanceField, low: np.ndarray, size: np.ndarray, rng: np.random.Generator) -> Goal:
+    while True:
+        pose = np.append(rng.uniform(low, low + size), rng.uniform(-math.pi, math.pi))
+        if truth.free(Footprint(), pose[None], 0.08)[0]:
+            return float(pose[0]), float(pose[1]), float(pose[2])
+
+
+def drive(goal: Goal, seed: int, *, surprise: bool) -> dict[str, Any]:
+    """One run."""
+    base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
+    config = with_overlay(with_overlay(base, QUICK), {"sim": {"seed": seed}})
+    row: dict[str, Any] = {"goal": goal, "surprise": surprise}
+    digest = hashlib.sha256()
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        events = rig.bus.subscribe(topics.EVENT, fifo(100_000))
+        async with rig.running():
+            await clock.sleep(3.0)
+            state = await pursue(rig, clock, goal, surprise=surprise)
+        told = events.drain()
+        for event in told:
+            digest.update(f"{event.stamp} {event.source} {event.reason} {event.text}\n".encode())
+        true = rig.truth.array()
+        x, y, yaw = true[-1, 1:4]
+        row.update(
+            outcome=state.outcome.value, text=state.text, routes=state.routes, recoveries=state.recoveries,
+            elapsed=round(state.elapsed, 2), collided=bool(true[:, 5].any()), away=math.dist((x, y), goal[:2]),
+            turned=abs(math.remainder(yaw - goal[2], math.tau)), digest=digest.hexdigest(),
+            deformed=any(event.reason is Reason.ROUTE_DEFORMED for event in told),
+        )  # fmt: skip
+        row["reached"] = state.outcome is Reason.GOAL_REACHED and row["away"] <= 0.2 and row["turned"] <= 0.2
+
+    run_virtual(main)
+    return row
+
+
+async def pursue(rig: VirtualRig, clock: VirtualClock, goal: Goal, *, surprise: bool) -> GoalState:
+    """Ask for the goal, arm, perhaps step into the way, and wait for the end."""
+    operator, states = LocalOperator(rig.bus, clock), rig.bus.subscribe(topics.GOAL, fifo(100_000))
+    gate = rig.bus.newest(topics.GATE)
+    assert gate is not None
+    header = {
+        "stamp": clock.now(), "received": clock.now(), "seq": 1, "source": "benchmark", "role": "station", "lease": 1.0,
+        "frame": "map", "nonce": gate.nonce, "gate_stamp": gate.stamp,
+    }  # fmt: skip
+    x, y, yaw = goal
+    try:
+        await rig.daemon.rpc.call("goal", {**header, "goal": {"x": x, "y": y, "yaw": yaw}})
+    except RequestRefusedError:
+        return await last(states)
+    await operator.order(Order.ARM)
+    if surprise:
+        stepping = asyncio.create_task(step_in(rig, clock, goal))
+    try:
+        async with clock.deadline(LIMIT):
+            return await last(states)
+    finally:
+        if surprise:
+            stepping.cancel()
+
+
+async def last(states: Any) -> GoalState:
+    async for state in states:
+        if state.phase is GoalPhase.IDLE and state.outcome is not Reason.OK:
+            return state
+    raise AssertionError("the bus was closed")
+
+
+async def step_in(rig: VirtualRig, clock: VirtualClock, goal: Goal) -> None:
+    """A post on the route before the truck, once it has driven for some seconds; never at the goal."""
+    await clock.sleep(6.0)
+    path = rig.bus.newest(topics.PATH)
+    truth = rig.world.truth(clock.now())
+    if path is None:
+        return
+    poses = path.poses.reshape(-1, 3)
+    near = int(np.argmin(np.hypot(poses[:, 0] - truth.x, poses[:, 1] - truth.y)))
+    ahead = np.hypot(poses[near:, 0] - truth.x, poses[near:, 1] - truth.y) > GAP
+    if ahead.any():
+        x, y = poses[near + int(np.argmax(ahead)), :2]
+        if math.dist((x, y), goal[:2]) > GAP:
+            rig.world.add(clock.now(), Disc(float(x), float(y), POST))
+
+
+def told(row: dict[str, Any]) -> str:
+    what = "reached" if row["reached"] else f"{row['outcome']} ({row['text']})"
+    more = ", collided" * row["collided"] + ", decisions differ" * (not row["equal"])
+    return f"{what}, {row['away']:.3f} m {row['turned']:.3f} rad, {row['elapsed']:.0f} s{more}"
