@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.deform.api import DeformResult, Guide, Memory, apart
@@ -18,6 +18,7 @@ from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 Array = NDArray[np.float64]
@@ -56,6 +57,17 @@ class Local:
     """Whether the band ends where the guide does."""
 
 
+@dataclass(frozen=True)
+class Cycle:
+    """How a cycle begins."""
+
+    here: Array
+    """Shape (3,): the truck's pose."""
+    local: Local
+    memory: Memory
+    """With the band and what of the guide is in it."""
+
+
 class Surveyor:
     """Shared by the deformers of one vehicle.
 
@@ -73,6 +85,20 @@ class Surveyor:
         deep = search.model_copy(update={"margin": config.margin, "effort": DEEP * search.effort})
         self._deep = HybridPlanner(vehicle, deep)
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
+
+    def begin(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> Cycle | DeformResult:
+        """The route cut to the window for one cycle, see ``api.Deformer``, or the result if nothing of it is free.
+
+        Raises:
+            InputError: a pose that is none.
+        """
+        here = checked(pose)
+        if memory.guide is not guide:
+            memory = Memory(guide=guide)
+        local = self.cut(guide, surroundings, here, memory)
+        if local is None:
+            return DeformResult(Reason.PATH_BLOCKED, memory, text="no pose of the route in the window is free")
+        return Cycle(here, local, replace(memory, band=local.band, entered=local.entered))
 
     def cut(self, guide: Guide, surroundings: DistanceField, pose: Array, memory: Memory) -> Local | None:
         """The band of the cycle before from the truck on, and poses of the guide that came into the window since.
@@ -204,6 +230,18 @@ class Surveyor:
             return None
         path = self.vehicle.steer().path(here, band.poses[near[-1]])
         return path if path.cusps == 0 and self.free(surroundings, path) else None
+
+
+def checked(pose: ArrayLike) -> Array:
+    """A pose (x, y, yaw).
+
+    Raises:
+        InputError: it is none.
+    """
+    here = np.array(pose, dtype=np.float64)
+    if here.shape != (3,) or not np.isfinite(here).all():
+        raise InputError("deformation: expected the truck's pose as three finite numbers")
+    return here
 
 
 def costs_of(config: DeformConfig) -> HybridConfig:

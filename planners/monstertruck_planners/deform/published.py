@@ -19,8 +19,8 @@ from monstertruck_planners.deform import bubbles
 from monstertruck_planners.deform.api import DeformResult, Guide, Memory
 from monstertruck_planners.deform.band import rules_of, stretch
 from monstertruck_planners.deform.config import BandConfig, PublishedConfig
-from monstertruck_planners.deform.local import Local, Surveyor
-from monstertruck_planners.deform.rsband import checked, ends_at
+from monstertruck_planners.deform.local import Local, Surveyor, checked
+from monstertruck_planners.deform.rsband import ends_at
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath, joined, moved

@@ -18,7 +18,6 @@ from monstertruck_planners.deform.config import RsbandConfig
 from monstertruck_planners.deform.local import CUSP_REACHED, RUN_ENDED, Local, Surveyor, costs_of, rest_of, runs
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, joined
-from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 Array = NDArray[np.float64]
@@ -67,13 +66,10 @@ class Rsband:
         Raises:
             InputError: a pose that is none.
         """
-        here = checked(pose)
-        if memory.guide is not guide:
-            memory = Memory(guide=guide)
-        local = self._surveyor.cut(guide, surroundings, here, memory)
-        if local is None:
-            return DeformResult(Reason.PATH_BLOCKED, memory, text="no pose of the route in the window is free")
-        memory = replace(memory, band=local.band, entered=local.entered)
+        cycle = self._surveyor.begin(guide, surroundings, pose, memory)
+        if isinstance(cycle, DeformResult):
+            return cycle
+        here, local, memory = cycle.here, cycle.local, cycle.memory
         rest, far = rest_of(memory.path, here) if memory.path is not None else (None, 0.0)
         ended_there = rest is not None and ends_at(rest, guide.poses[-1])
         if (
@@ -197,18 +193,6 @@ class Rsband:
             ):
                 yield i
                 begin = travelled[i]
-
-
-def checked(pose: ArrayLike) -> Array:
-    """A pose (x, y, yaw).
-
-    Raises:
-        InputError: it is none.
-    """
-    here = np.array(pose, dtype=np.float64)
-    if here.shape != (3,) or not np.isfinite(here).all():
-        raise InputError("deformation: expected the truck's pose as three finite numbers")
-    return here
 
 
 def with_robot(band: Guide, here: Array) -> Guide:

@@ -17,7 +17,7 @@ from monstertruck_planners.deform.band import rules_of, stretch
 from monstertruck_planners.deform.config import TebConfig
 from monstertruck_planners.deform.least_squares import Terms, settle
 from monstertruck_planners.deform.local import Local, Surveyor, costs_of, rest_of, runs, ways
-from monstertruck_planners.deform.rsband import checked, ends_at, with_robot
+from monstertruck_planners.deform.rsband import ends_at, with_robot
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
@@ -58,13 +58,10 @@ class Teb:
         Raises:
             InputError: a pose that is none.
         """
-        here = checked(pose)
-        if memory.guide is not guide:
-            memory = Memory(guide=guide)
-        local = self._surveyor.cut(guide, surroundings, here, memory)
-        if local is None:
-            return DeformResult(Reason.PATH_BLOCKED, memory, text="no pose of the route in the window is free")
-        memory = replace(memory, band=local.band, entered=local.entered)
+        cycle = self._surveyor.begin(guide, surroundings, pose, memory)
+        if isinstance(cycle, DeformResult):
+            return cycle
+        here, local, memory = cycle.here, cycle.local, cycle.memory
         statistics = {"searched": 0.0, "poses": 0.0, "steps": 0.0, "kept": 0.0}
         rest = rest_of(memory.path, here)[0] if memory.path is not None else None
         path = None
