@@ -271,7 +271,7 @@ class OdometryService:
         steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen
-        self._seen = (steering, compass)
+        self._seen = (steering, before[1])
         if steering is not None and steering is not before[0]:
             self._reckoning.observe_steering(steering)
         drives = tuple(reading for drive in self._drives if (reading := drive.latest) is not None)
@@ -279,8 +279,16 @@ class OdometryService:
         if len(drives) == len(self._drives) and all(now is not then for now, then in zip(drives, known, strict=True)):
             self._reckoned = drives
             self._reckoning.observe_drive(*drives)
-        if compass is not None and compass is not before[1]:
+        if compass is not None and compass is not before[1] and self.hears_compass():
+            self._seen = (steering, compass)
             self._reckoning.observe_attitude(compass)
+
+    def hears_compass(self) -> bool:
+        """Whether a heading counts yet: it is held against a pose, which begins with the first drive reading.
+
+        Until then it waits, so that what a log shows first does not depend on ticks that showed nothing.
+        """
+        return bool(self._reckoned)
 
 
 def _message(estimate: Estimate, now: int, seq: int) -> Odometry:

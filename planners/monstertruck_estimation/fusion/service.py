@@ -69,3 +69,7 @@ class FusionService(OdometryService):
                 self._events(
                     Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {standing.north or 0:.2f} rad in odom"
                 )
+
+    def hears_compass(self) -> bool:
+        """Always: a heading can be the first reading."""
+        return True
