@@ -92,7 +92,8 @@ def _build_odometry(config: TruckConfig, bus: Bus, clock: Clock, chassis: Chassi
     }
     if isinstance(odometry, OdometryConfig):
         return OdometryService(DeadReckoning(odometry, chassis), clock, **ends)
-    scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if config.slam is not None and odometry.scans else None
+    used = config.slam is not None and odometry.scans is not None
+    scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if used else None
     return FusionService(Fusion(odometry, chassis), clock, scans=scans, events=bus.event_sink(), **ends)
 
 

@@ -50,7 +50,8 @@ class ScanMotion(Message):
     motion: Pose2D
     """Base at ``stamp`` in base at ``since``."""
     covariance: Float64Array
-    """Shape (9,), row-major covariance of (x, y, yaw): m^2, m rad, rad^2; huge along a corridor."""
+    """Shape (9,), row-major covariance of the later scan's place on the map, (x, y, yaw) in its own base's axes: m^2,
+    m rad, rad^2; huge along a corridor. That of the earlier scan came with the motion before."""
 
     @model_validator(mode="after")
     def _shape(self) -> Self:

@@ -1,11 +1,13 @@
 """The filter: an error-state extended Kalman filter with stochastic clones, as pure functions of a frozen belief.
 
 State: pose in odom (x, y, yaw), velocity in base (vx, vy, wz), north (yaw in odom at which the compass reads 0: the
-bias of the compass), trim (the bias of the wheels' curvature, rad/m), and two earlier poses: that at the last scan and
-that at the last wheel reading. All errors are additive, yaw on the circle.
+bias of the compass), trim (the bias of the wheels' curvature, rad/m), the place of the last scan, and the pose at the
+last wheel reading. All errors are additive, yaw on the circle.
 
 Wheels and scans tell motion between two instants, so they are compared with the pose and the clone of the earlier one;
 pose and clone stay correlated, and nothing is counted twice (Roumeliotis and Burdick, "Stochastic cloning", 2002).
+The clone of a scan is the pose as the scan saw it, error included: scans are matched to one map, so the error of the
+later scan of one motion is that of the earlier scan of the next, and must not add up as if they were independent.
 Covariances are updated in Joseph's form, which keeps them symmetric and positive.
 """
 
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.heading import Evidence, Gate, Verdict, judged
 from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
-from monstertruck_estimation.slam.se2 import between, between_jacobians
+from monstertruck_estimation.slam.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND
@@ -32,6 +34,8 @@ TWIST: Final = slice(3, 6)
 YAW, NORTH, TRIM = 2, 6, 7
 SCAN: Final = slice(8, 11)
 WHEELS: Final = slice(11, 14)
+LATER: Final = slice(14, 17)
+"""Place of the scan that is just being taken in."""
 AT_REST: Final = 0.05
 """Standard deviation of the velocity at the start, m/s and rad/s."""
 QUANTUM: Final = (1e-5, 1e-5)
@@ -104,7 +108,7 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
     covariance[TWIST, TWIST] += np.diag(agility * dt)
     covariance[NORTH, NORTH] += (config.compass.drift**2 if config.compass is not None else 0.0) * dt
     covariance[TRIM, TRIM] += (config.wheels.trim_drift**2 if config.wheels is not None else 0.0) * dt
-    return replace(belief, stamp=stamp, mean=mean, covariance=covariance)
+    return replace(belief, stamp=stamp, mean=mean, covariance=(covariance + covariance.T) / 2)
 
 
 def advanced(belief: Belief, operation: Operation, config: FusionConfig) -> Belief:
@@ -114,9 +118,9 @@ def advanced(belief: Belief, operation: Operation, config: FusionConfig) -> Beli
         case WheelWay():
             return _wheels(belief, operation, config)
         case ScanWay():
-            return _scan(belief, operation)
+            return _scan(belief, operation, config)
         case ScanMark():
-            return _cloned(belief, SCAN, scan=operation.stamp)
+            return _marked(belief, operation.stamp, operation.covariance)
         case Heading():
             return _heading(belief, operation, config)
 
@@ -127,13 +131,13 @@ def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> B
     Args:
         belief: prior.
         residual: shape (m,), measured minus expected.
-        by_state: shape (m, 14), derivative of the expected by the state.
+        by_state: shape (m, n), derivative of the expected by the state.
         noise: shape (m, m), covariance of the measurement.
     """
     spread = by_state @ belief.covariance
     innovation = spread @ by_state.T + noise
     gain = np.linalg.solve(innovation, spread).T
-    left = np.eye(SIZE) - gain @ by_state
+    left = np.eye(len(belief.mean)) - gain @ by_state
     covariance = left @ belief.covariance @ left.T + gain @ noise @ gain.T
     mean = belief.mean + gain @ residual
     nis = float(residual @ np.linalg.solve(innovation, residual))
@@ -165,7 +169,7 @@ def _wheels(belief: Belief, way: WheelWay, config: FusionConfig) -> Belief:
         belief = updated(belief, residual, by_state, noise)
         if not way.slipping:
             belief = replace(belief, used={**belief.used, "drive": way.stamp})
-    return _cloned(belief, WHEELS, wheels=way.stamp)
+    return replace(_cloned(belief, WHEELS), wheels=way.stamp)
 
 
 def _level(belief: Belief) -> tuple[float, float]:
@@ -175,27 +179,57 @@ def _level(belief: Belief) -> tuple[float, float]:
     return math.cos(belief.tilt[2]), math.cos(belief.tilt[1])
 
 
-def _scan(belief: Belief, way: ScanWay) -> Belief:
-    if belief.scan == way.since:
-        residual, by_state = _way(belief, SCAN, way.delta)
-        belief = updated(belief, residual, by_state, way.covariance)
-        belief = replace(belief, used={**belief.used, "lidar": way.stamp})
-    return _cloned(belief, SCAN, scan=way.stamp)
+def _scan(belief: Belief, way: ScanWay, config: FusionConfig) -> Belief:
+    """The later scan's place joins the state, the motion ties it to the earlier one's, and it takes over."""
+    if belief.scan != way.since or config.scans is None:
+        return _marked(belief, way.stamp, way.covariance)
+    by_place = np.vstack((np.eye(SIZE), np.zeros((3, SIZE))))
+    by_place[LATER, POSE] = np.eye(3)
+    mean = by_place @ belief.mean
+    covariance = by_place @ belief.covariance @ by_place.T
+    covariance[LATER, LATER] += _turned(way.covariance, float(belief.mean[YAW]))
+    earlier, later = mean[SCAN], mean[LATER]
+    residual = way.delta - between(earlier, later)
+    residual[2] = wrap_angle(float(residual[2]))
+    by_state = np.zeros((3, SIZE + 3))
+    by_state[:, SCAN], by_state[:, LATER] = between_jacobians(earlier, later)
+    place, turn = config.scans.drift
+    noise = np.diag((place**2, place**2, turn**2))
+    joint = updated(replace(belief, mean=mean, covariance=covariance), residual, by_state, noise)
+    kept = np.r_[0:SIZE]
+    kept[SCAN] = np.r_[LATER]
+    return replace(
+        joint,
+        mean=joint.mean[kept],
+        covariance=joint.covariance[np.ix_(kept, kept)],
+        scan=way.stamp,
+        used={**belief.used, "lidar": way.stamp},
+    )
 
 
-def _cloned(belief: Belief, clone: slice, *, scan: int | None = None, wheels: int | None = None) -> Belief:
+def _turned(covariance: Array, yaw: float) -> Array:
+    """A covariance given in base's axes, in those of odom."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(yaw)
+    result: Array = turn @ covariance @ turn.T
+    return (result + result.T) / 2
+
+
+def _marked(belief: Belief, stamp: int, noise: Array) -> Belief:
+    """The pose as a scan sees it becomes the clone of the scan."""
+    belief = _cloned(belief, SCAN)
+    covariance = belief.covariance.copy()
+    covariance[SCAN, SCAN] += _turned(noise, float(belief.mean[YAW]))
+    return replace(belief, covariance=covariance, scan=stamp)
+
+
+def _cloned(belief: Belief, clone: slice) -> Belief:
     """The pose as it is now becomes the clone."""
     mean, covariance = belief.mean.copy(), belief.covariance.copy()
     mean[clone] = mean[POSE]
     covariance[clone, :] = covariance[POSE, :]
     covariance[:, clone] = covariance[:, POSE]
-    return replace(
-        belief,
-        mean=mean,
-        covariance=covariance,
-        scan=belief.scan if scan is None else scan,
-        wheels=belief.wheels if wheels is None else wheels,
-    )
+    return replace(belief, mean=mean, covariance=covariance)
 
 
 def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:

@@ -43,6 +43,15 @@ class HeadingTrust(Schema):
     """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
 
 
+class ScanTrust(Schema):
+    """What the motion between scans is worth."""
+
+    scale: Positive = 1.0
+    """Factor on the standard deviation the matching claims."""
+    drift: tuple[Share, Share] = (0.0005, 0.0005)
+    """Standard deviation by which the map, against which scans are matched, drifts from one to the next, m and rad."""
+
+
 class SlipConfig(Schema):
     """When the wheels are held to slip."""
 
@@ -83,13 +92,15 @@ class FusionConfig(Schema):
     horizon: Positive = 1.5
     """Measurements may come this late, s."""
     slew: tuple[Positive, Positive] = (0.5, 1.0)
-    """The published pose follows corrections no faster than this, m/s and rad/s: it never jumps."""
+    """The published pose follows corrections no faster than this, m/s and rad/s: it never jumps,"""
+    settle: Positive = 0.4
+    """and with this time constant, s."""
     wheels: WheelTrust | None = WheelTrust()
     """Null leaves the wheels out"""
     compass: HeadingTrust | None = HeadingTrust()
     """Null leaves the compass out"""
-    scans: bool = True
-    """Whether the motion between scans is used, where `slam` finds it"""
+    scans: ScanTrust | None = ScanTrust()
+    """Null leaves the scans out; they are used where `slam` matches them"""
     slip: SlipConfig = SlipConfig()
 
 

@@ -64,7 +64,7 @@ class Fusion:
         self._history: History | None = None
         self._last: dict[str, int] = {}
         self._shown: tuple[int, Array] | None = None
-        self._correction = Correction(config.slew, math.inf)
+        self._correction = Correction(config.slew, math.inf, config.settle)
         self._left_out: Counter[str] = Counter()
         self._changes: deque[Change] = deque()
 
@@ -115,18 +115,18 @@ class Fusion:
         )
         if self._config.compass is None:
             heading = replace(heading, disturbed=True)
+        if not self._insert(heading):
+            self._left_out["compass: too late"] += 1
         elif heading.field is not None and not heading.disturbed and not self._disturbed:
             self._heed(self._slip.heading(attitude.stamp, heading.yaw))
         else:
             self._slip.forget_headings()
-        if not self._insert(heading):
-            self._left_out["compass: too late"] += 1
 
     def observe_scan(self, motion: ScanMotion) -> None:
         """Take the motion between two scans, some time after the later of them."""
-        if not self._config.scans:
+        if self._config.scans is None:
             return
-        way = _scan_way(motion)
+        way = _scan_way(motion, self._config.scans.scale)
         if way is None:
             self._left_out["lidar: no motion with a covariance"] += 1
             return
@@ -141,7 +141,7 @@ class Fusion:
         history = self._begin(way.since)
         if history.before(way.stamp).scan != way.since:
             # The clone of the earlier pose has to be made where it was.
-            self._insert(ScanMark(way.since))
+            self._insert(ScanMark(way.since, way.covariance))
         if not self._insert(way):
             self._left_out["lidar: too late"] += 1
 
@@ -257,9 +257,9 @@ def _slipping(operation: Operation) -> Operation:
     return replace(operation, slipping=True) if isinstance(operation, WheelWay) else operation
 
 
-def _scan_way(motion: ScanMotion) -> ScanWay | None:
+def _scan_way(motion: ScanMotion, scale: float) -> ScanWay | None:
     delta = np.array((motion.motion.x, motion.motion.y, motion.motion.yaw))
-    covariance = np.array(motion.covariance).reshape(3, 3)
+    covariance = np.array(motion.covariance).reshape(3, 3) * scale**2
     covariance = (covariance + covariance.T) / 2
     if motion.since >= motion.stamp or not (np.isfinite(delta).all() and np.isfinite(covariance).all()):
         return None

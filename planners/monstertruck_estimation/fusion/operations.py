@@ -31,7 +31,7 @@ class ScanWay:
     delta: Array
     """Shape (3,), m and rad."""
     covariance: Array
-    """Shape (3, 3); huge along a corridor."""
+    """Shape (3, 3), of the later scan's place on the map both are matched to, in base's axes; huge along a corridor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,8 @@ class ScanMark:
     """A scan was taken; a later one will tell how the base moved since."""
 
     stamp: int
+    covariance: Array
+    """Shape (3, 3), of its place, as in ``ScanWay``."""
 
 
 @dataclass(frozen=True, slots=True)

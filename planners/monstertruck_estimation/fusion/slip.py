@@ -26,6 +26,8 @@ FLOOR: Final = (0.003, 0.005)
 """Standard deviation of any comparison, m and rad."""
 JITTER: Final = 0.01
 """Standard deviation of a compass heading against one a second before, rad."""
+FASTEST: Final = 3.0
+"""No robot turns faster than this, rad/s."""
 SPAN: Final = SECOND
 """Wheels and compass are compared over this long, ns."""
 
@@ -83,11 +85,12 @@ class SlipWatch:
         told = self._told(since, way.stamp)
         if told is None:
             return None
-        moved, spread = np.zeros(3), np.zeros((3, 3))
+        moved = np.zeros(3)
         for one in self._ways:
-            by_pose, by_way = compose_jacobians(moved, one.delta)
-            spread = by_pose @ spread @ by_pose.T + by_way @ one.covariance @ by_way.T
             moved = compose(moved, one.delta)
+        _, by_later = compose_jacobians(moved, np.zeros(3))
+        # The places of the first and the last scan err; what was in between has cancelled.
+        spread = self._ways[0].covariance + by_later @ way.covariance @ by_later.T
         delta, noise = told
         off = delta - moved
         off[2] = wrap_angle(float(off[2]))
@@ -98,6 +101,11 @@ class SlipWatch:
 
     def heading(self, stamp: int, yaw: float) -> Change | None:
         """Take an undisturbed heading (counter-clockwise, rad); it is the judge where there are no scans."""
+        if self._headings:
+            last, before = self._headings[-1]
+            if abs(wrap_angle(yaw - before)) > JITTER * 4 + FASTEST * (stamp - last) / SECOND:
+                # The field has changed, nothing turns so fast.
+                self._headings.clear()
         self._headings.append((stamp, yaw))
         while len(self._headings) > 1 and stamp - self._headings[1][0] >= SPAN:
             self._headings.popleft()

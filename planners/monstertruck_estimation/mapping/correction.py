@@ -17,10 +17,13 @@ class Correction:
     Args:
         slew: greatest speed of the change, m/s and rad/s.
         jump: corrections of the robot's place beyond this, m, count at once.
+        settle: time constant of the approach within that, s; 0 = none. Whoever undoes the motion of a scan by these
+            poses must not see every correction as motion: matched so, the next scan would be wrong by as much.
     """
 
-    def __init__(self, slew: tuple[float, float], jump: float) -> None:
+    def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:
         self._slew = slew
+        self._settle = settle
         self._jump = jump
         self._target = np.zeros(3)
         self._shown = np.zeros(3)
@@ -44,6 +47,8 @@ class Correction:
         off = between(now, then)
         way, turn = math.hypot(off[0], off[1]), abs(float(off[2]))
         share = min(self._slew[0] * dt / max(way, 1e-12), self._slew[1] * dt / max(turn, 1e-12))
+        if self._settle > 0:
+            share = min(share, -math.expm1(-dt / self._settle))
         if way > self._jump or share >= 1.0:
             now, self._shown = then, self._target.copy()
         else:

@@ -91,7 +91,7 @@ class Moved:
     motion: Vector
     """Base at the later one in base at the earlier one."""
     covariance: tuple[float, ...]
-    """Row-major (3, 3)."""
+    """Row-major (3, 3), of the later scan's place on the map, in base's axes: the earlier one's came with its own."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.exchange import Moved
 from monstertruck_estimation.slam.frontend import Match
-from monstertruck_estimation.slam.se2 import between, between_jacobians
+from monstertruck_estimation.slam.se2 import between, rotation
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ class Increments:
     """Relates every match to the one before; what was rejected is stepped over."""
 
     def __init__(self) -> None:
-        self._last: tuple[int, Array, Array] | None = None
+        self._last: tuple[int, Array] | None = None
 
     def take(self, stamp: int, match: Match, pose: Array, *, corrected: bool = False) -> Moved | None:
         """The motion since the last match that was accepted.
@@ -36,16 +36,16 @@ class Increments:
             if corrected:
                 self._last = None
             return None
-        covariance = np.linalg.inv(match.information + UNKNOWN)
-        covariance = covariance + np.diag(np.square((FLOOR[0], FLOOR[0], FLOOR[1])))
-        last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose, covariance)
+        last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose)
         if last is None:
             return None
-        since, origin, noise = last
-        by_origin, by_target = between_jacobians(origin, match.pose)
-        total = by_origin @ noise @ by_origin.T + by_target @ covariance @ by_target.T
+        since, origin = last
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(-match.pose[2])
+        covariance = turn @ np.linalg.inv(match.information + UNKNOWN) @ turn.T
+        covariance = (covariance + covariance.T) / 2 + np.diag(np.square((FLOOR[0], FLOOR[0], FLOOR[1])))
         x, y, yaw = between(origin, match.pose).tolist()
-        return Moved(since, (x, y, yaw), tuple(((total + total.T) / 2).ravel().tolist()))
+        return Moved(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def forget(self) -> None:
         """What was before cannot be compared with what comes."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
-from monstertruck_estimation.slam.se2 import between
+from monstertruck_estimation.slam.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import Attitude, Vector3
@@ -91,17 +91,18 @@ class Rig:
 
     def _scan(self):
         noise = np.diag(np.square(self.scan_noise))
+        place = compose(np.array(self.pose), self.rng.normal(0.0, self.scan_noise))
         if self.last is not None:
             since, then = self.last
-            delta = between(np.array(then), np.array(self.pose)) + self.rng.normal(0.0, self.scan_noise)
+            delta = between(np.array(then), np.array(place))
             if self.degenerate is not None:
                 # Along the direction (in odom) anything may come out.
-                along = self.degenerate - then[2]
+                along = self.degenerate - self.pose[2]
                 axis = np.array((math.cos(along), math.sin(along), 0.0))
                 delta = delta + axis * self.rng.normal(0.0, 0.5)
                 noise = noise + np.outer(axis, axis) * 100.0
             self.waiting.append(scan_motion(since, self.now, delta, noise))
-        self.last = (self.now, self.pose)
+        self.last = (self.now, place)
 
     @property
     def estimate(self):

@@ -30,8 +30,9 @@ def test_more_sensors_err_less():
         errors = [wander(Rig(sensors, seed=seed), seconds=12).error()[0] for seed in range(3)]
         return math.sqrt(np.mean(np.square(errors)))
 
-    assert rms(ALL) < rms(("wheels",))
-    assert rms(ALL) < rms(("scans",))
+    wheels, held, everything = rms(("wheels",)), rms(("wheels", "compass")), rms(ALL)
+    assert everything < 0.5 * held
+    assert everything < 0.5 * wheels
 
 
 def test_the_errors_are_as_great_as_the_covariance_says():
@@ -99,7 +100,7 @@ def test_wheels_that_slip_do_not_count_as_a_source():
 
 def test_good_wheels_never_count_as_slipping():
     for seed in range(2):
-        assert wander(Rig(ALL, seed=seed)).changes == []
+        assert wander(Rig(ALL, seed=seed), seconds=12).changes == []
 
 
 def test_a_turn_that_only_the_wheels_make_is_slip_by_the_compass():
@@ -239,5 +240,5 @@ def test_sections_set_null_leave_sensors_out():
     rig = Rig(ALL, wheels=None, compass=None).drive(0.3, 0.0, 0.0, 3.0)
     assert rig.estimate.sources == ("tilt", "lidar")
     assert rig.error()[0] < 0.08
-    rig = Rig(ALL, scans=False).drive(0.3, 0.0, 0.0, 3.0)
+    rig = Rig(ALL, scans=None).drive(0.3, 0.0, 0.0, 3.0)
     assert "lidar" not in rig.estimate.sources

@@ -1,0 +1,115 @@
+import math
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+
+from monstertruck_estimation.fusion.beliefs import advanced, initial, predicted
+from monstertruck_estimation.fusion.history import History
+from monstertruck_estimation.fusion.operations import Heading, ScanMark, ScanWay, WheelWay
+from monstertruck_estimation.slam.se2 import between, between_jacobians
+from monstertruck_runtime.clock import SECOND
+from tests.unit.estimation.fusion.kit import config
+
+CONFIG = config()
+PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
+small = st.floats(-0.3, 0.3)
+spread = st.floats(-4.0, 1.0).map(lambda exponent: 10.0**exponent)
+deltas = st.tuples(small, small, small).map(np.array)
+noises = st.tuples(spread, spread, spread).map(lambda sigmas: np.diag(np.square(sigmas)))
+steps = st.lists(
+    st.tuples(st.integers(1, SECOND), st.sampled_from(("wheels", "scan", "heading", "mark")), deltas, noises),
+    max_size=15,
+)
+
+
+def operations(drawn):
+    now, since = SECOND, {"wheels": SECOND, "scan": SECOND}
+    for dt, kind, delta, noise in drawn:
+        now += dt
+        if kind == "wheels":
+            yield WheelWay(since[kind], now, delta, noise, slipping=bool(dt % 2))
+        elif kind == "scan":
+            yield ScanWay(since[kind], now, delta, noise)
+        elif kind == "mark":
+            yield ScanMark(now, noise)
+            since["scan"] = now
+        else:
+            yield Heading(now, float(delta[0] * 20), tilt=(float(delta[1]), float(delta[2])))
+        if kind in since:
+            since[kind] = now
+
+
+@settings(deadline=None, max_examples=25, phases=PHASES)
+@given(steps)
+def test_the_covariance_stays_symmetric_and_positive(drawn):
+    belief = initial(SECOND, CONFIG)
+    for operation in operations(drawn):
+        belief = advanced(belief, operation, CONFIG)
+        assert belief.covariance == pytest.approx(belief.covariance.T, abs=0.0)
+        # Clones are copies: exactly singular at the instant they are made, so the bound is a rounding below 0.
+        values = np.linalg.eigvalsh(belief.covariance)
+        assert values[0] > -1e-9 * max(values[-1], 1.0)
+        assert np.linalg.eigvalsh(belief.covariance[:3, :3])[0] > -1e-12
+        assert np.isfinite(belief.mean).all()
+
+
+@settings(deadline=None, max_examples=10, phases=PHASES)
+@given(steps, st.randoms(use_true_random=False))
+def test_the_order_in_which_measurements_come_does_not_matter(drawn, random):
+    made = list(operations(drawn))
+    histories = []
+    for shuffled in (made, random.sample(made, len(made))):
+        history = History(initial(SECOND, CONFIG), lambda belief, op: advanced(belief, op, CONFIG), 10**12)
+        assert all(history.insert(operation) for operation in shuffled)
+        histories.append(history.newest)
+    assert histories[0].mean == pytest.approx(histories[1].mean, abs=0.0)
+    assert histories[0].covariance == pytest.approx(histories[1].covariance, abs=0.0)
+
+
+def test_what_is_before_the_horizon_is_forgotten():
+    history = History(initial(SECOND, CONFIG), lambda belief, op: advanced(belief, op, CONFIG), SECOND)
+    for k in range(30):
+        assert history.insert(Heading(SECOND + k * SECOND // 10, 0.1))
+    assert not history.insert(Heading(SECOND + SECOND // 20, 0.1))
+    assert history.reaches(3 * SECOND)
+    assert not history.reaches(2 * SECOND)
+
+
+def test_a_prediction_in_two_steps_is_one_prediction():
+    belief = initial(SECOND, CONFIG)
+    at_once = predicted(belief, 2 * SECOND, CONFIG)
+    in_steps = predicted(predicted(belief, 3 * SECOND // 2, CONFIG), 2 * SECOND, CONFIG)
+    assert in_steps.mean == pytest.approx(at_once.mean)
+    assert predicted(belief, SECOND // 2, CONFIG) is belief
+
+
+def test_a_scan_that_says_nothing_along_a_corridor_changes_nothing_along_it():
+    belief = initial(SECOND, CONFIG)
+    noise = np.diag((1e4, 1e-6, 1e-6))
+    belief = advanced(belief, ScanMark(SECOND, noise), CONFIG)
+    before = predicted(belief, 2 * SECOND, CONFIG)
+    after = advanced(belief, ScanWay(SECOND, 2 * SECOND, np.array((5.0, 0.0, 0.0)), noise), CONFIG)
+    assert after.mean[0] == pytest.approx(before.mean[0], abs=1e-3)
+    assert after.covariance[0, 0] == pytest.approx(before.covariance[0, 0], rel=1e-3)
+    assert after.covariance[1, 1] < 1e-3 * before.covariance[1, 1]
+
+
+def test_errors_of_scans_matched_to_one_map_do_not_add_up():
+    noise = np.diag((0.01**2, 0.01**2, 0.005**2))
+    belief = advanced(initial(SECOND, CONFIG), ScanMark(SECOND, noise), CONFIG)
+    for k in range(400):
+        since = SECOND + k * SECOND // 10
+        belief = advanced(belief, ScanWay(since, since + SECOND // 10, np.zeros(3), noise), CONFIG)
+    # The error of the first place, the drift of the map, and little else; independent motions would make 0.28 m.
+    assert math.sqrt(belief.covariance[0, 0]) < 0.03
+
+
+def test_the_jacobians_of_a_motion_between_poses():
+    origin, target, step = np.array((1.0, -2.0, 0.7)), np.array((1.4, -1.5, 1.1)), 1e-6
+    by_origin, by_target = between_jacobians(origin, target)
+    for k in range(3):
+        off, here = step * np.eye(3)[k], between(origin, target)
+        assert by_origin[:, k] == pytest.approx((between(origin + off, target) - here) / step, abs=1e-5)
+        assert by_target[:, k] == pytest.approx((between(origin, target + off) - here) / step, abs=1e-5)

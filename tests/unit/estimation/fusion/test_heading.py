@@ -1,0 +1,98 @@
+import math
+
+import pytest
+
+from tests.unit.estimation.fusion.kit import FIELD, Rig, attitude
+
+SENSORS = ("wheels", "compass")
+
+
+def disturbed(rig, seconds, **what):
+    kept = {name: getattr(rig, name) for name in what}
+    for name, value in what.items():
+        setattr(rig, name, value)
+    rig.drive(0.3, 0.0, 0.0, seconds)
+    for name, value in kept.items():
+        setattr(rig, name, value)
+    return rig
+
+
+def test_north_is_found_whatever_it_is():
+    rig = Rig(SENSORS)
+    rig.north = -2.0
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    assert rig.fusion.standing().north == pytest.approx(-2.0, abs=0.02)
+
+
+def test_a_magnet_that_changes_the_field_is_left_out_at_once_and_comes_back():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    disturbed(rig, 3.0, magnet=0.1, field=FIELD * 1.4)
+    assert rig.fusion.standing().disturbed
+    assert "compass" not in rig.estimate.sources
+    assert rig.error()[1] < 0.02
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    assert not rig.fusion.standing().disturbed
+    assert "compass" in rig.estimate.sources
+
+
+def test_a_field_that_fades_does_not_creep_in():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    for k in range(30):
+        disturbed(rig, 0.1, magnet=0.6 * k / 30, field=FIELD * (1 + k / 30))
+    for k in range(30, 0, -1):
+        disturbed(rig, 0.1, magnet=0.6 * k / 30, field=FIELD * (1 + k / 30))
+    assert rig.error()[1] < 0.13, "no more than what the field does not betray: 15 % of its strength, 0.09 rad"
+
+
+def test_a_jump_of_the_heading_alone_is_left_out():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    disturbed(rig, 3.0, magnet=0.7)
+    assert rig.fusion.standing().disturbed
+    assert rig.error()[1] < 0.02
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    assert not rig.fusion.standing().disturbed
+
+
+def test_a_single_good_heading_is_not_enough_to_be_believed_again():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    disturbed(rig, 1.0, magnet=0.7)
+    disturbed(rig, 0.06)
+    assert rig.fusion.standing().disturbed
+
+
+def test_a_lasting_change_becomes_a_new_north_and_the_old_one_is_known_again():
+    # With scans, for by the wheels alone the yaw would become so uncertain that it might as well be wrong.
+    rig = Rig(("wheels", "compass", "scans")).drive(0.3, 0.0, 0.0, 4.0)
+    disturbed(rig, 9.0, magnet=0.7)
+    assert rig.fusion.standing().disturbed
+    disturbed(rig, 3.0, magnet=0.7)
+    assert not rig.fusion.standing().disturbed
+    assert rig.fusion.standing().north == pytest.approx(0.0, abs=0.1)
+    assert rig.error()[1] < 0.05
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    assert not rig.fusion.standing().disturbed
+    assert rig.fusion.standing().north == pytest.approx(0.7, abs=0.05)
+    assert rig.error()[1] < 0.05
+
+
+def test_wild_headings_never_become_a_north():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    for _ in range(150):
+        disturbed(rig, 0.1, magnet=float(rig.rng.uniform(0.5, 5.5)))
+    assert rig.fusion.standing().disturbed
+    assert rig.error()[1] < 0.05
+
+
+def test_the_devices_own_word_counts():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    before = rig.fusion.belief.mean[2]
+    for k in range(40):
+        rig.fusion.observe_attitude(attitude(rig.now + k + 1, math.pi / 2, heading_disturbed=True))
+    assert rig.fusion.belief.mean[2] == pytest.approx(before, abs=1e-3)
+    assert rig.fusion.standing().disturbed
+
+
+def test_the_deviation_of_the_compass_does_not_count_as_slip():
+    rig = Rig(SENSORS).drive(0.3, 0.2, -0.2, 4.0)
+    disturbed(rig, 2.0, magnet=0.7, field=FIELD * 1.5)
+    assert rig.drive(0.3, 0.2, -0.2, 4.0).changes == []
