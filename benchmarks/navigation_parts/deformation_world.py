@@ -101,6 +101,51 @@ SCENARIOS = (
 )  # fmt: skip
 
 
+def unseen(seed: int) -> tuple[Scenario, ...]:
+    """The same kinds of trouble with other measures, drawn at random; the rules were not developed on them."""
+    rng = np.random.default_rng([3, seed])
+
+    def draw(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    y, size = 2.5 + draw(-0.2, 0.2), draw(0.2, 0.7)
+    box = (draw(2.4, 3.6), y - draw(0.1, 0.9) * size)
+    two = (draw(2.2, 2.7), draw(4.0, 4.5), draw(0.9, 1.2))
+    crossing, pace, stop, stay = draw(2.6, 3.8), draw(0.15, 0.5), 2.5 + draw(-0.3, 0.3), draw(3.0, 9.0)
+    depth, half, trap = draw(0.5, 1.1), draw(0.45, 0.6), draw(2.7, 3.3)
+    door, wide, wall = 2.5 + draw(-0.5, 0.5), draw(0.56, 0.72), draw(2.8, 3.6)
+    slot, bay = draw(3.4, 4.2), draw(0.8, 0.95)
+
+    def walker(t: float) -> tuple[float, float]:
+        there = (4.2 - stop) / pace
+        return crossing, 4.2 - pace * min(t, there) - pace * max(t - there - stay, 0.0)
+
+    return (
+        Scenario("box", *AHEAD, hidden=lambda _: ((*box, box[0] + size, box[1] + size),)),
+        Scenario(
+            "two boxes", *AHEAD,
+            hidden=lambda _: ((two[0], 2.5 - two[2], two[0] + 0.3, 2.6), (two[1], 2.4, two[1] + 0.3, 2.5 + two[2])),
+        ),
+        Scenario("person from the left", *AHEAD, person=lambda t: walker(t) if t < 30.0 else (crossing, 0.8)),
+        Scenario(
+            "trap", *AHEAD,
+            hidden=lambda _: (
+                (trap, 2.5 - half - 0.08, trap + depth, 2.5 - half), (trap, 2.5 + half, trap + depth, 2.58 + half),
+                (trap + depth - 0.08, 2.5 - half, trap + depth, 2.5 + half),
+            ),
+        ),
+        Scenario(
+            "door aside", *AHEAD,
+            hidden=lambda _: ((wall, 0.0, wall + 0.1, door - wide / 2), (wall, door + wide / 2, wall + 0.1, 5.0)),
+        ),
+        Scenario(
+            "parking", (1.0, 2.2, 0.0), (slot + bay / 2, 0.6, math.pi / 2),
+            known=((0.0, 0.0, slot, 1.1), (slot + bay, 0.0, 7.0, 1.1), (0.0, 3.7, 7.0, 5.0)),
+            hidden=lambda _: ((slot + bay + 0.2, 2.0, slot + bay + 0.5, 2.3),), planned=True,
+        ),
+    )  # fmt: skip
+
+
 class World:
     """A scenario as it is at some time."""
 
