@@ -2,9 +2,8 @@
 
 Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
 for bit. So are those of the estimation worker and what rests on them in a log of the virtual clock. On the wall clock
-the log shows when the worker's results counted, but not to the microsecond: there such outputs may differ by
-``WORKER_TOLERANCE``, and pictures of the map, sent so often a second, by chance come a scan sooner or later: they are
-shown, not judged.
+the log shows when the worker's results counted, but not which of two inputs of one instant it had read: there what
+rests on them may differ by ``WORKER_TOLERANCE``, and its own messages are shown, not judged.
 """
 
 import asyncio
@@ -27,10 +26,9 @@ from monstertruckd.replay_check.recorded import Survey, preamble, recorded_confi
 from monstertruckd.replay_check.result import Check, Unreadable
 
 RESTS_ON_WORKER: Final = frozenset(
-    {*WORKER, *(topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE))}
+    topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
 )
 """Outputs a worker has a say in where the robot maps or localises."""
-PICTURES: Final = frozenset({topics.MAP.name, topics.MAP_TILES.name})
 WORKER_TOLERANCE: Final = 0.02
 """Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""
 
@@ -69,7 +67,7 @@ def check_log(
             topic,
             _tolerance(topic.name, tolerance, exact=exact),
             found.start,
-            judged=exact or topic.name not in PICTURES,
+            judged=exact or topic.name not in WORKER,
         )
         for topic in topics.TOPICS
         if topic.name in compared

@@ -1,0 +1,17 @@
+"""What a whole daemon recorded on the virtual clock comes again bit for bit."""
+
+import pytest
+
+from monstertruckd.replay_check import check_log
+from tests.make_replay_logs import RUNS, record
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_fresh_run_comes_again(tmp_path, name):
+    record(name, tmp_path / "run.mcap")
+    check = check_log(tmp_path / "run.mcap")
+    assert check.agrees, check.first
+    assert check.equal == check.compared >= 1000
+    assert check.lost == {}
