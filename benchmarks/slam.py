@@ -3,9 +3,10 @@
     python benchmarks/slam.py --data DIR [--only LOG|PART ...] [--quick]
 
 DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
-1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs. The trajectories
-judged are those after the joint registration at a log's end; ``online`` figures are before it. Two processes at most;
-times are processor time. Plots go to runs/slam. The last line is JSON.
+1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs, world (odometry by
+every subset of sensors in the emulators' world; needs no data; with --quick two drives of each kind, not ten). The
+trajectories judged are those after the joint registration at a log's end; ``online`` figures are before it. Two
+processes at most; times are processor time. Plots go to runs/slam. The last line is JSON.
 """
 
 import argparse
@@ -21,18 +22,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from slam_parts import accuracy
 from slam_parts.logs import verified
 
+PARTS = ("exp2", "costs", "world")
 OUT = Path(__file__).resolve().parents[1] / "runs" / "slam"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--only", nargs="+", choices=(*accuracy.LOGS, "exp2", "costs"))
+    parser.add_argument("--data", type=Path, help="needed for all parts but world")
+    parser.add_argument("--only", nargs="+", choices=(*accuracy.LOGS, *PARTS))
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(accuracy.QUICK)}")
     arguments = parser.parse_args()
-    verified(arguments.data)
     OUT.mkdir(parents=True, exist_ok=True)
-    chosen = arguments.only or (accuracy.QUICK if arguments.quick else (*accuracy.LOGS, "exp2", "costs"))
+    chosen = arguments.only or (accuracy.QUICK if arguments.quick else (*accuracy.LOGS, *PARTS))
+    if set(chosen) != {"world"}:
+        if arguments.data is None:
+            parser.error("--data DIR is needed for all parts but world")
+        verified(arguments.data)
     parts = []
     logs = tuple(name for name in accuracy.LOGS if name in chosen)
     if logs:
@@ -41,6 +46,8 @@ def main() -> int:
         parts.append(importlib.import_module("slam_parts.exp2").run(OUT / "exp2.png"))
     if "costs" in chosen:
         parts.append(importlib.import_module("slam_parts.costs").run(arguments.data / "urg04lx_exp2.dat.gz"))
+    if "world" in chosen:
+        parts.append(importlib.import_module("slam_parts.world").run(OUT, quick=arguments.quick))
     figures = {key: value for part in parts for key, value in part[0].items()}
     goals = {key: value for part in parts for key, value in part[1].items()}
     met = all(part[2] for part in parts)

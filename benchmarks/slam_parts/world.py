@@ -1,0 +1,328 @@
+"""Odometry in the world: ten drives of every kind by every subset of sensors, against the truth.
+
+Absolute error (ATE): root mean square of the position in odom, which begins at the truth; no alignment. Relative error
+(RPE): of the motion over every metre driven. After a kidnapping odom goes on from where it was, so that part of the
+drive counts from its own beginning. ``reckoning`` is the daemon's default: wheels, its heading held by the compass.
+The scans are matched by the mapper itself, on the odometry that is judged (without wheels: on nothing), and told
+30 ms after their end; in kidnapped drives by the localisation in the saved map.
+"""
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.world.config import TruckConfig
+from monstertruck_estimation.fusion.config import FusionConfig
+from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.mapping.config import GridConfig
+from monstertruck_estimation.mapping.estimator import Estimator, MappingEstimator, prepared
+from monstertruck_estimation.mapping.exchange import Estimate, Moved, ScanInput
+from monstertruck_estimation.mapping.localise import LocalisingEstimator
+from monstertruck_estimation.mapping.storage import load
+from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Reckoner
+from monstertruck_estimation.scan_tilt import Track, plane_slopes, plane_tilt
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.se2 import between, compose, interpolate, inverse
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.health import Standing
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.state import ScanMotion
+from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, Scenario, draw_corridor, driven
+
+Array = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[2]
+SEEDS, QUICK_SEEDS = 10, 2
+LATENCY = 3 * SECOND // 100
+MAX_TILT = 0.1
+SUBSETS = {
+    "reckoning": ("drive", "compass"),
+    "wheels": ("drive",),
+    "wheels+compass": ("drive", "compass"),
+    "wheels+scans": ("drive", "scans"),
+    "compass+scans": ("compass", "scans"),
+    "scans": ("scans",),
+    "all": ("drive", "compass", "scans"),
+}
+STARTED = 2.0
+"""Seconds in which nothing is judged."""
+GOALS = {
+    "all_ate_over_reckoning": 1.0,
+    "corridor_degenerate": 0.9,
+    "corridor_nees": 8.0,
+    "kidnap_found": 1.0,
+    "slip_told": 0.8,
+    "slip_false": 0.0,
+    "greatest_step_m": 0.025,
+}
+"""At most; degenerate (share of the scans), found and told at least. NEES of 3 degrees of freedom, their mean."""
+
+
+@dataclass
+class Run:
+    """What one robot believed on one drive."""
+
+    stamps: list[float] = field(default_factory=list)
+    poses: list[tuple[float, ...]] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    standings: Counter[Standing] = field(default_factory=Counter)
+    slips: list[float] = field(default_factory=list)
+    """Stamps of their onsets."""
+    found: float | None = None
+    """Seconds from the kidnapping to the first right pose in map."""
+
+
+class Matching:
+    """Scans to motion, as the estimation worker does it."""
+
+    def __init__(self, scenario: Scenario, drive: Drive) -> None:
+        self._body = Track()
+        self.newest: Estimate | None = None
+        if scenario.carried is None:
+            self.estimator: Estimator = MappingEstimator(MapperConfig(), GridConfig(), start=drive.start)
+        else:
+            self.estimator = LocalisingEstimator(load(ROOT / "configs/worlds/rooms.yaml"), MapperConfig(), drive.start)
+
+    def heed(self, attitude: Attitude) -> None:
+        """Take the tilt."""
+        self._body.extend(((attitude.stamp, (attitude.roll, attitude.pitch)),))
+
+    def match(self, stamp: int, ranges: Array, history: list[tuple[float, ...]] | None) -> Moved | None:
+        """Motion up to the scan; ``history`` are stamps (s) and poses of odometry, None without."""
+        tilt = self._body.at(stamp + SWEEP // 2)
+        if tilt is not None and plane_tilt(*tilt) > MAX_TILT:
+            return None
+        odom, twist = _motion(stamp, history)
+        inputs = ScanInput(
+            stamp=stamp,
+            ranges=ranges,
+            start_angle=-384 * BEAM,
+            angle_increment=BEAM,
+            range_min=0.02,
+            range_max=5.6,
+            time_increment=SWEEP / 1024 / SECOND,
+            mount=(0.14, 0.0, 0.0),
+            odom=odom,
+            twist=twist,
+            slopes=None if tilt is None else plane_slopes(*tilt),
+            height=0.25,
+        )
+        self.newest = self.estimator.step(prepared(inputs, 30.0, self.estimator.twist), inputs)
+        return None if self.newest is None else self.newest.moved
+
+
+def _motion(
+    stamp: int, history: list[tuple[float, ...]] | None
+) -> tuple[tuple[float, float, float] | None, tuple[float, float, float]]:
+    """Base in odom when a scan began, and its velocity during the scan."""
+    if history is None or not history or history[0][0] > stamp / SECOND:
+        return None, (0.0, 0.0, 0.0)
+    rows = np.array(history[-32:])
+    begin, end = interpolate(rows[:, 0], rows[:, 1:], np.array((stamp, stamp + SWEEP)) / SECOND)
+    x, y, yaw = begin.tolist()
+    vx, vy, wz = (between(begin, end) / (SWEEP / SECOND)).tolist()
+    return (x, y, yaw), (vx, vy, wz)
+
+
+def run_drive(scenario: Scenario, drive: Drive, subset: str) -> Run:
+    """One robot with a subset of the sensors on one drive."""
+    sensors, chassis = SUBSETS[subset], TruckConfig().chassis()
+    x, y, yaw = drive.start
+    start = Pose2D(x=x, y=y, yaw=yaw)
+    fusion = Fusion(FusionConfig(kind="fusion", start=start), chassis)
+    reckoner: Reckoner = fusion
+    if subset == "reckoning":
+        reckoner = DeadReckoning(OdometryConfig(start=start), chassis)
+    matching = Matching(scenario, drive) if "scans" in sensors else None
+    run, waiting, due, truth = Run(), deque[tuple[int, ScanMotion]](), SECOND, np.array(drive.truth)
+    for now, message in drive.told:
+        while due <= now:
+            while waiting and waiting[0][0] <= due:
+                fusion.observe_scan(waiting.popleft()[1])
+            run.slips += [change.since / SECOND for change in fusion.changes() if change.slipping]
+            _tell(run, reckoner, due, truth, drive)
+            due += SECOND // 50
+        if isinstance(message, SteeringFeedback) and "drive" in sensors:
+            reckoner.observe_steering(message)
+        elif isinstance(message, DriveFeedback) and "drive" in sensors:
+            reckoner.observe_drive(message)
+        elif isinstance(message, Attitude) and "compass" in sensors:
+            reckoner.observe_attitude(message)
+            if matching is not None:
+                matching.heed(message)
+        elif isinstance(message, tuple) and matching is not None:
+            history = [(t, *pose) for t, pose in zip(run.stamps[-32:], run.poses[-32:], strict=True)]
+            moved = matching.match(*message, history if "drive" in sensors else None)
+            _judge_match(run, matching, drive, message[0], truth)
+            if moved is not None:
+                waiting.append((now + LATENCY, _message(message[0], moved)))
+    return run
+
+
+def _message(stamp: int, moved: Moved) -> ScanMotion:
+    x, y, yaw = moved.motion
+    return ScanMotion(
+        stamp=stamp,
+        received=stamp,
+        seq=0,
+        since=moved.since,
+        motion=Pose2D(x=x, y=y, yaw=yaw),
+        covariance=np.array(moved.covariance),
+    )
+
+
+def _tell(run: Run, reckoner: Reckoner, now: int, truth: Array, drive: Drive) -> None:
+    estimate = reckoner.estimate(now)
+    if estimate is None:
+        return
+    run.stamps.append(now / SECOND)
+    run.poses.append(estimate.pose)
+    if (drive.carried is None or now < drive.carried) and now > (1 + STARTED) * SECOND:
+        off = np.array(estimate.pose) - _at(truth, now / SECOND)
+        off[2] = math.remainder(off[2], math.tau)
+        run.nees.append(float(off @ np.linalg.solve(estimate.pose_covariance + 1e-10 * np.eye(3), off)))
+
+
+def _judge_match(run: Run, matching: Matching, drive: Drive, stamp: int, truth: Array) -> None:
+    estimate = matching.newest
+    if estimate is None:
+        return
+    run.standings[estimate.standing] += 1
+    if drive.carried is None or stamp <= drive.carried or run.found is not None:
+        return
+    if estimate.standing in (Standing.LOCALISED, Standing.DEGENERATE):
+        off = np.array(estimate.pose) - _at(truth, stamp / SECOND)
+        if math.hypot(off[0], off[1]) < 0.1:
+            run.found = (stamp - drive.carried) / SECOND
+
+
+def _at(truth: Array, second: float) -> Array:
+    row: Array = truth[min(int(np.searchsorted(truth[:, 0], second - 1e-6)), len(truth) - 1), 1:]
+    return row
+
+
+def judged(run: Run, drive: Drive) -> dict[str, float]:
+    """ATE (m), RPE (m and degrees per metre), NEES and the greatest step of one run."""
+    stamps, poses = np.array(run.stamps), np.array(run.poses)
+    truth = np.array([_at(np.array(drive.truth), second) for second in stamps])
+    carried = math.inf if drive.carried is None else drive.carried / SECOND
+    errors, moves = [], []
+    for leg in (stamps < carried, stamps >= carried):
+        if leg.sum() > 1:
+            mine, true = poses[leg], truth[leg]
+            if stamps[leg][0] >= carried:
+                mine = compose(compose(true[0], inverse(mine[0])), mine)
+            errors.append(np.hypot(*(mine - true)[:, :2].T))
+            moves.append(_per_metre(mine, true))
+    moved = np.concatenate(moves)
+    steps = np.hypot(*np.diff(poses, axis=0)[:, :2].T)
+    return {
+        "ate": float(np.sqrt(np.mean(np.square(np.concatenate(errors))))),
+        "rpe": float(np.sqrt(np.mean(np.square(moved[:, :2]).sum(axis=1)))),
+        "rpe_deg": math.degrees(float(np.sqrt(np.mean(np.square(moved[:, 2]))))),
+        "nees": float(np.mean(run.nees)),
+        "step": float(steps.max()),
+    }
+
+
+def _per_metre(poses: Array, truth: Array) -> Array:
+    """Errors, shape (n, 3), of the motions over a metre of true way."""
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(truth, axis=0)[:, :2].T))))
+    firsts = np.flatnonzero(way <= way[-1] - 1.0)[::5]
+    lasts = np.searchsorted(way, way[firsts] + 1.0)
+    lasts = np.minimum(lasts, len(way) - 1)
+    off: Array = between(between(truth[firsts], truth[lasts]), between(poses[firsts], poses[lasts]))
+    return off
+
+
+def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[str, float], bool]:
+    """All drives; figures, goals and whether they are met."""
+    draw_corridor(folder)
+    seeds = QUICK_SEEDS if quick else SEEDS
+    cells: dict[tuple[str, str], list[dict[str, float]]] = {}
+    robots: dict[str, list[tuple[Drive, Run]]] = {}
+    for scenario in SCENARIOS:
+        for seed in range(seeds):
+            drive = driven(scenario, seed, folder)
+            for subset in SUBSETS:
+                done = run_drive(scenario, drive, subset)
+                cells.setdefault((scenario.name, subset), []).append(judged(done, drive))
+                if subset == "all":
+                    robots.setdefault(scenario.name, []).append((drive, done))
+        _print(scenario.name, cells)
+    figures = _figures(cells, robots)
+    _draw(robots, folder / "world.png")
+    met = all(
+        figures[key] >= goal if key in ("corridor_degenerate", "kidnap_found", "slip_told") else figures[key] <= goal
+        for key, goal in GOALS.items()
+    )
+    return figures, dict(GOALS), met
+
+
+def _mean(rows: list[dict[str, float]], key: str) -> float:
+    return float(np.mean([row[key] for row in rows]))
+
+
+def _print(name: str, cells: dict[tuple[str, str], list[dict[str, float]]]) -> None:
+    for subset in SUBSETS:
+        rows = cells[name, subset]
+        text = f"{name:9} {subset:15} ATE {_mean(rows, 'ate'):.3f} m (worst {max(row['ate'] for row in rows):.3f})"
+        text += f"  RPE {100 * _mean(rows, 'rpe'):.2f} % {_mean(rows, 'rpe_deg'):.2f} deg/m"
+        text += f"  NEES {_mean(rows, 'nees'):.1f}  step {1e3 * max(row['step'] for row in rows):.0f} mm"
+        print(text, flush=True)
+
+
+def _figures(
+    cells: dict[tuple[str, str], list[dict[str, float]]], robots: dict[str, list[tuple[Drive, Run]]]
+) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    for (name, subset), rows in cells.items():
+        figures[f"world_{name}_{subset}_ate_m"] = round(_mean(rows, "ate"), 4)
+        figures[f"world_{name}_{subset}_rpe"] = round(_mean(rows, "rpe"), 4)
+    mean = {
+        subset: np.mean([_mean(rows, "ate") for (_, which), rows in cells.items() if which == subset])
+        for subset in SUBSETS
+    }
+    figures |= {f"world_{subset}_ate_m": round(float(value), 4) for subset, value in mean.items()}
+    figures["all_ate_over_reckoning"] = round(float(mean["all"] / mean["reckoning"]), 4)
+    corridor = sum((run.standings for _, run in robots["corridor"]), Counter[Standing]())
+    figures["corridor_degenerate"] = round(corridor[Standing.DEGENERATE] / corridor.total(), 4)
+    figures["corridor_nees"] = round(_mean(cells["corridor", "all"], "nees"), 3)
+    found = [run.found for _, run in robots["kidnap"]]
+    figures["kidnap_found"] = float(np.mean([second is not None for second in found]))
+    figures["kidnap_seconds"] = round(float(np.mean([second for second in found if second is not None] or [0.0])), 2)
+    told, bursts = _slips(robots["slip"])
+    figures["slip_told"] = round(told / bursts, 4)
+    others = (run for name, runs in robots.items() if name not in ("slip", "kidnap") for _, run in runs)
+    figures["slip_false"] = float(sum(len(run.slips) for run in others))
+    steps = [row["step"] for (_, which), rows in cells.items() if which == "all" for row in rows]
+    figures["greatest_step_m"] = round(max(steps), 4)
+    return figures
+
+
+def _slips(runs: list[tuple[Drive, Run]]) -> tuple[int, int]:
+    """Bursts of slip that were told, and all of them."""
+    told = sum(any(abs(slip - burst) < 1.0 for slip in run.slips) for drive, run in runs for burst in drive.bursts)
+    return told, sum(len(drive.bursts) for drive, _ in runs)
+
+
+def _draw(robots: dict[str, list[tuple[Drive, Run]]], file: Path) -> None:
+    """Truth and odometry of the first drive of every kind."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(16, 8), layout="constrained")
+    for axes, (name, runs) in zip(figure.subplots(2, 4).flat, robots.items(), strict=False):
+        drive, done = runs[0]
+        truth, poses = np.array(drive.truth), np.array(done.poses)
+        axes.plot(truth[:, 1], truth[:, 2], color="0.6", lw=3, label="truth")
+        axes.plot(poses[:, 0], poses[:, 1], color="tab:red", lw=0.9, label="odometry, all sensors")
+        axes.set_title(name, fontsize=10)
+        axes.set_aspect("equal", "datalim")
+        axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(file, dpi=110)
