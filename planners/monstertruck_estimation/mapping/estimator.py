@@ -142,7 +142,8 @@ class MappingEstimator:
         odom = None if inputs.odom is None else np.array(inputs.odom)
         swept = odom is None and inputs.time_increment > 0
         again = partial(prepared, inputs, self.mapper.config.longest) if swept else None
-        step = self.mapper.step(scan, inputs.stamp, odom, again)
+        period = inputs.time_increment * math.tau / inputs.angle_increment if swept else 0.0
+        step = self.mapper.step(scan, inputs.stamp, odom, again, period)
         if step is None:
             return None
         accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.map) == 1)

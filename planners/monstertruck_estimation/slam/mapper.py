@@ -86,7 +86,12 @@ class Mapper:
         return self._motion.twist
 
     def step(
-        self, scan: Scan, stamp: int, odom: Array | None = None, again: Callable[[Vector], Scan] | None = None
+        self,
+        scan: Scan,
+        stamp: int,
+        odom: Array | None = None,
+        again: Callable[[Vector], Scan] | None = None,
+        period: float = 0.0,
     ) -> Step | None:
         """Take one scan.
 
@@ -96,10 +101,12 @@ class Mapper:
             odom: shape (3,), pose of base in odom at ``stamp``; None predicts from the motion so far.
             again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): where odometry does
                 not tell it, the scan is matched a second time by the motion that the first match found.
+            period: seconds of a revolution of a sensor that turns evenly, however unevenly its scans are stamped (by a
+                busy host, say); 0 = take stamps as they are.
         """
         if self._stamp is not None and stamp <= self._stamp:
             return None
-        dt = 0.0 if self._stamp is None else (stamp - self._stamp) / SECOND
+        dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
         delta, noise = self._motion.predict(dt, odom)
         guess, covariance = _moved(self._pose, self._covariance, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
@@ -116,10 +123,11 @@ class Mapper:
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
         events: tuple[Event, ...] = () if match.accepted or not len(self.map) else (Event.REJECTED,)
         if self._key_is_due(scan):
+            if len(self.map):
+                self._append_to_trail(stamp)
             events += self._extend(scan, stamp, match)
         if len(self.map):
-            newest = len(self.map) - 1
-            self._trail.append(stamp, newest, between(self.map.poses[newest], self._pose))
+            self._append_to_trail(stamp)
         odom_now = self._motion.odom
         correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
         return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, scan, events)
@@ -166,9 +174,18 @@ class Mapper:
         self._look_around()
         return events
 
+    def _append_to_trail(self, stamp: int) -> None:
+        newest = len(self.map) - 1
+        self._trail.append(stamp, newest, between(self.map.poses[newest], self._pose))
+
     def _look_around(self) -> None:
         self._local = self.map.local()
         self._submap = self.map.submap(self._local)
+
+
+def _evenly(dt: float, period: float) -> float:
+    """``dt`` as the nearest number of whole revolutions."""
+    return dt if period <= 0 else max(round(dt / period), 1) * period
 
 
 def _moved(pose: Array, covariance: Array, delta: Array, noise: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.slam.graph import Edges
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import compose
+from monstertruck_estimation.slam.se2 import compose, wrap
 
 Array = NDArray[np.float64]
 
@@ -124,6 +124,9 @@ class EdgeStore:
 class Trail:
     """Every scan's place relative to a key scan, so that the whole trajectory moves with the graph.
 
+    A scan that becomes a key scan is there twice: where the key scan before it saw it, and as itself. What the graph
+    has moved the one against the other is spread over the scans between, or every key scan would be a jolt.
+
     Args:
         most: scans remembered; beyond that every second one is forgotten.
     """
@@ -151,4 +154,13 @@ class Trail:
 
     def poses(self, keys: Array) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,) and poses (n, 3), given those of the key scans."""
-        return self._stamps.view.copy(), compose(keys[self._keys.view], self._relative.view)
+        stamps = self._stamps.view.copy()
+        poses = compose(keys[self._keys.view], self._relative.view)
+        joints = np.flatnonzero(stamps[1:] == stamps[:-1])
+        apart = poses[joints + 1] - poses[joints]
+        apart[:, 2] = wrap(apart[:, 2])
+        begins = np.append(0, joints + 1)[: len(joints)]
+        for begin, end, off in zip(begins, joints, apart, strict=True):
+            share = (stamps[begin:end] - stamps[begin]) / max(stamps[end] - stamps[begin], 1)
+            poses[begin:end] += share[:, None] * off
+        return np.delete(stamps, joints), np.delete(poses, joints, axis=0)

@@ -125,6 +125,22 @@ def test_the_distortion_of_a_swept_scan_is_undone_by_the_motion_it_shows():
     assert off[1] < 0.8 * off[0]
 
 
+def test_scans_stamped_unevenly_are_still_of_a_sensor_that_turns_evenly():
+    truth = rounds(120, 1.0)
+    swept = dataclasses.replace(LIDAR, time_increment=0.08 / BEAMS)
+    share = np.linspace(0.0, 0.8, BEAMS)[:, None]
+    scans = [ranges(ROOM, compose(now, share * between(now, then)), swept) for now, then in itertools.pairwise(truth)]
+    late = np.random.default_rng(3).uniform(-0.045, 0.045, len(scans))
+    off = []
+    for period in (0.0, 0.1):
+        mapper = Mapper()
+        for k, values in enumerate(scans):
+            again = functools.partial(prepare, values, swept)
+            mapper.step(again(mapper.twist), int((k + 10 * late[k]) * 1e8), None, again, period)
+        off.append(errors(mapper.trajectory()[1], truth[:-1]).mean())
+    assert off[1] < 0.9 * off[0]
+
+
 def test_a_corridor_does_not_collapse():
     truth = np.stack((np.linspace(0, 6, 150), np.full(150, 0.2), np.zeros(150)), axis=1)
     mapper = Mapper()
