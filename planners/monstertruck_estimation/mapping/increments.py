@@ -1,5 +1,6 @@
 """How the base moved between two matched scans, by the scans alone: what odometry may be corrected by."""
 
+import math
 from typing import Final
 
 import numpy as np
@@ -42,7 +43,7 @@ class Increments:
         since, origin = last
         turn = np.eye(3)
         turn[:2, :2] = rotation(-match.pose[2])
-        covariance = turn @ np.linalg.inv(match.information + UNKNOWN) @ turn.T
+        covariance = turn @ np.linalg.inv(_known(match, match.information) + UNKNOWN) @ turn.T
         covariance = (covariance + covariance.T) / 2 + np.diag(np.square((FLOOR[0], FLOOR[0], FLOOR[1])))
         x, y, yaw = between(origin, match.pose).tolist()
         return Moved(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
@@ -50,3 +51,15 @@ class Increments:
     def forget(self) -> None:
         """What was before cannot be compared with what comes."""
         self._last = None
+
+
+def _known(match: Match, information: Array) -> Array:
+    """Information without what a degenerate match says along its weak direction.
+
+    That comes from no wall, but from the ends of the walls in sight, which go along with the robot.
+    """
+    if not match.degenerate:
+        return information
+    along = np.array((math.cos(match.direction), math.sin(match.direction), 0.0))
+    weight = information @ along
+    return information - np.outer(weight, weight) / max(float(along @ weight), 1e-9)

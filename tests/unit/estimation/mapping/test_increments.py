@@ -1,0 +1,61 @@
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.mapping.increments import Increments
+from monstertruck_estimation.slam.frontend import Match, Verdict, rejected
+
+INFORMATION = np.diag((1e4, 1e5, 1e6))
+
+
+def match(pose, information=INFORMATION, degeneracy=0.5, direction=0.0):
+    return Match(
+        np.array(pose), np.eye(3), 0.9, 0.01, degeneracy, direction, Verdict.ACCEPTED, np.asarray(information, float)
+    )
+
+
+def take(increments, stamp, pose, **more):
+    made = match(pose, **more)
+    return increments.take(stamp, made, made.pose)
+
+
+def test_the_motion_is_told_in_base_with_the_covariance_of_the_later_place():
+    increments = Increments()
+    assert take(increments, 1, (1.0, 0.0, math.pi / 2)) is None
+    moved = take(increments, 2, (1.0, 0.5, math.pi / 2))
+    assert moved.since == 1
+    assert moved.motion == pytest.approx((0.5, 0.0, 0.0))
+    sizes = np.sqrt(np.diag(np.array(moved.covariance).reshape(3, 3)))
+    # Base looks along y of the map: what is known best across the map's y is known best along base.
+    assert sizes[0] == pytest.approx(math.hypot(1e5**-0.5, 0.002), rel=0.01)
+    assert sizes[1] == pytest.approx(math.hypot(1e4**-0.5, 0.002), rel=0.01)
+
+
+def test_rejected_matches_are_stepped_over():
+    increments = Increments()
+    take(increments, 1, (0.0, 0.0, 0.0))
+    lost = rejected(np.array((9.0, 9.0, 9.0)), np.eye(3), Verdict.OVERLAP)
+    assert increments.take(2, lost, lost.pose) is None
+    assert take(increments, 3, (0.2, 0.0, 0.0)).motion == pytest.approx((0.2, 0.0, 0.0))
+
+
+def test_a_correction_of_the_map_is_no_motion():
+    increments = Increments()
+    first = match((0.0, 0.0, 0.0))
+    increments.take(1, first, np.array((5.0, 5.0, 0.0)), corrected=True)
+    assert take(increments, 2, (5.1, 5.0, 0.0)).motion == pytest.approx((0.1, 0.0, 0.0))
+    lost = rejected(np.zeros(3), np.eye(3), Verdict.FAR)
+    increments.take(3, lost, lost.pose, corrected=True)
+    assert take(increments, 4, (7.0, 0.0, 0.0)) is None
+    increments.forget()
+    assert take(increments, 5, (8.0, 0.0, 0.0)) is None
+
+
+def test_a_corridor_says_nothing_along_itself():
+    increments = Increments()
+    take(increments, 1, (0.0, 0.0, 0.3))
+    moved = take(increments, 2, (0.0, 0.0, 0.3), degeneracy=0.01, direction=0.3)
+    sizes = np.sqrt(np.diag(np.array(moved.covariance).reshape(3, 3)))
+    assert sizes[0] > 10.0
+    assert sizes[1] < 0.1
