@@ -4,7 +4,7 @@ Absolute error (ATE): root mean square of the position in odom, which begins at 
 (RPE): of the motion over every metre driven. After a kidnapping odom goes on from where it was, so that part of the
 drive counts from its own beginning. ``reckoning`` is the daemon's default: wheels, its heading held by the compass.
 The scans are matched by the mapper itself, on the odometry that is judged (without wheels: on nothing), and told
-30 ms after their end; in kidnapped drives by the localisation in the saved map.
+30 ms after their end; in kidnapped drives by the localisation in a map that another drive has saved.
 """
 
 import math
@@ -22,7 +22,7 @@ from monstertruck_estimation.mapping.config import GridConfig
 from monstertruck_estimation.mapping.estimator import Estimator, MappingEstimator, prepared
 from monstertruck_estimation.mapping.exchange import Estimate, Moved, ScanInput
 from monstertruck_estimation.mapping.localise import LocalisingEstimator
-from monstertruck_estimation.mapping.storage import load
+from monstertruck_estimation.mapping.storage import load, save
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Reckoner
 from monstertruck_estimation.scan_tilt import Track, plane_slopes, plane_tilt
 from monstertruck_estimation.slam.config import MapperConfig
@@ -32,11 +32,10 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import Standing
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
-from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, Scenario, draw_corridor, driven
+from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 
 Array = NDArray[np.float64]
 
-ROOT = Path(__file__).resolve().parents[2]
 SEEDS, QUICK_SEEDS = 10, 2
 LATENCY = 3 * SECOND // 100
 MAX_TILT = 0.1
@@ -80,13 +79,13 @@ class Run:
 class Matching:
     """Scans to motion, as the estimation worker does it."""
 
-    def __init__(self, scenario: Scenario, drive: Drive) -> None:
+    def __init__(self, drive: Drive, saved: Path | None = None) -> None:
         self._body = Track()
         self.newest: Estimate | None = None
-        if scenario.carried is None:
+        if saved is None:
             self.estimator: Estimator = MappingEstimator(MapperConfig(), GridConfig(), start=drive.start)
         else:
-            self.estimator = LocalisingEstimator(load(ROOT / "configs/worlds/rooms.yaml"), MapperConfig(), drive.start)
+            self.estimator = LocalisingEstimator(load(saved), MapperConfig(), drive.start)
 
     def heed(self, attitude: Attitude) -> None:
         """Take the tilt."""
@@ -129,8 +128,8 @@ def _motion(
     return (x, y, yaw), (vx, vy, wz)
 
 
-def run_drive(scenario: Scenario, drive: Drive, subset: str) -> Run:
-    """One robot with a subset of the sensors on one drive."""
+def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path | None = None) -> Run:
+    """One robot with a subset of the sensors on one drive; it localises in ``saved``, or maps, and keeps the map."""
     sensors, chassis = SUBSETS[subset], TruckConfig().chassis()
     x, y, yaw = drive.start
     start = Pose2D(x=x, y=y, yaw=yaw)
@@ -138,7 +137,7 @@ def run_drive(scenario: Scenario, drive: Drive, subset: str) -> Run:
     reckoner: Reckoner = fusion
     if subset == "reckoning":
         reckoner = DeadReckoning(OdometryConfig(start=start), chassis)
-    matching = Matching(scenario, drive) if "scans" in sensors else None
+    matching = Matching(drive, saved) if "scans" in sensors else None
     run, waiting, due, truth = Run(), deque[tuple[int, ScanMotion]](), SECOND, np.array(drive.truth)
     for now, message in drive.told:
         while due <= now:
@@ -161,6 +160,9 @@ def run_drive(scenario: Scenario, drive: Drive, subset: str) -> Run:
             _judge_match(run, matching, drive, message[0], truth)
             if moved is not None:
                 waiting.append((now + LATENCY, _message(message[0], moved)))
+    if keep is not None and matching is not None:
+        matching.estimator.finish()
+        save(keep, matching.estimator.patch(), matching.estimator.graph())
     return run
 
 
@@ -246,11 +248,14 @@ def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[st
     seeds = QUICK_SEEDS if quick else SEEDS
     cells: dict[tuple[str, str], list[dict[str, float]]] = {}
     robots: dict[str, list[tuple[Drive, Run]]] = {}
+    mapped = next(scenario for scenario in SCENARIOS if scenario.name == "rooms")
+    run_drive(driven(mapped, 1000, folder), "all", keep=folder / "rooms")
     for scenario in SCENARIOS:
+        saved = folder / "rooms" if scenario.carried is not None else None
         for seed in range(seeds):
             drive = driven(scenario, seed, folder)
             for subset in SUBSETS:
-                done = run_drive(scenario, drive, subset)
+                done = run_drive(drive, subset, saved)
                 cells.setdefault((scenario.name, subset), []).append(judged(done, drive))
                 if subset == "all":
                     robots.setdefault(scenario.name, []).append((drive, done))
