@@ -21,6 +21,9 @@ M = TypeVar("M", bound=Message)
 
 MOVING = (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
 
+INTERRUPTIONS = 20
+"""Times in a lap that the truck is armed again after a stop; more are a fault, not a busy computer."""
+
 
 class Operator(Protocol):
     """What ``TruckClient`` and ``LocalOperator`` have in common."""
@@ -80,6 +83,8 @@ class Lap:
     """Daemon time at which the path was done or given up, ns."""
     cross_track: NDArray[np.float64]
     """Every reported distance from the path, m."""
+    interruptions: tuple[Reason, ...] = ()
+    """Why the truck had to be armed again on the way, in order."""
 
     @property
     def seconds(self) -> float:
@@ -93,7 +98,7 @@ class Lap:
 
 
 async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0, limit: float = 600.0) -> Lap:
-    """Arm the truck, watch the tracker drive its path to the end, disarm.
+    """Arm the truck, watch the tracker drive its path to the end, disarm; after a stop that disarms it, arm it again.
 
     Args:
         operator: who gives the orders.
@@ -104,10 +109,15 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
     Raises:
         NoAnswerError: the truck could not be armed, or the path took too long; the text says what held it.
     """
-    with operator.subscribe(topics.GATE, latest()) as gate, operator.subscribe(topics.TRACKER, fifo(256)) as tracker:
+    with (
+        operator.subscribe(topics.GATE, latest()) as gate,
+        operator.subscribe(topics.STOP, latest()) as stop,
+        operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
+    ):
         await _arm(operator, clock, gate, patience)
         start = clock.now()
         cross_track: list[float] = []
+        interruptions: list[Reason] = []
         try:
             async with clock.deadline(limit):
                 while True:
@@ -116,7 +126,12 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
                         continue
                     cross_track.append(report.cross_track)
                     if report.outcome is not Reason.DRIVING and report.along > 0:
-                        return Lap(report.outcome, start, report.stamp, np.array(cross_track))
+                        told = (np.array(cross_track), tuple(interruptions))
+                        return Lap(report.outcome, start, report.stamp, *told)
+                    state = gate.latest
+                    if state is not None and state.mode not in MOVING and len(interruptions) < INTERRUPTIONS:
+                        interruptions.append(stop.latest.reason if stop.latest is not None else Reason.DISARMED)
+                        await _arm(operator, clock, gate, patience)
         except TimeoutError:
             held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""
             raise NoAnswerError(f"path not finished within {limit:g} s ({held or 'nothing held the truck'})") from None

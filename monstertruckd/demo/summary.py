@@ -1,5 +1,6 @@
 """What a demo run achieved, from the log and the world's truth."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -71,6 +72,7 @@ class Summary:
         rows = [
             ("outcome", self.lap.outcome.text + (", COLLIDED" if self.collided else "")),
             ("lap time", f"{self.lap.seconds:.1f} s"),
+            *self._interruption_row(),
             ("distance, true", f"{self.distance:.2f} m"),
             ("cross-track RMS", f"{self.lap.cross_track_rms * 100:.2f} cm"),
             *self._closing_row(),
@@ -83,6 +85,12 @@ class Summary:
         if self.digest is not None:
             rows.append(("sha256", self.digest))
         return rows + [("file", str(file)) for file in self.files]
+
+    def _interruption_row(self) -> list[tuple[str, str]]:
+        """Nothing, for a lap without a stop."""
+        told = Counter(reason.text for reason in self.lap.interruptions)
+        text = ", ".join(f"{count} x {reason}" for reason, count in told.items())
+        return [("stopped on the way", f"{text}; armed again")] if text else []
 
     def _closing_row(self) -> list[tuple[str, str]]:
         if not self.closed:
@@ -97,6 +105,7 @@ class Summary:
             "lap_s": self.lap.seconds,
             "distance_m": self.distance,
             "cross_track_rms_m": self.lap.cross_track_rms,
+            "interruptions": [reason.value for reason in self.lap.interruptions],
             "closing_error_m": self.closing_error if self.closed else None,
             "lateness_p99_s": self.lateness_p99,
             "lateness_max_s": self.lateness_max,

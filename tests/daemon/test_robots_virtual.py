@@ -1,5 +1,6 @@
 """Every robot of configs/robots drives its bend through real drivers and emulators, on the virtual clock."""
 
+import asyncio
 import math
 from pathlib import Path
 
@@ -114,3 +115,25 @@ def test_what_does_not_fit_the_body_is_refused(text: str, said: str, tmp_path: P
     with pytest.raises(ConfigError) as caught:
         load_truck(bad)
     assert said in str(caught.value)
+
+
+def test_a_lap_that_a_stop_interrupts_is_driven_to_its_end():
+    config, _ = load_config(FOLDER / "truck.yaml", SimulatedTruckConfig)
+    config = config.model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> Lap:
+        rig = VirtualRig(config, clock)
+
+        async def unplug() -> None:
+            await clock.sleep(8.0)
+            rig.ports["drive"].unplug()
+            await clock.sleep(1.0)
+            rig.ports["drive"].plug()
+
+        async with rig.running(), asyncio.TaskGroup() as group:
+            group.create_task(unplug())
+            return await drive_lap(LocalOperator(rig.bus, clock), clock, limit=60)
+
+    lap = run_virtual(main, start=SECOND)
+    assert lap.outcome is Reason.GOAL_REACHED
+    assert lap.interruptions == (Reason.DRIVE_STALE,)
