@@ -77,7 +77,7 @@ class Fusion:
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
         """Take the position of every driven shaft."""
-        if self._wheels is None or self._chassis is None or self._config.wheels is None:
+        if not shafts or self._wheels is None or self._chassis is None or self._config.wheels is None:
             return
         known, stamp = self._wheels.known, self._wheels.stamp
         roll = self._wheels.observe_drive(*shafts)

@@ -1,0 +1,89 @@
+import asyncio
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from monstertruck_estimation.fusion.config import AnyOdometry, FusionConfig
+from monstertruck_estimation.fusion.service import FusionService
+from monstertruck_estimation.fusion.slip import Change
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_runtime.clock import run_virtual
+from monstertruck_schemas.reasons import Reason
+from tests.unit.estimation.fusion.kit import FIELD, Rig
+
+READ = TypeAdapter(AnyOdometry)
+
+
+class Outbox(list):
+    def next_seq(self):
+        return len(self)
+
+    put = list.append
+
+
+class Scans:
+    def __init__(self, motions):
+        self.motions = motions
+
+    def drain(self):
+        motions, self.motions = self.motions, []
+        return motions
+
+
+def served(rig, scans=None):
+    """What a service over the rig's fusion tells in a tenth of a second."""
+    events, odometry = [], Outbox()
+
+    async def main(clock):
+        service = FusionService(
+            rig.fusion,
+            clock,
+            drives=[],
+            steering=None,
+            compass=None,
+            scans=scans,
+            odometry=odometry,
+            pose=None,
+            events=lambda reason, severity, source, text="", **_: events.append((reason, text)),
+        )
+        task = asyncio.create_task(service.run(lambda: None))
+        await clock.sleep(0.1)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    run_virtual(main, start=rig.now)
+    return events, odometry
+
+
+def test_slip_and_a_disturbed_compass_are_events():
+    rig = Rig().drive(0.3, 0.0, 0.0, 4.0)
+    rig.field, rig.magnet = 2 * FIELD, 0.5
+    rig.drive(0.3, 0.0, 0.0, 0.5)
+    rig.fusion._changes.extend((Change(True, 0, "apart"), Change(False, 0, "together")))
+    events, odometry = served(rig)
+    assert [reason for reason, _ in events] == [Reason.WHEEL_SLIP, Reason.WHEEL_GRIP, Reason.HEADING_DISTURBED]
+    assert events[0][1] == "apart"
+    assert "lidar" in odometry[-1].sources
+    assert odometry[-1].frame == "odom"
+
+
+def test_the_motion_between_scans_is_taken_from_the_bus():
+    rig = Rig().drive(0.3, 0.0, 0.0, 2.0)
+    rig.delay = 1000
+    rig.drive(0.3, 0.0, 0.0, 0.5)
+    before = rig.fusion.belief.used["lidar"]
+    served(rig, Scans(list(rig.waiting)))
+    assert rig.fusion.belief.used["lidar"] > before
+
+
+def test_the_section_is_dead_reckoning_unless_it_says_fusion():
+    assert isinstance(READ.validate_python({}), OdometryConfig)
+    assert isinstance(READ.validate_python({"kind": "fusion", "compass": None}), FusionConfig)
+
+
+@pytest.mark.parametrize(
+    "section", [{"kind": "guess"}, {"kind": "fusion", "slipp": 1}, {"kind": "fusion", "settle": 0}]
+)
+def test_what_a_section_cannot_say_is_refused(section):
+    with pytest.raises(ValidationError):
+        READ.validate_python(section)
