@@ -4,7 +4,8 @@
 
 DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
 1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs, world (odometry by
-every subset of sensors in the emulators' world; needs no data; with --quick two drives of each kind, not ten). The
+every subset of sensors in the emulators' world; needs no data; with --quick two drives of each kind, not ten), endurance
+(memory over two hours; needs no data). The
 trajectories judged are those after the joint registration at a log's end; ``online`` figures are before it. Two
 processes at most; times are processor time. Plots go to runs/slam. The last line is JSON.
 """
@@ -22,21 +23,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from slam_parts import accuracy
 from slam_parts.logs import verified
 
-PARTS = ("exp2", "costs", "world")
+PARTS = ("exp2", "costs", "world", "endurance")
+WITHOUT_DATA = {"world", "endurance"}
 OUT = Path(__file__).resolve().parents[1] / "runs" / "slam"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="needed for all parts but world")
+    parser.add_argument("--data", type=Path, help="needed for recorded logs")
     parser.add_argument("--only", nargs="+", choices=(*accuracy.LOGS, *PARTS))
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(accuracy.QUICK)}")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     chosen = arguments.only or (accuracy.QUICK if arguments.quick else (*accuracy.LOGS, *PARTS))
-    if set(chosen) != {"world"}:
+    if not WITHOUT_DATA.issuperset(chosen):
         if arguments.data is None:
-            parser.error("--data DIR is needed for all parts but world")
+            parser.error(f"--data DIR is needed for all parts but {', '.join(sorted(WITHOUT_DATA))}")
         verified(arguments.data)
     parts = []
     logs = tuple(name for name in accuracy.LOGS if name in chosen)
@@ -48,6 +50,8 @@ def main() -> int:
         parts.append(importlib.import_module("slam_parts.costs").run(arguments.data / "urg04lx_exp2.dat.gz"))
     if "world" in chosen:
         parts.append(importlib.import_module("slam_parts.world").run(OUT, quick=arguments.quick))
+    if "endurance" in chosen:
+        parts.append(importlib.import_module("slam_parts.endurance").run())
     figures = {key: value for part in parts for key, value in part[0].items()}
     goals = {key: value for part in parts for key, value in part[1].items()}
     met = all(part[2] for part in parts)
