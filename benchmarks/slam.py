@@ -4,10 +4,10 @@
 
 DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
 1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), costs, world (odometry by
-every subset of sensors in the emulators' world; needs no data; with --quick two drives of each kind, not ten), endurance
-(memory over two hours; needs no data). The
-trajectories judged are those after the joint registration at a log's end; ``online`` figures are before it. Two
-processes at most; times are processor time. Plots go to runs/slam. The last line is JSON.
+every subset of sensors in the emulators' world; with --quick two drives of each kind, not ten), endurance (memory over
+two hours); the last two need no data. The trajectories judged are those after the joint registration at a log's end;
+``online`` figures are before it. Two processes at most; times are processor time. Plots go to runs/slam. The last line
+is JSON.
 """
 
 import argparse
