@@ -4,14 +4,15 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Any
 
+from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
-from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Packet, Parser
+from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Packet, Parser, Present
 from monstertruck_drivers.ax12.unit import Unit
 from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.link import Link
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import Clock, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import StabiliserFeedback
@@ -87,3 +88,41 @@ async def wire(clock: Clock, **bus: Any) -> AsyncIterator[tuple[Ax12Bus, Host]]:
     """Bus and a host that speaks bytes."""
     async with bench(clock, **bus) as rig, await rig.port.open() as link:
         yield rig.bus, Host(link, clock)
+
+
+def on_bench(test, config: Ax12Config | None = None, **options):
+    """Run ``test(rig)`` on the virtual clock."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with bench(clock, config, **options) as rig:
+            await test(rig)
+
+    run_virtual(main)
+
+
+def requests(rig: Rig) -> list[p.Packet]:
+    """Everything the host sent so far."""
+    return p.Parser().feed(bytes(rig.bus.received))
+
+
+def on_wire(test, **options):
+    """Run ``test(bus, host, clock)`` on the virtual clock."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with wire(clock, **({"positions": {}} | options)) as (bus, host):
+            await test(bus, host, clock)
+
+    run_virtual(main)
+
+
+def write(unit: int, register: p.Register, value: int) -> bytes:
+    return p.write(unit, register, register.encode(value))
+
+
+async def value(host: Host, unit: int, register: p.Register) -> int:
+    packet = await host.status(p.read(unit, register, register.size))
+    return int.from_bytes(packet.params, "little")
+
+
+async def present(host: Host, unit: int = 1) -> Present:
+    return Present.decode((await host.status(p.read(unit, p.PRESENT_POSITION, p.PRESENT_SIZE))).params)

@@ -15,7 +15,13 @@ from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
-from monstertruck_drivers.epos.protocol import Opcode
+from monstertruck_drivers.epos.protocol import (
+    Control,
+    Frame,
+    Opcode,
+    State,
+    state_of,
+)
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -158,3 +164,54 @@ def on_line(test: Callable[[EposEmulator, Exchanger, VirtualClock], Coroutine[An
             await line.close()
 
     on_cable(main, **options)
+
+
+def controls(rig: Rig) -> list[int]:
+    return [value for _, value in rig.writes(od.CONTROLWORD)]
+
+
+def targets(rig: Rig) -> list[int]:
+    return [value for _, value in rig.writes(od.TARGET_VELOCITY)]
+
+
+async def heard(link: Link, clock: VirtualClock, seconds: float) -> bytes:
+    """Everything that comes within a time."""
+    await clock.sleep(seconds)
+    data = b""
+    try:
+        async with clock.deadline(0.0001):
+            data = await link.read()
+    except TimeoutError:
+        pass
+    return data
+
+
+async def ask(link: Link, clock: VirtualClock, request: Frame) -> bytes:
+    """Whole exchange by hand; the answer's body."""
+    link.write(request.head)
+    assert await link.exactly(1) == b"O"
+    link.write(request.body)
+    assert await link.exactly(2) == b"O\0"
+    link.write(b"O")
+    data = await heard(link, clock, 0.01)
+    link.write(b"O")
+    return data
+
+
+async def state(line: Exchanger) -> State:
+    return state_of(await line.read(od.STATUSWORD))
+
+
+async def control(line: Exchanger, *words: int) -> None:
+    for word in words:
+        await line.write(od.CONTROLWORD, word)
+
+
+async def enable(line: Exchanger, clock: VirtualClock, rpm: int = 0) -> None:
+    await line.write(od.MODE, od.PROFILE_VELOCITY)
+    await line.write(od.TARGET_VELOCITY, rpm)
+    await control(line, Control.SHUTDOWN, Control.SWITCH_ON)
+    await clock.sleep(0.31)
+    await control(line, Control.ENABLE)
+    await clock.sleep(0.31)
+    assert await state(line) is State.ENABLED

@@ -8,7 +8,7 @@ from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import Clock, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
@@ -81,3 +81,13 @@ async def bench(
     rig.gate.talking = gate
     async with rig.plugged_in(rig.emulator.run(rig.port.device), rig.gate.run()):
         yield rig
+
+
+def on_bench(test, config: MaestroConfig | None = None, **options):
+    """Run ``test(rig)`` on the virtual clock."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with bench(clock, config, **options) as rig:
+            await test(rig)
+
+    run_virtual(main)
