@@ -33,7 +33,12 @@ def install_service(
             autocompletion=complete_config,
         ),
     ] = None,
-    user: Annotated[str, typer.Option(help="User the service runs as; made if there is none.")] = "monstertruckd",
+    user: Annotated[
+        str | None,
+        typer.Option(
+            help="User the service runs as; made if there is none. Default: the one it runs as, or monstertruckd."
+        ),
+    ] = None,
     start: Annotated[bool, typer.Option("--start", help="Start or restart the service as well.")] = False,
     dry_run: DryOption = False,
     root: RootOption = Path("/"),

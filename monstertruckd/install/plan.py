@@ -63,12 +63,12 @@ class Plan:
     """What will not work, and why."""
 
 
-def plan(config_file: Path | None, user: str, program: Program, root: Path) -> Plan:
+def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> Plan:
     """What belongs to the service of a configuration.
 
     Args:
         config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
-        user: the service runs as.
+        user: the service runs as; None: as whom the installed unit says, else ``USER``.
         program: what it runs.
         root: of the system that gets it.
 
@@ -78,7 +78,7 @@ def plan(config_file: Path | None, user: str, program: Program, root: Path) -> P
         InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
             could not see the program.
     """
-    user_name(user)
+    user = user_name(user or installed_user(root) or USER)
     hidden = temporary(program)
     if hidden is not None and root == Path("/"):
         raise InputError(hidden)
@@ -110,6 +110,12 @@ def installed_config(root: Path) -> Path | None:
     named = re.search(r"^ExecStart=.* --config (/\S+)$", unit, re.MULTILINE)
     file = below(root, Path(named[1]) if named is not None else CONFIG)
     return file if named is not None or file.is_file() else None
+
+
+def installed_user(root: Path) -> str | None:
+    """Whom the installed unit runs the daemon as."""
+    named = re.search(r"^User=(\S+)$", text_of(below(root, UNIT)) or "", re.MULTILINE)
+    return None if named is None else named[1]
 
 
 def below(root: Path, path: Path) -> Path:

@@ -12,8 +12,8 @@ PROGRAM = Program(
 )
 
 
-def truck_plan(root: Path, config: Path | None = TRUCK, program: Program = PROGRAM) -> Plan:
-    return plan(config, "monstertruckd", program, root)
+def truck_plan(root: Path, config: Path | None = TRUCK, program: Program = PROGRAM, user: str | None = None) -> Plan:
+    return plan(config, user, program, root)
 
 
 def text_of(planned: Plan, name: str) -> str:

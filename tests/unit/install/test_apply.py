@@ -13,7 +13,7 @@ from monstertruckd.install import apply
 from monstertruckd.install.apply import Change, Report, install, run_command, uninstall
 from monstertruckd.install.configuration import files_of
 from monstertruckd.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
-from tests.unit.install.kit import ROOT, TRUCK, truck_plan
+from tests.unit.install.kit import ROOT, TRUCK, settings, truck_plan
 
 
 def tree(root: Path) -> dict[str, str]:
@@ -50,6 +50,13 @@ def test_the_second_time_nothing_changes(config: Path | None, tmp_path: Path):
     report = install(truck_plan(tmp_path, config), tmp_path)
     assert not report.changed
     assert tree(tmp_path) == before
+
+
+def test_the_user_of_the_installed_unit_stays_until_another_is_named(tmp_path: Path):
+    unit = tmp_path / "etc/systemd/system/monstertruckd.service"
+    for user, found in ((None, "monstertruckd"), ("pi", "pi"), (None, "pi"), ("truck", "truck")):
+        install(truck_plan(tmp_path, user=user), tmp_path)
+        assert settings(unit.read_text())["User"] == [found]
 
 
 def test_the_second_time_the_configuration_may_have_any_name(tmp_path: Path):
