@@ -78,7 +78,7 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
         InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
             could not see the program.
     """
-    user = user_name(user or installed_user(root) or USER)
+    user = user_name((installed_user(root) or USER) if user is None else user)
     hidden = temporary(program)
     if hidden is not None and root == Path("/"):
         raise InputError(hidden)
