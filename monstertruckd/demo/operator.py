@@ -1,7 +1,7 @@
 """Somebody who arms the truck and watches a lap, over Zenoh or beside the bus."""
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,22 +54,25 @@ class LocalOperator:
 
     async def order(self, order: Order, lease: float = 1.0) -> None:
         """Send a control request with the robot's present nonce."""
+        self._seq += 1
+        header = await self._header(self._seq, self._role, lease)
+        self._bus.inject(topics.REQ_CONTROL, ControlRequest(**header, order=order))
+
+    async def _header(self, seq: int, role: Role, lease: float) -> dict[str, Any]:
+        """What every request begins with, once the gate has told its nonce."""
         while self._gate.latest is None:
             await self._gate.next()
-        now = self._clock.now()
-        self._seq += 1
-        request = ControlRequest(
-            stamp=now,
-            received=now,
-            seq=self._seq,
-            source=self._source,
-            role=self._role,
-            lease=lease,
-            nonce=self._gate.latest.nonce,
-            gate_stamp=self._gate.latest.stamp,
-            order=order,
-        )
-        self._bus.inject(topics.REQ_CONTROL, request)
+        now, gate = self._clock.now(), self._gate.latest
+        return {
+            "stamp": now,
+            "received": now,
+            "seq": seq,
+            "source": self._source,
+            "role": role,
+            "lease": lease,
+            "nonce": gate.nonce,
+            "gate_stamp": gate.stamp,
+        }
 
 
 @dataclass(frozen=True, slots=True)

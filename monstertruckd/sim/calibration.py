@@ -39,24 +39,9 @@ class LocalTruck(LocalOperator):
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
         """Inject a drive request as the bridge to Zenoh does."""
-        while self._gate.latest is None:
-            await self._gate.next()
-        now = self._clock.now()
         self._requests += 1
-        request = DriveRequest(
-            stamp=now,
-            received=now,
-            seq=self._requests,
-            source=self.source,
-            role=Role.STATION,
-            lease=lease,
-            nonce=self._gate.latest.nonce,
-            gate_stamp=self._gate.latest.stamp,
-            speed=speed,
-            front=front,
-            rear=rear,
-        )
-        self._bus.inject(topics.REQ_DRIVE, request)
+        header = await self._header(self._requests, Role.STATION, lease)
+        self._bus.inject(topics.REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
         """Call one of the daemon's."""
