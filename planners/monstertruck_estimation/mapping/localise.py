@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from monstertruck_estimation.mapping.estimator import LOST_AFTER, estimate, standing_of
 from monstertruck_estimation.mapping.exchange import Estimate, Patch, ScanInput, Vector
 from monstertruck_estimation.mapping.increments import Increments
-from monstertruck_estimation.mapping.storage import Graph, SavedMap, elements
+from monstertruck_estimation.mapping.storage import Graph, SavedMap
+from monstertruck_estimation.mapping.surfaces import surfaces_of
 from monstertruck_estimation.mapping.time_offset import OffsetWatch
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import correlate
@@ -27,7 +28,6 @@ from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians
 from monstertruck_estimation.slam.submap import Submap, merged
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_schemas.health import Standing
 
 Array = NDArray[np.float64]
@@ -64,16 +64,11 @@ def submap_of(saved: SavedMap) -> Submap:
     """
     if saved.graph is not None and saved.graph.scans:
         return Submap(Cloud.of(merged(saved.graph.scans, saved.graph.poses)))
-    rows, columns = np.nonzero(saved.grid.cells == OCCUPIED)
-    if not len(rows):
-        msg = "the map has no occupied cells: nothing to localise in"
+    surfaces = surfaces_of(saved.grid)
+    if not len(surfaces):
+        msg = "the map has no occupied cells beside free ones: nothing to localise in"
         raise InputError(msg)
-    step = saved.grid.resolution
-    points = np.stack((columns, rows), axis=-1) * step + step / 2 + np.array(saved.grid.origin)
-    normals = np.tile((1.0, 0.0), (len(points), 1))
-    return Submap(
-        Cloud.of(elements(points, normals=normals, variances=np.full((len(points), 2), max(step, 0.03) ** 2)))
-    )
+    return Submap(Cloud.of(surfaces))
 
 
 class Searcher:
