@@ -138,6 +138,9 @@ class Fusion:
             self._left_out["lidar: faster than the truck can be"] += 1
             return
         self._heed(self._slip.scans(way))
+        if self._slip.doubted:
+            self._left_out["lidar: against the wheels when it has just been blind"] += 1
+            return
         history = self._begin(way.since)
         if history.before(way.stamp).scan != way.since:
             # The clone of the earlier pose has to be made where it was.

@@ -1,4 +1,9 @@
-"""Whether the wheels hold the ground: their motion against that between scans, or their yaw against the compass."""
+"""Whether the wheels hold the ground: their motion against that between scans, or their yaw against the compass.
+
+Scans are a witness against the wheels only while they have known their place without a break. After a gap, or where
+they knew nothing along one direction, what they match may go along with the robot (the ground ahead on a slope), so
+they have to agree with the wheels for a while first; what does not agree then is doubted itself.
+"""
 
 import math
 from collections import deque
@@ -28,6 +33,8 @@ JITTER: Final = 0.01
 """Standard deviation of a compass heading against one a second before, rad."""
 FASTEST: Final = 3.0
 """No robot turns faster than this, rad/s."""
+BLANK: Final = 1.0
+"""A scan tells nothing along a direction in which its standard deviation is greater, m."""
 SPAN: Final = SECOND
 """Wheels and compass are compared over this long, ns."""
 
@@ -59,7 +66,11 @@ class SlipWatch:
         self._suspicious = 0
         self._calm = 0
         self._scanned: int | None = None
+        self._unproven = 0
+        """Scans that must agree before they are a witness."""
         self.slipping = False
+        self.doubted = False
+        """The last scan is not to be believed against the wheels."""
         self.distance = 0.0
         """Last distance between the two, in standard deviations."""
 
@@ -75,9 +86,12 @@ class SlipWatch:
 
     def scans(self, way: ScanWay) -> Change | None:
         """Take the motion between two scans; tells a change of verdict."""
-        self._scanned = way.stamp
+        self._scanned, self.doubted = way.stamp, False
         if self._ways and self._ways[-1].stamp != way.since:
             self._ways.clear()
+            self._unproven = self._config.calm
+        if float(np.linalg.eigvalsh(way.covariance[:2, :2])[-1]) > BLANK**2:
+            self._unproven = self._config.calm
         self._ways.append(way)
         while len(self._ways) > 1 and way.stamp - self._ways[1].since >= self._config.window * SECOND:
             self._ways.popleft()
@@ -97,6 +111,9 @@ class SlipWatch:
         distance = math.sqrt(float(off @ np.linalg.solve(spread + noise, off)))
         seconds = (way.stamp - since) / SECOND
         text = f"wheels and scans differ by {math.hypot(off[0], off[1]):.3f} m and {off[2]:+.3f} rad in {seconds:.1f} s"
+        if self._unproven and not self.slipping:
+            self._prove(distance)
+            return None
         return self._judged(distance, since, text)
 
     def heading(self, stamp: int, yaw: float) -> Change | None:
@@ -150,6 +167,14 @@ class SlipWatch:
                 turn + FLOOR[1] ** 2 + (timing * rate) ** 2,
             )
         )
+
+    def _prove(self, distance: float) -> None:
+        self.distance = distance
+        self.doubted = distance > self._config.gate
+        if distance < self._config.release:
+            self._unproven -= 1
+        elif self.doubted:
+            self._unproven = self._config.calm
 
     def _judged(self, distance: float, since: int, text: str) -> Change | None:
         self.distance = distance

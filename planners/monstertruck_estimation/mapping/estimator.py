@@ -157,7 +157,8 @@ class MappingEstimator:
             self.painter.add(step.scan, step.stamp, step.pose, inputs.mount)
             if inputs.odom is not None:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
-        moved = self._increments.take(step.stamp, step.match, step.pose, corrected=Event.CLOSED in step.events)
+        closed = Event.CLOSED in step.events
+        moved = self._increments.take(step.stamp, step.match, step.pose, alone=inputs.odom is None, corrected=closed)
         standing = Standing.LOST if self._misfits >= LOST_AFTER else standing_of(step.match, Standing.MAPPING)
         return estimate(
             step.stamp,

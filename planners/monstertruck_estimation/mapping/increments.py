@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.mapping.exchange import Moved
-from monstertruck_estimation.slam.frontend import Match
+from monstertruck_estimation.slam.frontend import DOUBTFUL, Match
 from monstertruck_estimation.slam.se2 import between, rotation
 
 Array = NDArray[np.float64]
@@ -16,27 +16,43 @@ UNKNOWN: Final = np.diag((1e-4, 1e-4, 1e-2))
 """Added to every information: what a scan does not tell has a standard deviation of 100 m, or of 10 rad."""
 FLOOR: Final = (0.002, 0.001)
 """Standard deviation of any match, m and rad: the cells of the map are not finer."""
+SHORT: Final = 0.15
+"""So much less than usual a match may overlap to count again after a misfit."""
+LEARNING: Final = 0.05
+"""Weight of one match in the usual overlap."""
 
 
 class Increments:
-    """Relates every match to the one before; what was rejected is stepped over."""
+    """Relates every match to the one before it.
+
+    Beside odometry only matches that overlap well tell a motion, and none tells it across a misfit: the robot may have
+    been carried, and what fits half at a wrong place does not count before the overlap is as usual again. Where
+    nothing else tells any motion, misfits are stepped over, and what was accepted counts.
+    """
 
     def __init__(self) -> None:
         self._last: tuple[int, Array] | None = None
+        self._usual = 0.0
+        """Overlap of the matches that counted, their running mean; 0 before the first."""
+        self._least = DOUBTFUL
 
-    def take(self, stamp: int, match: Match, pose: Array, *, corrected: bool = False) -> Moved | None:
-        """The motion since the last match that was accepted.
+    def take(self, stamp: int, match: Match, pose: Array, *, alone: bool, corrected: bool = False) -> Moved | None:
+        """The motion since the last match that counts.
 
         Args:
             stamp: of the scan, ns.
             match: the scan's place; its covariance contains the guess, its information does not.
             pose: shape (3,), the same place after the step, when a loop may have been closed.
+            alone: there is no odometry.
             corrected: the map was changed at this step: the next motion begins at ``pose``.
         """
-        if not match.accepted or match.information is None:
-            if corrected:
+        if match.information is None or not (alone or match.overlap >= self._least):
+            self._least = max(DOUBTFUL, self._usual - SHORT)
+            if corrected or not alone:
                 self._last = None
             return None
+        self._least = DOUBTFUL
+        self._usual += (match.overlap - self._usual) * (LEARNING if self._usual else 1.0)
         last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose)
         if last is None:
             return None
@@ -50,7 +66,7 @@ class Increments:
 
     def forget(self) -> None:
         """What was before cannot be compared with what comes."""
-        self._last = None
+        self._last, self._least = None, DOUBTFUL
 
 
 def _known(match: Match, information: Array) -> Array:

@@ -186,7 +186,7 @@ class LocalisingEstimator:
             match, standing, events = self._search(scan, guess, covariance, odom)
         if "found" in events:
             self._increments.forget()
-        moved = self._increments.take(stamp, match, match.pose)
+        moved = self._increments.take(stamp, match, match.pose, alone=odom is None)
         self._pose, self._covariance = match.pose, match.covariance
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])

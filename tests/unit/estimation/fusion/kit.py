@@ -56,6 +56,8 @@ class Rig:
         self.sensors, self.rng = set(sensors), np.random.default_rng(seed)
         self.now, self.pose, self.motor = SECOND, (0.0, 0.0, 0.0), 0.0
         self.slip, self.magnet, self.field, self.north, self.degenerate = 1.0, 0.0, FIELD, 0.7, None
+        self.seen = 1.0
+        """Share of the way that scans show."""
         self.crooked, self.count, self.last, self.waiting = 0.0, 0, None, []
         self.shown, self.truths, self.changes = [], [], []
         self._observe(0.0, 0.0)
@@ -94,7 +96,7 @@ class Rig:
         place = compose(np.array(self.pose), self.rng.normal(0.0, self.scan_noise))
         if self.last is not None:
             since, then = self.last
-            delta = between(np.array(then), np.array(place))
+            delta = between(np.array(then), np.array(place)) * self.seen
             if self.degenerate is not None:
                 # Along the direction (in odom) anything may come out.
                 along = self.degenerate - self.pose[2]

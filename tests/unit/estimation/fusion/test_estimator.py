@@ -103,6 +103,34 @@ def test_good_wheels_never_count_as_slipping():
         assert wander(Rig(ALL, seed=seed), seconds=12).changes == []
 
 
+@pytest.mark.parametrize("blind", ["degenerate", "silent"])
+def test_scans_that_go_along_with_the_robot_after_they_were_blind_are_doubted(blind):
+    """As the ground ahead does behind a crest."""
+    rig = Rig(("wheels", "scans")).drive(0.3, 0.0, 0.0, 3.0)
+    if blind == "degenerate":
+        rig.degenerate = 0.0
+    else:
+        rig.sensors, rig.last = {"wheels"}, None
+    rig.drive(0.3, 0.0, 0.0, 0.5)
+    rig.sensors, rig.degenerate, rig.seen = {"wheels", "scans"}, None, 0.0
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    assert rig.changes == []
+    assert rig.error()[0] < 0.15
+    assert rig.fusion.standing().left_out["lidar: against the wheels when it has just been blind"] > 20
+    rig.seen = 1.0
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    rig.slip = 1.8
+    rig.drive(0.3, 0.0, 0.0, 1.5)
+    assert [change.slipping for change in rig.changes] == [True], "they agreed again, so they are a witness again"
+
+
+def test_scans_that_have_seen_all_along_are_believed_when_they_stand():
+    rig = Rig(("wheels", "scans")).drive(0.3, 0.0, 0.0, 3.0)
+    rig.seen = 0.0
+    rig.drive(0.3, 0.0, 0.0, 1.0)
+    assert [change.slipping for change in rig.changes] == [True]
+
+
 def test_a_turn_that_only_the_wheels_make_is_slip_by_the_compass():
     rig = Rig(("wheels", "compass")).drive(0.3, 0.0, 0.0, 4.0)
     rig.crooked = 0.3
