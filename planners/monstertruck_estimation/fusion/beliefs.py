@@ -1,8 +1,10 @@
 """The filter: an error-state extended Kalman filter with stochastic clones, as pure functions of a frozen belief.
 
 State: pose in odom (x, y, yaw), velocity in base (vx, vy, wz), north (yaw in odom at which the compass reads 0: the
-bias of the compass), trim (the bias of the wheels' curvature, rad/m), the place of the last scan, and the pose at the
-last wheel reading. All errors are additive, yaw on the circle.
+bias of the compass), trim (the bias of the wheels' curvature, rad/m), the place of the last scan, the pose at the
+last wheel reading, and the local deviation of the compass (iron near by, and what is left of the truck's own). That
+lasts a metre or a radian: readings taken close together err alike, and a magnet that comes nearer moves it rather than
+the yaw. All errors are additive, yaw on the circle.
 
 Wheels and scans tell motion between two instants, so they are compared with the pose and the clone of the earlier one;
 pose and clone stay correlated, and nothing is counted twice (Roumeliotis and Burdick, "Stochastic cloning", 2002).
@@ -18,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.fusion.config import FusionConfig
+from monstertruck_estimation.fusion.config import LASTING, FusionConfig
 from monstertruck_estimation.fusion.heading import Evidence, Gate, Verdict, judged
 from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
 from monstertruck_estimation.slam.se2 import between, between_jacobians, rotation
@@ -28,13 +30,14 @@ from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
 
-SIZE: Final = 14
+SIZE: Final = 15
 POSE: Final = slice(0, 3)
 TWIST: Final = slice(3, 6)
 YAW, NORTH, TRIM = 2, 6, 7
 SCAN: Final = slice(8, 11)
 WHEELS: Final = slice(11, 14)
-LATER: Final = slice(14, 17)
+LOCAL: Final = 14
+LATER: Final = slice(15, 18)
 """Place of the scan that is just being taken in."""
 AT_REST: Final = 0.05
 """Standard deviation of the velocity at the start, m/s and rad/s."""
@@ -54,9 +57,9 @@ class Belief:
 
     stamp: int
     mean: Array
-    """Shape (14,)."""
+    """Shape (15,)."""
     covariance: Array
-    """Shape (14, 14)."""
+    """Shape (15, 15)."""
     scan: int | None = None
     """Stamp of the clone at the last scan."""
     wheels: int | None = None
@@ -77,6 +80,7 @@ def initial(stamp: int, config: FusionConfig) -> Belief:
     trim = config.wheels.trim if config.wheels is not None else 0.0
     spread = np.zeros(SIZE)
     spread[TWIST], spread[NORTH], spread[TRIM] = AT_REST, math.pi, trim
+    spread[LOCAL] = config.compass.local if config.compass is not None else 0.0
     return Belief(stamp, mean, np.diag(spread**2))
 
 
@@ -98,6 +102,9 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
     step = np.eye(SIZE)
     step[POSE, POSE], step[POSE, TWIST] = by_pose, by_twist
     step[TWIST, TWIST] *= keep
+    like = math.exp(-(math.hypot(vx, vy) / LASTING[0] + abs(wz) / LASTING[1]) * span)
+    mean[LOCAL] *= like
+    step[LOCAL, LOCAL] = like
     covariance = step @ belief.covariance @ step.T
     agility = np.square(config.agility)
     turned = by_twist / span
@@ -106,7 +113,9 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
     covariance[POSE, TWIST] += cross
     covariance[TWIST, POSE] += cross.T
     covariance[TWIST, TWIST] += np.diag(agility * dt)
-    covariance[NORTH, NORTH] += (config.compass.drift**2 if config.compass is not None else 0.0) * dt
+    if config.compass is not None:
+        covariance[NORTH, NORTH] += config.compass.drift**2 * dt
+        covariance[LOCAL, LOCAL] += config.compass.local**2 * (1 - like**2)
     covariance[TRIM, TRIM] += (config.wheels.trim_drift**2 if config.wheels is not None else 0.0) * dt
     return replace(belief, stamp=stamp, mean=mean, covariance=(covariance + covariance.T) / 2)
 
@@ -145,7 +154,7 @@ def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> B
 
 
 def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
-    """Residual, shape (3,), and derivative, (3, 14), of a motion since a clone."""
+    """Residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
     then, now = belief.mean[clone], belief.mean[POSE]
     residual = delta - between(then, now)
     residual[2] = wrap_angle(float(residual[2]))
@@ -240,24 +249,29 @@ def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
         return belief
     mean, covariance = belief.mean, belief.covariance
     by_state = np.zeros((1, SIZE))
-    by_state[0, YAW], by_state[0, NORTH] = 1.0, -1.0
-    residual = wrap_angle(heading.yaw - float(mean[YAW] - mean[NORTH]))
+    by_state[0, YAW], by_state[0, NORTH], by_state[0, LOCAL] = 1.0, -1.0, 1.0
+    residual = float(_residual(belief, heading)[0])
     evidence = Evidence(
         stamp=heading.stamp,
+        place=(float(mean[0]), float(mean[1]), float(mean[YAW])),
         residual=residual,
         variance=float((by_state @ covariance @ by_state.T).item()),
         yaw_variance=float(covariance[YAW, YAW]),
         north=(float(mean[NORTH]), float(covariance[NORTH, NORTH])),
+        local=float(mean[LOCAL]),
         flagged=heading.disturbed,
         field=heading.field,
     )
-    verdict, gate = judged(belief.gate, evidence, config.compass)
+    before = belief.gate
+    verdict, gate = judged(before, evidence, config.compass)
+    if gate.disturbed and not before.disturbed:
+        belief = _elsewhere(belief, config.compass.local)
     belief = replace(belief, gate=gate)
     noise = config.compass.noise**2
     if verdict is Verdict.LEFT_OUT:
         return belief
     if verdict is Verdict.ANCHORED:
-        belief = _anchored(belief, wrap_angle(float(mean[YAW]) - heading.yaw), noise)
+        belief = _anchored(belief, wrap_angle(float(mean[YAW] + mean[LOCAL]) - heading.yaw), noise)
     elif verdict is Verdict.HOME and gate.home is not None:
         belief = _returned(belief, *gate.home)
         belief = updated(belief, _residual(belief, heading), by_state, np.array([[noise]]))
@@ -267,16 +281,27 @@ def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
 
 
 def _residual(belief: Belief, heading: Heading) -> Array:
-    return np.array([wrap_angle(heading.yaw - float(belief.mean[YAW] - belief.mean[NORTH]))])
+    return np.array([wrap_angle(heading.yaw - float(belief.mean[YAW] - belief.mean[NORTH] + belief.mean[LOCAL]))])
 
 
 def _anchored(belief: Belief, north: float, noise: float) -> Belief:
-    """North follows from yaw and heading: their errors add up in it."""
-    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    """North follows from yaw, heading and deviation: their errors add up in it."""
+    mean, by_state = belief.mean.copy(), np.eye(SIZE)
     mean[NORTH] = north
-    covariance[NORTH, :] = covariance[YAW, :]
-    covariance[:, NORTH] = covariance[:, YAW]
-    covariance[NORTH, NORTH] = covariance[YAW, YAW] + noise
+    by_state[NORTH, :] = 0.0
+    by_state[NORTH, [YAW, LOCAL]] = 1.0
+    covariance = by_state @ belief.covariance @ by_state.T
+    covariance[NORTH, NORTH] += noise
+    return replace(belief, mean=mean, covariance=covariance)
+
+
+def _elsewhere(belief: Belief, deviation: float) -> Belief:
+    """What was taken for the local deviation was a disturbance; nothing is known of the one to come."""
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    mean[LOCAL] = 0.0
+    covariance[LOCAL, :] = 0.0
+    covariance[:, LOCAL] = 0.0
+    covariance[LOCAL, LOCAL] = deviation**2
     return replace(belief, mean=mean, covariance=covariance)
 
 

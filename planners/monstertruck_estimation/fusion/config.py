@@ -1,6 +1,6 @@
 """Settings of the fusion; light, for the daemon's start."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Discriminator, Field, Tag
 
@@ -9,6 +9,8 @@ from monstertruck_schemas.base import Pose2D, Schema
 
 Share = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
+LASTING: Final = (1.0, 1.0)
+"""Way, m, and turn, rad, after which the local deviation of the compass is another."""
 
 
 class WheelTrust(Schema):
@@ -16,11 +18,11 @@ class WheelTrust(Schema):
 
     shaft_noise: Positive = 0.02
     """Standard deviation of every shaft's way per root metre it rolled, m."""
-    angle_noise: Share = 0.02
+    angle_noise: Share = 0.01
     """Standard deviation of the mean angle of a steered axle over a metre, rad."""
     slip_noise: tuple[Share, Share, Share] = (0.01, 0.01, 0.03)
     """Standard deviations of what no wheel can tell, forward and sideways (m) and in yaw (rad), per root metre."""
-    trim: Positive = 0.1
+    trim: Positive = 0.05
     """Standard deviation of the constant error of the curvature at the start (a servo off its centre), rad/m."""
     trim_drift: Positive = 0.002
     """How fast that may change, rad/m per root second."""
@@ -29,16 +31,20 @@ class WheelTrust(Schema):
 class HeadingTrust(Schema):
     """What the compass is worth, and when it is left out."""
 
-    noise: Positive = 0.05
-    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors last."""
+    noise: Positive = 0.02
+    """Standard deviation of a heading, rad."""
+    local: Positive = 0.05
+    """Standard deviation of what iron near by and the truck's own adds to it, rad; it lasts a metre or a radian."""
     drift: Positive = 0.001
     """How fast its north may wander, rad per root second."""
     gate: Positive = 3.0
     """A heading further off than this many standard deviations is left out."""
-    field: Positive = 0.15
+    field: Positive = 0.05
     """Share by which the strength of the magnetic field may differ from what it was at the start."""
     recover: Annotated[int, Field(ge=1)] = 10
-    """Good headings in a row until a compass that was disturbed counts again."""
+    """Good headings in a row until a compass that was disturbed counts again,"""
+    regain: Positive = 1.0
+    """over at least so many metres, or radians, or else over the time of patience."""
     patience: Positive = 10.0
     """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
 

@@ -60,7 +60,7 @@ class Fusion:
         self._chassis = chassis
         use = chassis is not None and config.wheels is not None
         self._wheels = WheelMotion(chassis, config.max_speed) if use and chassis is not None else None
-        self._slip = SlipWatch(config.slip)
+        self._slip = SlipWatch(config.slip, 0.0 if config.compass is None else config.compass.local)
         self._history: History | None = None
         self._last: dict[str, int] = {}
         self._shown: tuple[int, Array] | None = None
@@ -115,8 +115,13 @@ class Fusion:
         )
         if self._config.compass is None:
             heading = replace(heading, disturbed=True)
+        before = self._disturbed
         if not self._insert(heading):
             self._left_out["compass: too late"] += 1
+        elif self._disturbed and not before and self._history is not None:
+            # A magnet comes nearer before it is noticed.
+            self._history.rewrite(0, _disturbed)
+            self._slip.forget_headings()
         elif heading.field is not None and not heading.disturbed and not self._disturbed:
             self._heed(self._slip.heading(attitude.stamp, heading.yaw))
         else:
@@ -258,6 +263,10 @@ class Fusion:
 
 def _slipping(operation: Operation) -> Operation:
     return replace(operation, slipping=True) if isinstance(operation, WheelWay) else operation
+
+
+def _disturbed(operation: Operation) -> Operation:
+    return replace(operation, disturbed=True) if isinstance(operation, Heading) else operation
 
 
 def _scan_way(motion: ScanMotion, scale: float) -> ScanWay | None:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.fusion.config import SlipConfig
+from monstertruck_estimation.fusion.config import LASTING, SlipConfig
 from monstertruck_estimation.fusion.operations import ScanWay, WheelWay
 from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_estimation.transforms import wrap_angle
@@ -55,10 +55,12 @@ class SlipWatch:
 
     Args:
         config: thresholds.
+        deviation: standard deviation of what a place adds to a heading, rad.
     """
 
-    def __init__(self, config: SlipConfig) -> None:
+    def __init__(self, config: SlipConfig, deviation: float) -> None:
         self._config = config
+        self._deviation = deviation
         self._trail: deque[tuple[int, Array, Array]] = deque()
         """Stamp, pose, and the sum of the ways' covariances: over a window too short to turn them into each other."""
         self._ways: deque[ScanWay] = deque()
@@ -134,7 +136,9 @@ class SlipWatch:
             return None
         delta, noise = told
         off = wrap_angle(float(delta[2]) - wrap_angle(yaw - before))
-        distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * JITTER**2)
+        like = math.exp(-math.hypot(delta[0], delta[1]) / LASTING[0] - abs(float(delta[2])) / LASTING[1])
+        elsewhere = JITTER**2 + self._deviation**2 * (1 - like)
+        distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * elsewhere)
         text = f"wheels and compass differ by {off:+.3f} rad in {(stamp - since) / SECOND:.1f} s"
         return self._judged(distance, since, text)
 
