@@ -142,7 +142,7 @@ PLAN_STABILISER: Final = Topic(
     StabiliserCommand,
     W.PLANNER,
     "Joint goals of the lidar's mount; they move no wheel, so they pass no gate",
-    50,
+    25,
     0.5,
 )
 

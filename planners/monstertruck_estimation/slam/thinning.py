@@ -88,8 +88,27 @@ def _handed_over(
         measured[k], information[k] = compose(first, second), np.linalg.inv(covariance)
         spread[k] += spread[best]
     kept = (origin != target) & ~gone[origin] & ~gone[target]
+    kept &= _surest(origin, target, odometry, np.linalg.det(information))
     moved = Edges(origin[kept], target[kept], measured[kept], information[kept], edges.loop[kept])
     return moved, spread[kept], odometry[kept]
+
+
+def _surest(
+    origin: NDArray[np.int64], target: NDArray[np.int64], odometry: NDArray[np.bool_], sureness: Array
+) -> NDArray[np.bool_]:
+    """Marks of the best relation of each kind between two key scans.
+
+    Relations handed over share what they were composed with: taken together they would claim more than they know, and
+    their number would grow with the way.
+    """
+    low, high = np.minimum(origin, target), np.maximum(origin, target)
+    order = np.lexsort((-sureness, odometry, high, low))
+    keys = np.stack((low, high, odometry))[:, order]
+    first = np.ones(len(order), bool)
+    first[1:] = (keys[:, 1:] != keys[:, :-1]).any(axis=0)
+    result = np.zeros(len(order), bool)
+    result[order[first]] = True
+    return result
 
 
 def _seen_from(edges: Edges, k: int, node: int) -> tuple[Array, Array]:

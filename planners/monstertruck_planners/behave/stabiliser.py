@@ -39,7 +39,7 @@ class StabiliserConfig(Schema):
     """How the lidar is kept level."""
 
     kind: Literal["stabiliser"] = "stabiliser"
-    rate: Annotated[float, Field(gt=0, le=100)] = 50.0
+    rate: Annotated[float, Field(gt=0, le=100)] = 25.0
     """Goals a second."""
     pitch_limit: Limit = math.radians(30)
     """Greatest joint angle to either side, rad."""

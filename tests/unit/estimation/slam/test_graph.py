@@ -95,3 +95,14 @@ def test_thinning_hands_relations_over_so_that_the_optimum_stays():
     number = np.cumsum(~gone) - 1
     again = optimise(bent[~gone], left.renumbered(number))
     assert np.abs(between(again, full[~gone])[:, :2]).max() < 0.05
+
+
+def test_relations_handed_over_do_not_pile_up():
+    truth = rounds(200, 2.0, 8.0, 6.0)
+    edges = chain(truth, [(k, k + gap, between(truth[k], truth[k + gap])) for gap in (2, 3, 99) for k in range(100)])
+    spread, marks, poses = np.full((len(edges), 2), 1e-4), np.zeros(len(edges), bool), truth
+    for _ in range(5):
+        gone, _, edges, spread, marks = thinned(poses, edges, spread, marks, 0.1)
+        edges, poses = edges.renumbered(np.cumsum(~gone) - 1), poses[~gone]
+        ends = np.sort(np.stack((edges.origin, edges.target)), axis=0)
+        assert len(np.unique(ends, axis=1).T) == len(edges), "one relation between two key scans"
