@@ -35,6 +35,8 @@ FASTEST: Final = 3.0
 """No robot turns faster than this, rad/s."""
 BLANK: Final = 1.0
 """A scan tells nothing along a direction in which its standard deviation is greater, m."""
+SPANS: Final = 2
+"""Windows over which wheels and scans are compared as well."""
 SPAN: Final = SECOND
 """Wheels and compass are compared over this long, ns."""
 
@@ -95,28 +97,51 @@ class SlipWatch:
         if float(np.linalg.eigvalsh(way.covariance[:2, :2])[-1]) > BLANK**2:
             self._unproven = self._config.calm
         self._ways.append(way)
-        while len(self._ways) > 1 and way.stamp - self._ways[1].since >= self._config.window * SECOND:
+        while len(self._ways) > 1 and way.stamp - self._ways[1].since >= SPANS * self._window:
             self._ways.popleft()
-        since = self._ways[0].since
-        told = self._told(since, way.stamp)
+        recent = sum(1 for one in self._ways if way.stamp - one.stamp < self._window)
+        near = self._compared(recent)
+        if near is None:
+            return None
+        if self._unproven and not self.slipping:
+            self._prove(near[0])
+            return None
+        # Slip adds up, noise evens out: what is doubtful over one window is clear over two.
+        far = None if self.slipping else self._compared(len(self._ways))
+        change = self._judged(*(near if far is None or far[0] < near[0] else far))
+        if change is not None and not change.slipping:
+            self._agreed()
+        return change
+
+    @property
+    def _window(self) -> int:
+        return round(self._config.window * SECOND)
+
+    def _agreed(self) -> None:
+        """What is past is settled."""
+        while len(self._ways) > 1:
+            self._ways.popleft()
+
+    def _compared(self, count: int) -> tuple[float, int, str] | None:
+        """Wheels against the last ``count`` motions: distance in deviations, since when (ns), and in words."""
+        ways = list(self._ways)[-count:]
+        since, stamp = ways[0].since, ways[-1].stamp
+        told = self._told(since, stamp)
         if told is None:
             return None
         moved = np.zeros(3)
-        for one in self._ways:
+        for one in ways:
             moved = compose(moved, one.delta)
         _, by_later = compose_jacobians(moved, np.zeros(3))
         # The places of the first and the last scan err; what was in between has cancelled.
-        spread = self._ways[0].covariance + by_later @ way.covariance @ by_later.T
+        spread = ways[0].covariance + by_later @ ways[-1].covariance @ by_later.T
         delta, noise = told
         off = delta - moved
         off[2] = wrap_angle(float(off[2]))
         distance = math.sqrt(float(off @ np.linalg.solve(spread + noise, off)))
-        seconds = (way.stamp - since) / SECOND
+        seconds = (stamp - since) / SECOND
         text = f"wheels and scans differ by {math.hypot(off[0], off[1]):.3f} m and {off[2]:+.3f} rad in {seconds:.1f} s"
-        if self._unproven and not self.slipping:
-            self._prove(distance)
-            return None
-        return self._judged(distance, since, text)
+        return distance, since, text
 
     def heading(self, stamp: int, yaw: float) -> Change | None:
         """Take an undisturbed heading (counter-clockwise, rad); it is the judge where there are no scans."""
@@ -177,6 +202,8 @@ class SlipWatch:
         self.doubted = distance > self._config.gate
         if distance < self._config.release:
             self._unproven -= 1
+            if not self._unproven:
+                self._agreed()
         elif self.doubted:
             self._unproven = self._config.calm
 

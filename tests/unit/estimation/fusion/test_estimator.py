@@ -4,6 +4,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from monstertruck_estimation.fusion.config import SlipConfig
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, scan_motion, wander
@@ -96,6 +97,17 @@ def test_wheels_that_slip_do_not_count_as_a_source():
     assert rig.fusion.standing().slipping
     assert "drive" not in rig.estimate.sources
     assert "lidar" in rig.estimate.sources
+
+
+def test_slip_too_slight_for_one_window_is_clear_over_two():
+    rig = Rig(("wheels", "scans"), slip=SlipConfig(window=0.2)).drive(0.3, 0.0, 0.0, 4.0)
+    rig.slip = 1.6
+    rig.drive(0.3, 0.0, 0.0, 1.0)
+    assert [change.slipping for change in rig.changes] == [True]
+    assert "in 0.4 s" in rig.changes[0].text
+    rig.slip = 1.0
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    assert [change.slipping for change in rig.changes] == [True, False], "what is past is settled"
 
 
 def test_good_wheels_never_count_as_slipping():
