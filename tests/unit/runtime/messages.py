@@ -128,6 +128,22 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
 }
 
 
+FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
+    t.REQ_GOAL: {"goal": poses},
+    t.COMPASS: {"magnetic_field": st.none() | vectors, "acceleration": st.none() | vectors},
+    t.STABILISER: {"pitch_joint": joints, "roll_joint": joints},
+    t.EVENT: {
+        "values": st.dictionaries(
+            st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
+        )
+    },
+    t.SLAM: {"overlap": st.floats(0, 1)},
+    t.SCAN_MOTION: {"motion": poses, "covariance": hnp.arrays(np.float64, 9, elements=number)},
+    t.STOP: {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)},
+}
+"""Strategies of fields that any value of their type would not do for."""
+
+
 def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
     """Messages of any topic."""
     if topic in PROTOBUF:
@@ -141,20 +157,4 @@ def of(topic: t.Topic[Any]) -> st.SearchStrategy[Message]:
             special[name] = finite.map(lambda x: None if x is None else abs(x) % 2.0 or 1.0)
     if "source" in topic.model.model_fields and topic.group != "event":
         special["source"] = st.from_regex(r"\A[A-Za-z0-9_.@:-]{1,64}\Z")
-    if topic is t.REQ_GOAL:
-        special["goal"] = poses
-    if topic is t.COMPASS:
-        special["magnetic_field"] = special["acceleration"] = st.none() | vectors
-    if topic is t.STABILISER:
-        special["pitch_joint"] = special["roll_joint"] = joints
-    if topic is t.EVENT:
-        special["values"] = st.dictionaries(
-            st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
-        )
-    if topic is t.SLAM:
-        special["overlap"] = st.floats(0, 1)
-    if topic is t.SCAN_MOTION:
-        special |= {"motion": poses, "covariance": hnp.arrays(np.float64, 9, elements=number)}
-    if topic is t.STOP:
-        special |= {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)}
-    return st.builds(topic.model, **special)
+    return st.builds(topic.model, **special | FIELDS.get(topic, {}))
