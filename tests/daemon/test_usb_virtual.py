@@ -34,7 +34,7 @@ SAMPLES: dict[str, Topic[Any]] = {
     "lidar": topics.SCAN,
     "camera": topics.CAMERA,
 }
-GAPS = {"lidar": 0.1, "camera": 1 / 15, "drive": 0.05, "steering": 0.05, "compass": 0.05, "stabiliser": 0.02}
+GAPS = {"lidar": 0.1, "camera": 1 / 15, "drive": 0.05, "steering": 0.05, "compass": 0.05, "stabiliser": 0.04}
 """Seconds between two samples of a healthy device."""
 
 
