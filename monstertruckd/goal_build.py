@@ -5,7 +5,8 @@ from typing import Final
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_runtime.clock import Clock
+from monstertruck_planners.manage.exchange import Setup
+from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import Publisher
 from monstertruck_schemas import topics
@@ -40,8 +41,10 @@ def build_goals(
     lidar, mapped = config.devices.lidar, config.slam is not None
     assert config.tracker is not None
     planner = planner.model_copy(update={"map": None}) if mapped else planner
+    mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
+    setup = Setup(planner, chassis.bicycle, footprint, mount, timed=not isinstance(clock, VirtualClock))
     return GoalService(
-        planner,
+        setup,
         clock,
         places.actor(
             config.placement.planner,
@@ -51,9 +54,6 @@ def build_goals(
             deadline=planner.deadline,
             patience=PATIENCE,
         ),
-        geometry=chassis.bicycle,
-        footprint=footprint,
-        lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
         deceleration=config.tracker.deceleration,
         max_age=config.gate.max_request_age,
         inputs=Inputs(
@@ -67,19 +67,16 @@ def build_goals(
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         ),
         outputs=Outputs(path, wish, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
-        deformation=_deformation(config, planner, bus, clock, chassis, footprint, places),
+        deformation=_deformation(config, setup, bus, clock, places),
     )
 
 
-def _deformation(
-    config: TruckConfig, planner: PlannerConfig, bus: Bus, clock: Clock, chassis: Chassis, footprint: Footprint,
-    places: Places,
-) -> Deformation | None:  # fmt: skip
-    lidar, mapped, local = config.devices.lidar, config.slam is not None, planner.local
-    if planner.deform is None or lidar is None:
+def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, places: Places) -> Deformation | None:
+    mapped, local = config.slam is not None, setup.config.local
+    if setup.config.deform is None or config.devices.lidar is None:
         return None
     return Deformation(
-        planner,
+        setup,
         clock,
         places.actor(
             config.placement.deformer,
@@ -89,9 +86,6 @@ def _deformation(
             deadline=local.deadline,
             patience=PATIENCE,
         ),
-        geometry=chassis.bicycle,
-        footprint=footprint,
-        lidar=lidar.mount.planar,
         scan=bus.subscribe(topics.SCAN, latest()),
         pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
         grid=bus.subscribe(topics.MAP, latest()) if mapped else None,

@@ -6,18 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import (
-    DeformAnswer,
-    DeformSetup,
-    DeformTask,
-    Finding,
-    PlanAnswer,
-    Pose,
-    Way,
-)
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup, Way
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox
@@ -40,12 +29,9 @@ class Deformation:
     """Keeps the route that is driven and what the deforming step said of it last.
 
     Args:
-        config: how.
+        setup: how, and the truck.
         clock: time.
         actor: where it is deformed.
-        geometry: the truck's.
-        footprint: its outline.
-        lidar: pose (x, y, yaw) of the lidar in base.
         scan: every one is taken in.
         pose: of the truck, in the frame of the routes.
         grid: the map; None = the configured one.
@@ -56,20 +42,16 @@ class Deformation:
 
     def __init__(
         self,
-        config: PlannerConfig,
+        setup: Setup,
         clock: Clock,
         actor: Actor,
         *,
-        geometry: FourWheelSteering,
-        footprint: Footprint,
-        lidar: Pose,
         scan: Mailbox[LaserScan],
         pose: Subscription[Odometry],
         grid: Subscription[Grid] | None,
         events: EventSink,
     ) -> None:
-        self._local, self._clock, self._actor = config.local, clock, actor
-        self._setup = DeformSetup(config, geometry, footprint, lidar)
+        self._setup, self._local, self._clock, self._actor = setup, setup.config.local, clock, actor
         self._scan, self._pose, self._grid, self._events = scan, pose, grid, events
         self._fresh = True
         self._sent_grid: Grid | None = None

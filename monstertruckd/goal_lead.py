@@ -18,6 +18,7 @@ from monstertruckd.goal_parts import Followed, Inputs, Outputs, pose_of
 Array = NDArray[np.float64]
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
+SOURCE: Final = "goals"
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 LEASE: Final = 0.25
@@ -104,7 +105,7 @@ class Lead:
         self.followed = Followed(message, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
         self._out.path.put(message)
 
-    def stand_still(self, source: str) -> None:
+    def stand_still(self) -> None:
         """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
         gate, now = self._in.gate.latest, self._clock.now()
         if self.driving or gate is None or gate.mode not in ACTIVE:
@@ -114,7 +115,7 @@ class Lead:
                 stamp=now,
                 received=now,
                 seq=self._out.wish.next_seq(),
-                source=source,
+                source=SOURCE,
                 role=Role.TRACKER,
                 lease=LEASE,
                 nonce=gate.nonce,

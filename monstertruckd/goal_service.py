@@ -7,15 +7,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, scan_points
+from monstertruck_planners.collision import scan_points
 from monstertruck_planners.manage import mission as machine
-from monstertruck_planners.manage.config import PlannerConfig
 from monstertruck_planners.manage.escape import placed
-from monstertruck_planners.manage.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.manage.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup
 from monstertruck_planners.manage.lookout import blocked, way_ahead
 from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
-from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.schedule import Schedule
@@ -44,12 +42,9 @@ class GoalService:
     While it thinks and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
 
     Args:
-        config: how.
+        setup: how, and the truck.
         clock: time.
         actor: where it is planned.
-        geometry: the truck's.
-        footprint: its outline.
-        lidar: pose (x, y, yaw) of the lidar in base.
         deceleration: with which the tracker brakes, m/s^2.
         max_age: see ``GateConfig.max_request_age``.
         inputs: topics read.
@@ -61,23 +56,19 @@ class GoalService:
 
     def __init__(
         self,
-        config: PlannerConfig,
+        setup: Setup,
         clock: Clock,
         actor: Actor,
         *,
-        geometry: FourWheelSteering,
-        footprint: Footprint,
-        lidar: Pose,
         deceleration: float,
         max_age: float,
         inputs: Inputs,
         outputs: Outputs,
         deformation: Deformation | None = None,
     ) -> None:
-        self._config, self._clock, self._in, self._out = config, clock, inputs, outputs
+        self._setup, self._config, self._clock = setup, setup.config, clock
+        self._in, self._out, self._max_age = inputs, outputs, max_age
         self._place, self._deformation = actor, deformation
-        self._footprint, self._lidar, self._max_age = footprint, lidar, max_age
-        self._setup = Setup(config, geometry, footprint, timed=not isinstance(clock, VirtualClock))
         self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
         self._mission: Mission | None = None
         self._number = 0
@@ -211,8 +202,15 @@ class GoalService:
             answer=answer,
             outcome=None if report is None else self._outcome(report.outcome),
             along=along if followed is None else followed.before + along,
+            left=self._left(followed, along),
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
         )
+
+    def _left(self, followed: Followed | None, along: float) -> float:
+        """Metres of the route ahead; of none, infinitely many."""
+        if self._deformation is not None and self._deformation.up:
+            return self._deformation.left
+        return math.inf if followed is None else max(float(followed.travelled[-1]) - along, 0.0)
 
     def _odometry(self, now: int) -> Odometry | None:
         odometry = self._in.pose.latest
@@ -231,7 +229,7 @@ class GoalService:
             return False
         pose = pose_of(odometry)
         way = way_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, np.array(pose))
-        return blocked(self._footprint, way, points, pose)
+        return blocked(self._setup.footprint, way, points, pose)
 
     def _scan(self, now: int) -> Array:
         """Returns of the newest scan in base; none if it is old."""
@@ -239,7 +237,7 @@ class GoalService:
         if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return np.empty((0, 2))
         if scan is not self._scanned:
-            self._scanned, self._points = scan, scan_points(scan, self._lidar)
+            self._scanned, self._points = scan, scan_points(scan, self._setup.lidar)
         return self._points
 
     # Decisions
@@ -326,10 +324,9 @@ class GoalService:
         self._lead.halt(f"halt-{self._number}")
 
     def _stand_still(self, mission: Mission) -> None:
-        """Keep the truck armed while a way is looked for."""
-        held_up = self._deformation is not None and self._deformation.held_up
-        if mission.phase in (GoalPhase.PLANNING, GoalPhase.WAITING) or held_up:
-            self._lead.stand_still(self.name)
+        """Keep the truck armed while nothing is driven: a way is looked for, or what there was of one has ended."""
+        if mission.active and mission.phase is not GoalPhase.PAUSED:
+            self._lead.stand_still()
 
     def _report(self, now: int) -> None:
         left = 0.0 if self._deformation is None else self._deformation.left

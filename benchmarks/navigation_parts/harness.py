@@ -64,7 +64,7 @@ def place(file: Path) -> Place:
     steps = PlanningStep(), PlanningStep()
     for step, effort in zip(steps, EFFORTS, strict=True):
         config = PlannerConfig(map=file, route=HybridConfig(margin=0.03, effort=effort))
-        setup = Setup(config, TRUCK, BODY, timed=False)
+        setup = Setup(config, TRUCK, BODY)
         step.step(PlanTask("route", (math.nan,) * 3, (0.0,) * 3, np.empty((0, 2)), setup))
     low = np.array(world.origin)
     truth = DistanceField((world.cells >= OCCUPIED) | (world.cells < 0), world.resolution, (*world.origin, 0.0))

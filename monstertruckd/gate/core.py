@@ -177,6 +177,8 @@ class Gate:
         if self.mode is GateMode.DISARMED:
             return self._refuse(now, Reason.DISARMED, request)
         reason = self._sources.standing(source, now, self._states.holder_key)
+        if reason is Reason.BUSY and inside and source.neutral:
+            return reason  # It keeps the truck standing when the planner that drives comes to its end.
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._watch.judge(now), now)), Reason.OK)

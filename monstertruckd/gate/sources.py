@@ -6,7 +6,8 @@ Rules:
 - What may set the truck in motion must show that its sender knew the gate's state of a moment ago: then it cannot have
   waited long in some queue. That is the robot's own clock, so no other one has to be trusted.
 - Operators ask from outside, the tracker from inside; a tracker off board only if the configuration names it.
-- The source of the highest role with a live lease drives; among equals the one that drives already.
+- The source of the highest role with a live lease drives; among equals the one that drives already, but of the robot's
+  own planners one that asks for motion before one that keeps the truck standing.
 - Control passes upwards at once, downwards only after a new ARM order: once a role has driven, or has ordered a
   stop, lower roles are refused until somebody arms the truck again. So a tracker never goes on by itself after an
   operator lets go.
@@ -66,6 +67,11 @@ class Source:
     def neutral(self) -> bool:
         """Whether its stick is at rest."""
         return abs(self.request.speed) < NEUTRAL
+
+    @property
+    def setting_off(self) -> bool:
+        """Whether it is a planner that asks for motion."""
+        return self.inside and not self.neutral
 
     @property
     def rank(self) -> int:
@@ -189,7 +195,7 @@ class Sources:
             holder: key of the one driving already.
         """
         able = [source for source in self.live(now) if not source.held and source.rank >= self._floor]
-        return max(able, key=lambda source: (source.rank, source.key == holder), default=None)
+        return max(able, key=lambda source: (source.rank, source.setting_off, source.key == holder), default=None)
 
     def standing(self, source: Source, now: int, holder: Key | None) -> Reason:
         """OK if this source drives or would drive, else why not."""

@@ -12,15 +12,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.deform.config import BandConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.manage.config import EscapeConfig, LocalConfig, PlannerConfig
-from monstertruck_planners.manage.exchange import (
-    DeformAnswer,
-    DeformSetup,
-    DeformTask,
-    PlanAnswer,
-    PlanTask,
-    Setup,
-    Way,
-)
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask, Setup, Way
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.track.config import (
     FuzzyConfig,
@@ -43,17 +35,7 @@ _CLASSES: Final[dict[str, type[Any]]] = {
     cls.__name__: cls
     for cls in (
         *(PlanTask, PlanAnswer, Setup, PlannerConfig, EscapeConfig, HybridConfig, LatticeConfig, Grid, Pose2D),
-        *(
-            DeformTask,
-            DeformAnswer,
-            DeformSetup,
-            Way,
-            LocalConfig,
-            RsbandConfig,
-            PublishedConfig,
-            TebConfig,
-            BandConfig,
-        ),
+        *(DeformTask, DeformAnswer, Way, LocalConfig, RsbandConfig, PublishedConfig, TebConfig, BandConfig),
         *(TrackInput, TrackOutput, TrackSetup, Told, Odometry, Twist2D, Path, GateState, LaserScan, Attitude, Vector3),
         *(DriveRequest, TrackerState, FuzzyConfig, LqrConfig, MpcConfig, PurePursuitConfig, StanleyConfig),
         *(FourWheelSteering, Footprint),

@@ -103,11 +103,9 @@ class PlannerConfig(Schema):
     wait: Positive = 5.0
     """Seconds of the step "wait"."""
     recovered: Positive = 0.5
-    """Metres driven after which the ladder begins at its first step again."""
+    """Metres nearer to the goal along the route than ever before, after which the ladder begins anew"""
     routes: Annotated[int, Field(ge=1)] = 30
     """Routes for one goal at most."""
-    remembered: Annotated[int, Field(ge=1)] = 5
-    """Scans whose obstacles are remembered, of those taken when a route was planned."""
     scan_tolerance: Share = 0.08
     """Returns this near to an obstacle of the map are taken for it, m."""
     escape: EscapeConfig = EscapeConfig()

@@ -15,7 +15,7 @@ from monstertruck_planners.deform.catalog import make_deformer
 from monstertruck_planners.deform.local import passed
 from monstertruck_planners.deform.window import Window
 from monstertruck_planners.manage.escape import placed, seen_from
-from monstertruck_planners.manage.exchange import DeformAnswer, DeformSetup, DeformTask, Pose, Way
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
 from monstertruck_planners.manage.planning import answer_of
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import moved
@@ -37,7 +37,7 @@ class DeformStep:
     """Answers scan by scan; equal scans give equal answers."""
 
     def __init__(self) -> None:
-        self._setup: DeformSetup | None = None
+        self._setup: Setup | None = None
         self._known: DistanceField | None = None
         self._way: Way | None = None
         self._rest: Guide | None = None
@@ -72,7 +72,7 @@ class DeformStep:
         self._memory = result.memory
         return self._told(result)
 
-    def _set_up(self, setup: DeformSetup) -> None:
+    def _set_up(self, setup: Setup) -> None:
         config = setup.config
         if config.deform is None:
             raise InputError("deforming: expected planner.deform")
@@ -92,7 +92,7 @@ class DeformStep:
         self._travelled = self._guide.travelled
         self._rest, self._memory = None, Memory()
 
-    def _look(self, setup: DeformSetup, scan: LaserScan, pose: Pose) -> Array:
+    def _look(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
         """Put a scan into the window; returns its points in base. Beams without a return say nothing."""
         points = scan_points(scan, setup.lidar)
         (sensor,) = placed(np.array([setup.lidar]), pose)
@@ -111,7 +111,7 @@ class DeformStep:
         directions[:1] = directions[1:2] if len(directions) > 1 else directions
         self._place = first + passed(Guide(guide.poses[first : last + 1], directions), here)
 
-    def _free(self, setup: DeformSetup, here: Array, pose: Pose, points: Array) -> bool:
+    def _free(self, setup: Setup, here: Array, pose: Pose, points: Array) -> bool:
         """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked."""
         local, guide, at = setup.config.local, self._guide, self._place
         deformed = self._rest is not None

@@ -22,12 +22,14 @@ Place = tuple[float, float, float | None]
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What the step is made for; comes first, and again after every restart."""
+    """What planning and deforming are made for; comes first, and again after every restart."""
 
     config: PlannerConfig
     geometry: FourWheelSteering
     footprint: Footprint
-    timed: bool
+    lidar: Pose = (0.0, 0.0, 0.0)
+    """In base."""
+    timed: bool = False
     """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
 
 
@@ -46,7 +48,7 @@ class PlanTask:
     grid: Grid | None = None
     """A newer map than before."""
     clear: bool = False
-    """Forget the obstacles of older scans, and the route so far."""
+    """Forget obstacles of older scans, but for those near the truck, and the route so far."""
     afresh: bool = False
     """Forget the route so far."""
     via: tuple[Place, ...] = ()
@@ -79,17 +81,6 @@ class PlanAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class DeformSetup:
-    """What the deforming step is made for; comes first, and again after every restart."""
-
-    config: PlannerConfig
-    geometry: FourWheelSteering
-    footprint: Footprint
-    lidar: Pose
-    """In base."""
-
-
-@dataclass(frozen=True, slots=True)
 class Way:
     """A route to be deformed."""
 
@@ -108,7 +99,7 @@ class DeformTask:
     scan: LaserScan
     pose: Pose
     """Of the base, in the map's frame."""
-    setup: DeformSetup | None = None
+    setup: Setup | None = None
     grid: Grid | None = None
     way: Way | None = None
 

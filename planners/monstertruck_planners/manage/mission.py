@@ -87,6 +87,8 @@ class Facts:
     """What the tracker says of the present path; None before it says something."""
     along: float = 0.0
     """Metres driven on it."""
+    left: float = math.inf
+    """Metres of the route ahead."""
     blocked: bool = False
     """The newest scan shows something on the way ahead."""
 
@@ -118,6 +120,10 @@ class Mission:
     seen: int = 0
     """Looks in a row that showed the way blocked."""
     blocks: int = 0
+    nearest: float = math.inf
+    """Least that was left of any route, m..."""
+    troubled: float = math.inf
+    """...and at the last trouble."""
     misses: int = 0
     rung: int = 0
     """Next step of the ladder."""
@@ -197,6 +203,8 @@ def _planned(mission: Mission, facts: Facts, answer: PlanAnswer, config: Planner
     kind = "the rest of the route before" if answer.kept else "a new route"
     text = f"goal {mission.number}: {kind}, {answer.length:.2f} m"
     mission = replace(_set_off(mission, GoalPhase.DRIVING), routes=mission.routes + 1)
+    if math.isinf(mission.troubled):
+        mission = replace(mission, nearest=answer.length, troubled=answer.length)
     return mission, (Follow(answer), Tell(Reason.ROUTE_FOUND, Severity.INFO, text))
 
 
@@ -216,8 +224,8 @@ def _drive(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
         return _with(_plan(mission, config), told)
     if facts.along > mission.best + config.progress:
         mission = replace(mission, best=facts.along, moved=facts.now)
-    if not backing and mission.best > config.recovered:
-        mission = replace(mission, rung=0, blocks=0)
+    if not backing:
+        mission = _got_on(mission, facts.left, config)
     mission = replace(mission, seen=mission.seen + 1 if facts.blocked else 0)
     if mission.seen >= config.sightings and not backing:
         text = "the newest scan shows something on the route"
@@ -229,6 +237,18 @@ def _drive(mission: Mission, facts: Facts, config: PlannerConfig) -> Step:
     if facts.now - mission.moved > config.stuck:
         return _trouble(mission, Reason.STUCK, f"no progress for {config.stuck:g} s", config)
     return mission, ()
+
+
+def _got_on(mission: Mission, left: float, config: PlannerConfig) -> Mission:
+    """What begins anew as the truck gets on.
+
+    The ladder does so only nearer to the goal than before its last step: driving to and fro between two ways that are
+    both blocked is no progress.
+    """
+    mission = replace(mission, nearest=min(mission.nearest, left))
+    if mission.best > config.recovered:
+        mission = replace(mission, blocks=0)
+    return replace(mission, rung=0) if mission.nearest < mission.troubled - config.recovered else mission
 
 
 def _at_waypoint(mission: Mission, pose: Pose | None, config: PlannerConfig) -> bool:
@@ -255,7 +275,7 @@ def _trouble(mission: Mission, reason: Reason, text: str, config: PlannerConfig)
     if mission.rung >= len(config.ladder):
         return _end(mission, reason, text or reason.text)
     rung = config.ladder[mission.rung]
-    mission = replace(mission, rung=mission.rung + 1, recoveries=mission.recoveries + 1)
+    mission = replace(mission, rung=mission.rung + 1, recoveries=mission.recoveries + 1, troubled=mission.nearest)
     why = f"{reason.text}{f' ({text})' if text else ''}"
     told = Tell(Reason.RECOVERING, Severity.WARNING, f"goal {mission.number}: {why}: {rung.replace('_', ' ')}")
     match rung:

@@ -1,9 +1,8 @@
 """The planning step: map and newest scan in, a drivable way out. Compiled, for workers.
 
-It remembers the map, the obstacles of the last scans, and the route, which is kept while it is good.
+It remembers the map, the obstacles that scans showed beside it, and the route, which is kept while it is good.
 """
 
-from collections import deque
 from typing import Final
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from monstertruck_planners.collision import OCCUPIED, DistanceField, rectangle_distance
 from monstertruck_planners.manage.escape import escape, placed, seen_from
 from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.manage.memory import ObstacleMemory
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.hybrid import HybridPlanner
@@ -29,8 +29,10 @@ Cells = NDArray[np.int8]
 
 SAMPLE: Final = 0.05
 """Metres between two poses of an answer."""
+SQUARE: Final = 0.05
+"""Obstacles beside the map are remembered by squares of this size, m."""
 NEARBY: Final = 1.5
-"""Obstacles this near count when backing out, m."""
+"""Obstacles this near count when backing out, and are not forgotten, m."""
 
 
 class Ground:
@@ -54,11 +56,9 @@ class Ground:
         cells = grid.cells.reshape(grid.height, grid.width)
         return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
 
-    def news(self, points: Array, tolerance: float) -> Array:
-        """Those points (n, 2) that no obstacle of the map explains: further than ``tolerance`` from all, m."""
-        if not len(points):
-            return points
-        return np.asarray(points[self._walls.lookup(points) > tolerance + self.resolution / 2])
+    def beside(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
+        """Whether no obstacle of the map explains each point (n, 2): it is further than ``tolerance`` from all, m."""
+        return np.asarray(self._walls.lookup(points) > tolerance + self.resolution / 2)
 
     def with_points(self, points: Array) -> Cells:
         """Cells with the points' ones occupied."""
@@ -84,7 +84,7 @@ class PlanningStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._ground: Ground | None = None
-        self._scans: deque[Array] = deque()
+        self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
         self._now: Clock | None = None
 
@@ -105,14 +105,9 @@ class PlanningStep:
         places = [value for place in task.via for value in place if value is not None]
         if not np.isfinite((*task.pose, *task.goal, *places)).all():
             return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
-        if task.clear:
-            self._scans.clear()
         if task.clear or task.afresh:
             self._route = None
-        news = self._ground.news(task.points, self._setup.config.scan_tolerance)
-        self._scans.append(news)
-        while len(self._scans) > self._setup.config.remembered:
-            self._scans.popleft()
+        self._look(self._setup, self._ground, task)
         return self._escape(self._ground, task) if task.what == "escape" else self._plan(self._ground, task)
 
     def _set_up(self, setup: Setup) -> None:
@@ -130,9 +125,18 @@ class PlanningStep:
             world = load_map(config.map)
             self._ground = Ground(world.cells, world.resolution, (*world.origin, 0.0))
 
+    def _look(self, setup: Setup, ground: Ground, task: PlanTask) -> None:
+        """Take in a scan, and what has become of the map."""
+        memory = self._memory
+        if task.clear:
+            memory.forget(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
+        memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
+        memory.keep(task.points)
+        memory.forget(~ground.beside(memory.places, setup.config.scan_tolerance))
+
     def _plan(self, ground: Ground, task: PlanTask) -> PlanAnswer:
         assert self._setup is not None
-        points = np.vstack(self._scans)
+        points = self._memory.places
         if len(points):
             # What touches the truck where it stands would only keep it there; the gate watches that.
             pose = np.array([task.pose])
@@ -165,7 +169,7 @@ class PlanningStep:
         setup = self._setup
         assert setup is not None
         config = setup.config
-        near = ground.obstacles(ground.with_points(np.vstack(self._scans)), task.pose, NEARBY)
+        near = ground.obstacles(ground.with_points(self._memory.places), task.pose, NEARBY)
         way = escape(
             config.escape,
             setup.geometry,

@@ -11,7 +11,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.deform.config import RsbandConfig
 from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -60,8 +60,8 @@ class Stage:
         self.told: list[tuple[Finding, Finding]] = []
         self.events: list[Reason] = []
         self.deformation = Deformation(
-            PlannerConfig(deform=RsbandConfig()), clock, self.actor, geometry=FourWheelSteering(),
-            footprint=Footprint(), lidar=(0.0, 0.0, 0.0), scan=self.scans, pose=self.poses, grid=None,
+            Setup(PlannerConfig(deform=RsbandConfig()), FourWheelSteering(), Footprint()),
+            clock, self.actor, scan=self.scans, pose=self.poses, grid=None,
             events=lambda reason, *_, **__: self.events.append(reason),
         )  # fmt: skip
 

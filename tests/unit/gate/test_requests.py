@@ -11,6 +11,7 @@ from tests.unit.gate.rig import Rig
 
 TRACKER = {"source": "track", "role": Role.TRACKER}
 TRACK = {**TRACKER, "inside": True}
+GOALS = {**TRACK, "source": "goals"}
 PAD = {"source": "pad", "role": Role.GAMEPAD}
 
 
@@ -205,6 +206,21 @@ def test_equals_wait_for_each_other():
         rig.drive(source="bob")
         rig.tick()
     assert (rig.out.mode, rig.out.holder) == (GateMode.DRIVING, "bob")  # same role: handed over without a gap
+
+
+def test_a_planner_that_keeps_the_truck_standing_neither_disturbs_nor_delays_another():
+    rig = Rig().driving(**TRACK)
+    assert rig.drive(speed=0.0, **GOALS) is Reason.BUSY
+    rig.tick(60)
+    assert (rig.out.holder, rig.told(Reason.BUSY)) == ("track", [])
+    rig.driver = None
+    for _ in range(14):
+        rig.drive(speed=0.0, **GOALS)
+        rig.tick()
+    assert (rig.out.mode, rig.out.holder) == (GateMode.DRIVING, "goals")
+    assert rig.drive(**TRACK) is Reason.OK
+    rig.tick()
+    assert rig.out.holder == "track"
 
 
 def test_keyboard_ranks_between_gamepad_and_station():

@@ -10,7 +10,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.deform.config import RsbandConfig
 from monstertruck_planners.manage.config import PlannerConfig
 from monstertruck_planners.manage.deforming import DeformStep
-from monstertruck_planners.manage.exchange import DeformAnswer, DeformSetup, DeformTask, Way
+from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Setup, Way
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
@@ -54,7 +54,7 @@ def room() -> Grid:
 def begun(route: np.ndarray = ROUTE, directions: np.ndarray | None = None) -> tuple[DeformStep, DeformTask]:
     """A step, and its first task."""
     config = PlannerConfig(deform=RsbandConfig())
-    setup = DeformSetup(config, FourWheelSteering(), Footprint(), ORIGIN)
+    setup = Setup(config, FourWheelSteering(), Footprint(), ORIGIN)
     way = Way(1, route, np.ones(len(route)) if directions is None else directions)
     return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way)
 
@@ -128,7 +128,7 @@ def test_a_setup_with_a_deformer_comes_first():
     step, first = begun()
     with pytest.raises(InputError, match="setup"):
         step.step(DeformTask(first.scan, ORIGIN))
-    setup = DeformSetup(PlannerConfig(), FourWheelSteering(), Footprint(), ORIGIN)
+    setup = Setup(PlannerConfig(), FourWheelSteering(), Footprint(), ORIGIN)
     with pytest.raises(InputError, match=r"planner\.deform"):
         step.step(DeformTask(first.scan, ORIGIN, setup))
     assert first.setup is not None

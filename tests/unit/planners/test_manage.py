@@ -129,15 +129,31 @@ def test_the_ladder_is_climbed_in_order_and_then_the_goal_is_given_up():
     assert (story.mission.outcome, story.mission.text) == (Reason.GOAL_UNREACHABLE, "walled in")
 
 
-def test_the_ladder_begins_anew_once_the_truck_has_got_on():
+def test_the_ladder_begins_anew_once_the_truck_is_nearer_to_the_goal_than_ever():
     story = Story()
     story.tell(answer=WAY)
-    story.tell(round(CONFIG.stuck / 0.1) + 2)
+    story.tell(round(CONFIG.stuck / 0.1) + 2, left=1.8)
     story.tell(answer=WAY)
     assert story.mission.rung == 1
-    for along in (0.1, 0.3, 0.55):
-        story.tell(along=along)
+    for left in (1.9, 1.8, 1.35):
+        story.tell(along=2.0 - left, left=left)
+        assert story.mission.rung == 1
+    story.tell(along=0.75, left=1.25)
     assert story.mission.rung == 0
+
+
+def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
+    story = Story(PlannerConfig(routes=1000))
+    for _ in range(12):
+        story.tell(answer=WAY)
+        story.tell(5, along=1.0, left=3.0)
+        story.tell(round(CONFIG.stuck / 0.1) + 2, along=2.0, left=1.0)
+        if story.phase is GoalPhase.WAITING:
+            story.tell(round(CONFIG.wait / 0.1) + 2)
+        elif story.mission.planned == "escape":
+            story.tell(answer=PlanAnswer(Reason.STUCK))
+            story.tell(round(CONFIG.wait / 0.1) + 2)
+    assert (story.mission.outcome, story.mission.recoveries) == (Reason.STUCK, 4)
 
 
 def test_a_failed_escape_is_the_next_rung():
@@ -279,7 +295,7 @@ def hall(shut: bool = False) -> Grid:
 
 def setup(**config: Any) -> Setup:
     settings = {"route": HybridConfig(effort=2000, margin=0.04), **config}
-    return Setup(PlannerConfig(**settings), TRUCK, BODY, timed=False)
+    return Setup(PlannerConfig(**settings), TRUCK, BODY)
 
 
 def task(goal=(4.5, 1.5, 0.0), points=(), **fields: Any) -> PlanTask:
@@ -301,6 +317,30 @@ def test_routes_round_what_the_scan_shows_until_that_is_forgotten(route):
     assert clearance_to_points(BODY, round_it.poses, np.array(post)).min() > 0.0
     assert step.step(task()).length > straight.length + 0.02, "remembered"
     assert step.step(task(clear=True)).length == pytest.approx(straight.length, abs=0.05)
+
+
+def test_what_no_scan_sees_behind_the_truck_is_not_forgotten():
+    step = PlanningStep()
+    post = [(0.4, y) for y in np.arange(1.3, 1.75, 0.05)]
+    wall = [(1.33, y) for y in np.arange(1.2, 1.8, 0.05)]
+    step.step(task(setup=setup(), grid=hall(), points=post))
+    out = step.step(task(what="escape", points=wall, clear=True))
+    assert out.poses is not None
+    assert 0.04 < 1.0 - out.poses[-1, 0] < 0.35, "not through the post"
+    gone = step.step(task(what="escape", pose=(3.0, 1.5, 0.0), points=[(x + 2.0, y) for x, y in wall], clear=True))
+    assert gone.poses is not None
+    back = step.step(task(what="escape", points=wall))
+    assert back.poses is not None
+    assert back.poses[-1, 0] == pytest.approx(0.5, abs=0.03), "far away it was"
+
+
+def test_what_a_scan_sees_through_is_forgotten():
+    step = PlanningStep()
+    straight = step.step(task(setup=setup(), grid=hall()))
+    post = [(2.75, y) for y in np.arange(1.3, 1.75, 0.05)]
+    assert step.step(task(points=post)).length > straight.length + 0.02
+    far = [(5.95, y) for y in np.arange(0.05, 2.95, 0.02)]
+    assert step.step(task(points=far, afresh=True)).length == pytest.approx(straight.length, abs=0.05)
 
 
 def test_a_valid_route_is_kept():
@@ -363,7 +403,7 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
         stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=120, height=80, cells=cells.ravel(),
         origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
     )  # fmt: skip
-    setup = Setup(PlannerConfig(route=HybridConfig(effort=500, margin=0.04)), FourWheelSteering(), Footprint(), False)
+    setup = Setup(PlannerConfig(route=HybridConfig(effort=500, margin=0.04)), FourWheelSteering(), Footprint())
     at, goal, none = (1.0, 2.0, 0.0), (5.0, 2.0, 0.0), np.empty((0, 2))
 
     def nearest(answer: Any, x: float, y: float) -> float:
@@ -377,6 +417,6 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
     assert step.step(PlanTask("route", at, goal, none, via=((math.nan, 3.0, None),))).reason is Reason.NOT_FINITE
     blocked = step.step(PlanTask("route", at, goal, none, via=((9.0, 3.0, 0.0),)))
     assert (blocked.reason, "waypoint 1 of 2" in blocked.text) == (Reason.GOAL_OUTSIDE, True)
-    lattice = Setup(PlannerConfig(route=LatticeConfig()), FourWheelSteering(), Footprint(), False)
+    lattice = Setup(PlannerConfig(route=LatticeConfig()), FourWheelSteering(), Footprint())
     refused = step.step(PlanTask("route", at, goal, none, lattice, grid, via=((3.0, 3.0, None),)))
     assert refused.reason is Reason.BAD_INPUT

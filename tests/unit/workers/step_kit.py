@@ -8,7 +8,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.deform.config import RsbandConfig
 from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import DeformSetup, DeformTask, PlanTask, Setup, Way
+from monstertruck_planners.manage.exchange import DeformTask, PlanTask, Setup, Way
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.track.config import LqrConfig
 from monstertruck_schemas.base import Pose2D, Twist2D
@@ -34,7 +34,7 @@ def room() -> Grid:
 def deform_tasks() -> list[DeformTask]:
     """Something stands on a straight route, seen three times."""
     poses = np.column_stack((np.arange(1.0, 5.01, 0.05), np.full(81, 1.5), np.zeros(81)))
-    setup = DeformSetup(PlannerConfig(deform=RsbandConfig()), TRUCK, BODY, (0.14, 0.0, 0.0))
+    setup = Setup(PlannerConfig(deform=RsbandConfig()), TRUCK, BODY, (0.14, 0.0, 0.0))
     ranges = np.full(241, np.inf)
     ranges[110:125] = 1.2
     scan = LaserScan(
@@ -46,7 +46,7 @@ def deform_tasks() -> list[DeformTask]:
 
 
 def plan_task() -> PlanTask:
-    setup = Setup(PlannerConfig(route=HybridConfig(effort=1000, margin=0.04)), TRUCK, BODY, timed=False)
+    setup = Setup(PlannerConfig(route=HybridConfig(effort=1000, margin=0.04)), TRUCK, BODY)
     points = np.array([[2.75, 1.5], [2.75, 1.45]])
     return PlanTask("route", (1.0, 1.5, 0.1), (4.5, 1.4, 0.3), points, setup=setup, grid=room())
 
