@@ -14,9 +14,10 @@ from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.deform.api import DeformResult, Guide, Memory, apart
 from monstertruck_planners.deform.band import cover_of
 from monstertruck_planners.deform.config import DeformConfig
+from monstertruck_planners.deform.loosen import loosen
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.hybrid import LEVELS, SKIN, HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
@@ -85,6 +86,7 @@ class Surveyor:
         deep = search.model_copy(update={"margin": config.margin, "effort": DEEP * search.effort})
         self._deep = HybridPlanner(vehicle, deep)
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
+        self._moves = self._deep.car(LEVELS[0]).moves
 
     def begin(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> Cycle | DeformResult:
         """The route cut to the window for one cycle, see ``api.Deformer``, or the result if nothing of it is free.
@@ -178,20 +180,39 @@ class Surveyor:
         goal = band.poses[last].copy()
         if last == len(band.poses) - 1 and not local.final:
             goal[2] += TURNED[failed // PATIENCE % len(TURNED)]
-        reason = Reason.PATH_BLOCKED
+        path, reason = self._way(surroundings, pose, goal, deep=failed % PATIENCE == 1)
+        if path is None:
+            return None, None, reason
+        found = Guide.from_motion(path)
+        rest = band.part(last + 1, len(band.poses)) if last + 1 < len(band.poses) else None
+        return path, found if rest is None else found.then(rest), Reason.OK
+
+    def _way(
+        self, surroundings: DistanceField, pose: Array, goal: Array, *, deep: bool
+    ) -> tuple[MotionPath | None, Reason]:
+        """Path to a goal; a truck nearer to something than the margin first goes away from it."""
+        out = self.loosened(surroundings, pose)
+        if out is not None:
+            pose = out.end
         first, *others = self._planners
-        if failed % PATIENCE == 1:
-            first = self._deep
-        for planner in (first, *others):
+        reason = Reason.PATH_BLOCKED
+        for planner in (self._deep if deep else first, *others):
             result = planner.plan(RouteMap(surroundings), pose, goal)
             if result.path is not None and len(result.path.rows):
-                found = Guide.from_motion(result.path)
-                rest = band.part(last + 1, len(band.poses)) if last + 1 < len(band.poses) else None
-                return result.path, found if rest is None else found.then(rest), Reason.OK
+                return result.path if out is None else out.then(result.path), Reason.OK
             reason = result.reason
             if reason is not Reason.START_BLOCKED and reason is not Reason.GOAL_BLOCKED:
                 break
-        return None, None, reason
+        return None, reason
+
+    def loosened(self, surroundings: DistanceField, pose: Array) -> MotionPath | None:
+        """Way out of the margin of what is too near; None if nothing is, or there is no such way."""
+        if surroundings.free(self.vehicle.footprint, pose[None], self.config.margin)[0]:
+            return None
+        rows = loosen(
+            surroundings.data(), self._planners[0].body, self.cover, pose, self._moves, self.config.margin + SKIN
+        )
+        return MotionPath(pose, rows, self.vehicle.steering, self.vehicle.reference) if len(rows) else None
 
     def cost(self, surroundings: DistanceField, path: MotionPath) -> float:
         """What a path costs, m."""
