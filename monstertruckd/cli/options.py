@@ -41,7 +41,9 @@ def complete_config(incomplete: str) -> list[str]:
 
 
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.")]
-EndpointOption = Annotated[str, typer.Option("--endpoint", "-e", help="Where the robot listens.")]
+EndpointOption = Annotated[
+    str, typer.Option("--endpoint", "-e", help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT.")
+]
 ConfigOption = Annotated[
     Path,
     typer.Option(

@@ -8,7 +8,6 @@ import os
 import re
 import socket
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -19,8 +18,9 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, WallClock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_runtime.station import ClientTls, session_config, station_tls
 from monstertruck_runtime.threads import ThreadHop, in_thread
-from monstertruck_schemas.base import Message, Pose2D, Schema
+from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
@@ -53,14 +53,6 @@ M = TypeVar("M", bound=Message)
 _HOP_DEPTH = 1024
 
 
-class ClientTls(Schema):
-    """Files of a station with its own certificate."""
-
-    ca: Path
-    certificate: Path
-    key: Path
-
-
 class TruckClient:
     """Session with one robot; an async context manager.
 
@@ -74,7 +66,7 @@ class TruckClient:
         role: what it acts as; decides its priority.
         clock: time of stamps and deadlines; its own, robots do not trust it.
         timeout: seconds to wait for the link and for answers.
-        tls: certificate files for ``tls/...`` endpoints.
+        tls: certificate files for ``tls/...`` endpoints; None = those of ``station_tls``.
     """
 
     def __init__(
@@ -106,7 +98,8 @@ class TruckClient:
         """Dial the endpoint.
 
         Raises:
-            NotFoundError: nothing answers there.
+            NotFoundError: nothing answers there, or a file of the certificate is missing.
+            NotPermittedError: others may read the certificate's key.
         """
         try:
             await in_thread(self._open)
@@ -313,26 +306,10 @@ class TruckClient:
             await in_thread(session.close)
 
     def _open(self) -> None:
-        config: dict[str, Any] = {
-            "mode": "client",
-            "connect": {
-                "endpoints": [self.endpoint],
-                "timeout_ms": round(self._timeout * 1000),
-                "exit_on_failure": True,
-            },
-            "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        }
-        if self._tls is not None:
-            config["transport"] = {
-                "link": {
-                    "tls": {
-                        "root_ca_certificate": str(self._tls.ca),
-                        "connect_certificate": str(self._tls.certificate),
-                        "connect_private_key": str(self._tls.key),
-                        "enable_mtls": True,
-                    }
-                }
-            }
+        tls = self._tls
+        if tls is None and self.endpoint.startswith("tls/"):
+            tls = station_tls()
+        config = session_config(self.endpoint, self._timeout, tls)
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:

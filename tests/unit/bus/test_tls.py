@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.client import ClientTls, TruckClient
-from monstertruck_runtime.errors import NotFoundError, TruckError
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.errors import NotFoundError, NotPermittedError, TruckError
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.station import VARIABLE, ClientTls, station_tls
 from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot
@@ -77,3 +78,31 @@ async def test_who_may_do_what(tmp_path: Path):
                 pass
     assert request.source == "ann"
     assert requests.latest is request
+
+
+async def test_a_command_finds_the_stations_certificate_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    await asyncio.to_thread(certificates, tmp_path)
+    for name, file in (("ann.pem", "station.pem"), ("ann.key", "station.key")):
+        (tmp_path / name).rename(tmp_path / file)
+    server = TlsConfig(
+        ca=tmp_path / "ca.pem", certificate=tmp_path / "truck.pem", key=tmp_path / "truck.key", pilots=("ann",)
+    )
+    endpoint = free_endpoint("tls")
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    async with running_robot(endpoint, tls=server) as robot, TruckClient(endpoint=endpoint, timeout=1.0) as client:
+        robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        assert await client.get_retained(GATE) == gate_state(1)
+
+
+def test_a_certificate_that_is_missing_or_open_to_others_is_refused(tmp_path: Path):
+    config = tmp_path / "monstertruckd" / "tls"
+    config.mkdir(parents=True)
+    where = {"XDG_CONFIG_HOME": str(tmp_path)}
+    for name in ("ca.pem", "station.pem", "station.key"):
+        with pytest.raises(NotFoundError, match=f"{name}: not there"):
+            station_tls(where)
+        (config / name).touch(mode=0o644)
+    with pytest.raises(NotPermittedError, match="chmod 600"):
+        station_tls(where)
+    (config / "station.key").chmod(0o600)
+    assert station_tls(where).key == config / "station.key"
