@@ -95,6 +95,25 @@ async def test_ctrl_c_does_the_same_and_says_so(tmp_path: Path):
     assert Reason.CANCELLED.text in (tmp_path / "calibrate.txt").read_text()
 
 
+async def test_kill_9_of_the_daemon_ends_the_wizard_and_leaves_file_intact_and_truck_standing(tmp_path: Path):
+    async with truck_with_a_calibration(tmp_path) as (truck, client, before):
+        wizard = await drive_away(truck, client)
+        await end(truck.daemon, signal.SIGKILL)
+        script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), str(tmp_path / "dev" / "drive")]
+        stopped = await asyncio.to_thread(
+            subprocess.run, script, capture_output=True, text=True, timeout=20, check=False
+        )
+        assert stopped.returncode == 0, f"what the unit does after the daemon's death: {stopped.stderr}"
+        async with asyncio.timeout(30):
+            code = await wizard.wait()
+        assert code not in (0, Reason.INTERNAL.exit_code)
+        said = (tmp_path / "calibrate.txt").read_text()
+        assert "Traceback" not in said
+        assert files(tmp_path) == before
+        truth = await truck.truth()
+    assert abs(truth[-5:, 4]).max() < 0.01
+
+
 async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Path):
     async with truck_with_a_calibration(tmp_path) as (truck, _, before):
         shown = await command(truck, "show")
