@@ -27,7 +27,7 @@ QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
 
 
 class Reference(NamedTuple):
-    """Values at places of a run, all arrays of one shape."""
+    """Values at places of a run, arrays of one shape."""
 
     heading: Array
     """Direction of the body-forward motion, rad: the path's tangent, turned round backwards."""
@@ -39,6 +39,16 @@ class Reference(NamedTuple):
     """Yaw per metre of forward motion, 1/m."""
     curvature: Array
     """Of the path in the direction of travel, 1/m."""
+
+
+class Spot(NamedTuple):
+    """``Reference`` at one place."""
+
+    heading: float
+    yaw: float
+    slip: float
+    turn: float
+    curvature: float
 
 
 class Course:
@@ -73,31 +83,47 @@ class Course:
                 yaw[where], turn[where] = lagged[where], bend[where]
         slip = np.remainder(heading - yaw + math.pi, math.tau) - math.pi
         self._table = Reference(heading, yaw, slip, turn, curvature)
+        self._rows = np.column_stack((self._s, *self._table))
         side = np.tan(slip)
         lever = turn / np.cos(slip)
         self._axles = np.arctan([side + geometry.l_f * lever, side - geometry.l_r * lever])
 
+    @property
+    def places(self) -> Array:
+        """Metres from the run's beginning where the reference was computed: from 0 to the end of the way."""
+        return self._s
+
     def steering(self, s: float) -> Steering:
         """How the axles steer at ``s`` metres."""
-        return self.steerings(np.array([s]))[0]
+        return self._modes(np.array([s]))[0] if self.given else self._default
 
     def steerings(self, s: Array) -> list[Steering]:
         """The same at several places."""
         return self._modes(s) if self.given else [self._default] * len(s)
 
-    def at(self, s: Array | float) -> Reference:
+    def at(self, s: Array) -> Reference:
         """Values at ``s`` metres; outside the run those of its ends."""
         return Reference(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
 
-    def turned(self, s: Array, ahead: float) -> Array:
-        """How far the axles have to turn over the ``ahead`` metres behind each place, rad; the further one's."""
-        change = [np.abs(np.interp(s + ahead, self._s, axle) - np.interp(s, self._s, axle)) for axle in self._axles]
+    def spot(self, s: float) -> Spot:
+        """The same at one place."""
+        last = len(self._rows) - 1
+        i = int(self._s.searchsorted(s, "right")) - 1
+        if not 0 <= i < last:
+            return Spot(*self._rows[min(max(i, 0), last)].tolist()[1:])
+        (begin, *here), (end, *there) = self._rows[i : i + 2].tolist()
+        width, past = end - begin, s - begin
+        return Spot(*[(b - a) / width * past + a for a, b in zip(here, there, strict=True)])
+
+    def turned(self, ahead: float) -> Array:
+        """How far the axles have to turn in the ``ahead`` metres after each of the places, rad; the further one's."""
+        change = [np.abs(np.interp(self._s + ahead, self._s, axle) - axle) for axle in self._axles]
         return np.asarray(np.maximum(*change))
 
     def section_end(self, s: float) -> float:
         """Where the steering changes next, m; the end of the way if it does not."""
-        later = self._changes[self._changes > s]
-        return float(later[0]) if len(later) else self._run.end
+        i = int(self._changes.searchsorted(s, "right"))
+        return float(self._changes[i]) if i < len(self._changes) else self._run.end
 
     def _modes(self, s: Array) -> list[Steering]:
         run = self._run

@@ -66,7 +66,7 @@ class Fuzzy(Law[FuzzyConfig]):
         dx, dy = goal[0] - x, goal[1] - y
         ahead, aside = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
         bearing = math.degrees(math.atan2(aside, ahead))
-        orientation = math.degrees(math.remainder(float(here.course.at(s).yaw) - yaw, math.tau))
+        orientation = math.degrees(math.remainder(here.course.spot(s).yaw - yaw, math.tau))
         direction = (1.0 if abs(bearing) < BEHIND else -1.0) if self._published else run.direction
         inputs = Inputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
         return self._rules.infer(inputs), direction

@@ -17,9 +17,9 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.actuator import Angles, Axles, Pose
 from monstertruck_planners.track.api import Command, TruckState
 from monstertruck_planners.track.config import TrackerConfig
-from monstertruck_planners.track.course import Course, Reference
+from monstertruck_planners.track.course import Course, Spot
 from monstertruck_planners.track.line import MAX_RUNS, Foot, Line, Progress, Run
-from monstertruck_planners.track.speed import wanted_speed
+from monstertruck_planners.track.speed import Pace, wanted_speed
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 
@@ -56,7 +56,7 @@ class Here:
     steering: Steering
     offset: float
     """Distance left of the reference, seen along ``reference.heading``, m."""
-    reference: Reference
+    reference: Spot
     turned: float
     """Yaw less the reference's, rad."""
 
@@ -87,7 +87,7 @@ class Law(ABC, Generic[C]):
         self.period = 1.0 / config.rate
         self.lead = config.dead_time
         """Seconds ahead for which ``steer`` is asked."""
-        self._courses: dict[int, tuple[Run, Course]] = {}
+        self._courses: dict[int, tuple[Run, Course, Pace]] = {}
 
     def reset(self) -> None:
         """See ``Tracker``."""
@@ -144,39 +144,35 @@ class Law(ABC, Generic[C]):
         front, rear = self.geometry.limit_keeping_curvature(front, rear, ahead, behind)
         return float(front), float(rear)
 
-    def course(self, run: Run) -> Course:
-        """Reference of a run, computed once."""
+    def course(self, run: Run) -> tuple[Course, Pace]:
+        """Reference and greatest speeds of a run, computed once."""
         known = self._courses.get(id(run))
         if known is None or known[0] is not run:
             if len(self._courses) >= MAX_RUNS:
                 self._courses.clear()
-            known = self._courses[id(run)] = (run, Course(run, self.geometry, self.config.steering))
-        return known[1]
+            course = Course(run, self.geometry, self.config.steering)
+            known = self._courses[id(run)] = (run, course, Pace(self.config, course))
+        return known[1:]
 
     def _foot(self, state: TruckState, run: Run, s: float) -> Foot:
         low = min(s, run.length)
         return run.project(state.pose[0], state.pose[1], low, min(low + self.config.reach, run.length))
 
     def _here(self, state: TruckState, run: Run, s: float) -> Here:
-        course = self.course(run)
+        course, pace = self.course(run)
         speed = state.speed if state.speed * run.direction > self.config.min_speed else 0.0
-        pose, angles = (
-            self.axles.ahead(state.pose, speed, self.geometry, self.lead)
-            if self.lead
-            else (
-                state.pose,
-                self.axles.angles,
-            )
-        )
+        pose, angles = state.pose, self.axles.angles
+        if self.lead:
+            pose, angles = self.axles.ahead(pose, speed, self.geometry, self.lead)
         foot = run.project(pose[0], pose[1], s, s + self.config.reach)
-        reference = course.at(foot.s)
-        normal = float(reference.heading)
+        reference = course.spot(foot.s)
+        normal = reference.heading
         dx, dy = pose[0] - foot.point[0], pose[1] - foot.point[1]
         return Here(
             pose=pose,
             angles=angles,
             speed=speed or run.direction * self.config.min_speed,
-            wanted=wanted_speed(self.config, state, run, course, s),
+            wanted=wanted_speed(self.config, state, run, pace, s),
             acceleration=self.config.acceleration,
             run=run,
             course=course,
@@ -184,7 +180,7 @@ class Law(ABC, Generic[C]):
             steering=_freed(course, foot.s),
             offset=math.cos(normal) * dy - math.sin(normal) * dx,
             reference=reference,
-            turned=wrap_angle(pose[2] - float(reference.yaw)),
+            turned=wrap_angle(pose[2] - reference.yaw),
         )
 
     def _turning_at_rest(self, state: TruckState, angles: Angles) -> bool:
@@ -212,7 +208,7 @@ class Law(ABC, Generic[C]):
             rear=angles[1],
             progress=progress,
             cross_track=math.cos(foot.tangent) * dy - math.sin(foot.tangent) * dx,
-            heading_error=wrap_angle(state.pose[2] - float(here.course.at(foot.s).yaw)),
+            heading_error=wrap_angle(state.pose[2] - here.course.spot(foot.s).yaw),
             outcome=outcome,
         )
 

@@ -33,6 +33,8 @@ MAX_STEP: Final = 100.0
 MAX_RUNS: Final = 64
 """Runs; each costs some 20 us to prepare."""
 MAX_NAME: Final = 128
+MANY: Final = 40
+"""Steps from which on arrays find the nearest one sooner than floats do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +95,10 @@ class Run:
         lap: bool = False,
     ) -> None:
         steps = np.diff(points, axis=0)
+        lengths, tangents = np.hypot(steps[:, 0], steps[:, 1]), np.arctan2(steps[:, 1], steps[:, 0])
         self._points = points
-        self._steps = steps
-        self._lengths = np.hypot(steps[:, 0], steps[:, 1])
-        self._tangents = np.arctan2(steps[:, 1], steps[:, 0])
-        self._s = np.concatenate(([0.0], np.cumsum(self._lengths)))
+        self._s = np.concatenate(([0.0], np.cumsum(lengths)))
+        self._steps = np.column_stack((points[:-1], steps, lengths, self._s[:-1], tangents))
         self.direction = direction
         self.before = before
         self.length = float(self._s[last])
@@ -118,33 +119,37 @@ class Run:
 
     def at(self, s: float) -> Foot:
         """Point at ``s`` metres."""
-        i = min(int(np.searchsorted(self._s, s, side="right")) - 1, len(self._lengths) - 1)
-        share = (s - self._s[i]) / self._lengths[i]
-        x, y = self._points[i] + share * (self._points[i + 1] - self._points[i])
-        return Foot(s, (float(x), float(y)), float(self._tangents[i]))
-
-    def poses(self, s: Array) -> Array:
-        """Poses of the truck at ``s`` metres, shape (m, 3)."""
-        i = np.clip(np.searchsorted(self._s, s, side="right") - 1, 0, len(self._lengths) - 1)
-        share = ((s - self._s[i]) / self._lengths[i])[:, None]
-        turned = 0.0 if self.direction > 0 else math.pi
-        return np.column_stack(
-            (self._points[i] + share * (self._points[i + 1] - self._points[i]), self._tangents[i] + turned)
-        )
+        i = min(max(int(self._s.searchsorted(s, "right")) - 1, 0), len(self._steps) - 1)
+        x, y, dx, dy, length, begin, tangent = self._steps[i].tolist()
+        share = (s - begin) / length
+        return Foot(s, (x + share * dx, y + share * dy), tangent)
 
     def project(self, x: float, y: float, low: float, high: float) -> Foot:
         """Nearest point between ``low`` and ``high`` metres."""
-        first = max(int(np.searchsorted(self._s, low, side="right")) - 1, 0)
-        end = max(int(np.searchsorted(self._s, high, side="left")), first + 1)
-        step, length = self._steps[first:end], self._lengths[first:end]
-        start, s0 = self._points[first : first + len(step)], self._s[first : first + len(step)]
-        along = ((x - start[:, 0]) * step[:, 0] + (y - start[:, 1]) * step[:, 1]) / length
-        s = np.minimum(np.maximum(s0 + np.minimum(np.maximum(along, 0.0), length), low), high)
-        share = ((s - s0) / length)[:, None]
-        feet = start + share * step
-        best = int(np.argmin(np.hypot(feet[:, 0] - x, feet[:, 1] - y)))
-        px, py = feet[best]
-        return Foot(float(s[best]), (float(px), float(py)), float(self._tangents[first + best]))
+        first = max(int(self._s.searchsorted(low, "right")) - 1, 0)
+        end = max(int(self._s.searchsorted(high, "left")), first + 1)
+        steps = self._steps[first:end]
+        if len(steps) > MANY:
+            steps = steps[_nearest_step(steps, x, y, low, high)]
+        best, foot = math.inf, (0.0, x, y, 0.0)
+        for px, py, dx, dy, length, begin, tangent in steps.tolist():
+            along = ((x - px) * dx + (y - py) * dy) / length
+            along = 0.0 if along < 0.0 else min(along, length)
+            s = min(max(begin + along, low), high)
+            share = (s - begin) / length
+            fx, fy = px + share * dx, py + share * dy
+            gap = math.hypot(fx - x, fy - y)
+            if gap < best:
+                best, foot = gap, (s, fx, fy, tangent)
+        return Foot(foot[0], foot[1:3], foot[3])
+
+
+def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> list[int]:
+    """The one of many steps that comes nearest to a point, as above."""
+    px, py, dx, dy, length, begin, _ = steps.T
+    along = np.minimum(np.maximum(((x - px) * dx + (y - py) * dy) / length, 0.0), length)
+    share = (np.minimum(np.maximum(begin + along, low), high) - begin) / length
+    return [int(np.argmin(np.hypot(px + share * dx - x, py + share * dy - y)))]
 
 
 class Line:
@@ -180,7 +185,10 @@ class Line:
 
     def ahead(self, progress: Progress, horizon: float, count: int) -> Array:
         """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
-        return self.runs[progress.run].poses(np.linspace(progress.s, progress.s + horizon, count))
+        run = self.runs[progress.run]
+        turned = 0.0 if run.direction > 0 else math.pi
+        feet = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
+        return np.array([(*foot.point, foot.tangent + turned) for foot in feet])
 
     def _progress_of(self, points: Array, vertex: int) -> Progress:
         steps = np.diff(points[: vertex + 1], axis=0)
@@ -288,7 +296,7 @@ def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
 def _stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
     """Whether the truck has to come to rest between each two steps."""
     stops = np.diff(directions) != 0.0
-    if steering and len(stops):
+    if len(set(steering)) > 1 and len(stops):
         stops = stops | np.array([_must_stand(a, b) for a, b in pairwise(steering)], np.bool_)
     return np.asarray(stops)
 

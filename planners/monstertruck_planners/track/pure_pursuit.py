@@ -69,7 +69,7 @@ class PurePursuit(Law[PurePursuitConfig]):
     def _hybrid(self, here: Here, ahead: float, aside: float, tangent: float) -> Angles:
         """Turn by the path's own heading at the goal, and go sideways by what is left."""
         distance = max(math.hypot(ahead, aside), LEAST_SQUARE)
-        heading = float(here.course.at(here.s + distance).yaw)
+        heading = here.course.spot(here.s + distance).yaw
         turn = here.run.direction * math.remainder(heading - here.pose[2], math.tau) / distance
         forward = here.run.direction
         # An arc of this turn alone ends half its angle off the present heading.

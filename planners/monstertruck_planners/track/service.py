@@ -34,6 +34,11 @@ LOOKS: Final = 8
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 
+MOVED: Final = 0.01
+"""A truck not armed and moved by more than this may begin its path elsewhere, m."""
+TURNED: Final = 0.02
+"""Or turned by more than this, rad."""
+
 
 class TrackerService:
     """Follows ``plan/path`` by the configured tracker.
@@ -96,6 +101,7 @@ class TrackerService:
         self._followed: Path | None = None
         self._line: Line | None = None
         self._progress = Progress()
+        self._stood = (0.0, 0.0, 0.0)
         self._outcome = Reason.DRIVING
         self._active = False
 
@@ -131,22 +137,35 @@ class TrackerService:
 
     def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
         """Take a new path, or start the present one over: until armed it may still begin anywhere."""
-        restart = not self._active and (self._outcome is not Reason.DRIVING or self._at_start())
-        if armed and not self._active:
+        changed, self._active = armed != self._active, armed
+        if changed and armed:
             self._law.reset()
-        self._active = armed
-        if path is self._followed and not (restart and self._line is not None):
-            return
-        self._followed, self._line, self._outcome = path, None, Reason.DRIVING
+        here = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        if path is self._followed:
+            moved = not armed and self._moved(here)
+            if changed or moved:
+                self._stood = here
+            again = armed or path.closed if changed else moved
+            if self._line is None or not again or not self._to_begin():
+                return
+        self._followed, self._line, self._outcome, self._stood = path, None, Reason.DRIVING, here
         try:
             if path.frame != pose.frame:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
                 raise InputError(msg)
-            start = (pose.pose.x, pose.pose.y, pose.pose.yaw)
-            self._line = Line(path, start, self._config.beyond)
+            self._line = Line(path, here, self._config.beyond)
             self._progress = self._line.start
         except InputError as error:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
+
+    def _to_begin(self) -> bool:
+        """Whether the path has ended or not yet begun."""
+        return self._outcome is not Reason.DRIVING or self._at_start()
+
+    def _moved(self, here: tuple[float, float, float]) -> bool:
+        """Whether the truck is somewhere else than when the path was last looked at, so far as it matters."""
+        x, y, yaw = self._stood
+        return math.hypot(here[0] - x, here[1] - y) > MOVED or abs(math.remainder(here[2] - yaw, math.tau)) > TURNED
 
     def _at_start(self) -> bool:
         return self._line is not None and self._progress == self._line.start

@@ -23,10 +23,10 @@ class Stanley(Law[StanleyConfig]):
     def steer(self, here: Here) -> Angles:
         """Axle angles."""
         if here.steering == "crab":
-            bearing = float(here.reference.slip) - here.turned + self._back(here, 0.0)
+            bearing = here.reference.slip - here.turned + self._back(here, 0.0)
             return bearing, bearing
-        slip = min(max(float(here.reference.slip), -1.0), 1.0)
-        front, rear = self.geometry.steer_for(float(here.reference.turn), slip)
+        slip = min(max(here.reference.slip, -1.0), 1.0)
+        front, rear = self.geometry.steer_for(here.reference.turn, slip)
         front = front - here.turned + self._back(here, self.geometry.l_f)
         rear = rear - here.turned + self._back(here, -self.geometry.l_r)
         forward = here.run.direction > 0
@@ -47,6 +47,6 @@ class Stanley(Law[StanleyConfig]):
     def _by_heading(self, here: Here, x: float) -> Angles:
         """The fixed axle at ``x`` leads: turn the truck so that it goes to its place."""
         wrong = here.turned - self._back(here, x)
-        turn = float(here.reference.turn) - here.run.direction * self.config.heading_gain * wrong
+        turn = here.reference.turn - here.run.direction * self.config.heading_gain * wrong
         _, front, rear = self.geometry.steer_for_twist(1.0, -x * turn, turn)
         return float(front), float(rear)

@@ -28,6 +28,18 @@ def test_projection_looks_only_where_it_is_told():
     assert run.project(5.0, 0.0, 2.0, 2.0).s == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize("low", [0.0, 0.31, 1.7])
+def test_few_and_many_steps_are_searched_alike(low, monkeypatch):
+    run = line(path(figure_eight(count=80))).runs[0]
+    feet = {}
+    for many in (10**6, 0):
+        monkeypatch.setattr("monstertruck_planners.track.line.MANY", many)
+        points = np.random.default_rng(1).uniform(-1.5, 1.5, (200, 2)).tolist()
+        feet[many] = [run.project(x, y, low, low + 2.0) for x, y in points]
+    assert feet[0] == feet[10**6]
+    assert len({foot.s for foot in feet[0]}) > 20
+
+
 def test_a_lap_begins_at_the_truck_and_goes_on_where_it_began():
     lap = line(path(circle(), closed=True), pose=(1.0, 1.0, math.pi / 2))
     assert lap.length == pytest.approx(math.tau, abs=0.02)

@@ -7,12 +7,14 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.actuator import Axles
+from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.course import Course
 from monstertruck_planners.track.error_model import discretise, exponential, riccati
 from monstertruck_planners.track.fuzzy_rules import Inputs, Rules
 from monstertruck_planners.track.ground import Ground
 from monstertruck_planners.track.line import Line
-from tests.unit.planners.kit import STEERING, circle, path, straight
+from monstertruck_planners.track.speed import Pace
+from tests.unit.planners.kit import STEERING, circle, figure_eight, path, straight
 
 
 def course(route, mode="counter", geometry=STEERING):
@@ -61,12 +63,40 @@ def test_the_pose_is_foretold_over_the_dead_time():
 @pytest.mark.parametrize("mode", ["front", "rear", "counter", "hybrid"])
 def test_on_a_circle_the_reference_is_the_steady_turn(mode, direction):
     route = circle(1.0, 0.5, 0.005)
-    found = course(path(route, [direction] * len(route)), mode).at(1.5)
+    found = course(path(route, [direction] * len(route)), mode).spot(1.5)
     assert found.curvature == pytest.approx(1.0, rel=0.01)
-    front, rear = STEERING.steer_for(float(found.turn), float(found.slip))
+    front, rear = STEERING.steer_for(found.turn, found.slip)
     fixed = {"front": rear, "rear": front}.get(mode, front + rear)
     assert fixed == pytest.approx(0.0, abs=4e-3)
     assert direction * STEERING.curvature(front, rear) == pytest.approx(1.0, rel=0.01)
+
+
+def test_one_spot_is_as_one_of_many():
+    found = course(path(figure_eight(), closed=True), "front")
+    places = np.concatenate(
+        (np.random.default_rng(1).uniform(-0.5, found.places[-1] + 0.5, 100), found.places[[0, 7, -1]])
+    )
+    expected = np.column_stack(found.at(places))
+    assert np.array([found.spot(s) for s in places.tolist()]) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_pace_lets_every_curve_ahead_be_reached_slowly_enough():
+    config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, turn_within=0.1, steering_rate=0.5)
+    found = course(path(figure_eight(), closed=True), "front")
+    pace = Pace(config, found)
+    s = found.places
+    speed = np.array([pace.at(place) for place in s.tolist()])
+    curvature = np.maximum(np.abs(found.at(s).curvature), 1e-6)
+    assert (speed**2 * curvature <= config.lateral_acceleration + 1e-9).all()
+    assert (speed * found.turned(config.turn_within) <= config.turn_within * config.steering_rate + 1e-9).all()
+    assert (np.diff(speed**2) >= -2 * config.deceleration * np.diff(s) - 1e-9).all()
+    for i in range(0, len(s), 25):  # and no slower than that
+        bound = np.minimum(
+            config.lateral_acceleration / curvature[i:], (0.05 / np.maximum(found.turned(0.1)[i:], 1e-6)) ** 2
+        )
+        assert speed[i] ** 2 == pytest.approx((bound + 0.1 * (s[i:] - s[i])).min())
+    assert pace.at(-1.0) == speed[0]
+    assert pace.at(s[-1] + 1.0) == speed[-1]
 
 
 def test_points_rounded_to_millimetres_do_not_shake_the_reference():

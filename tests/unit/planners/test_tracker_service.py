@@ -8,6 +8,7 @@ from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.config import PurePursuitConfig
+from monstertruck_planners.track.line import Line
 from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import SECOND, run_virtual
@@ -172,6 +173,31 @@ def test_arming_after_the_end_starts_the_lap_over():
         assert 0.1 < bench.told[-1].along < 1.0
 
     on_bench(scenario, path(circle(0.6), closed=True))
+
+
+@pytest.mark.parametrize("route", [path(straight(1.0)), path(circle(0.6), closed=True)], ids=["open", "closed"])
+def test_while_disarmed_a_path_is_prepared_anew_only_for_a_truck_that_moved(monkeypatch, route):
+    prepared = []
+
+    def line(*arguments):
+        prepared.append(arguments)
+        return Line(*arguments)
+
+    async def scenario(bench):
+        bench.gate(GateMode.ARMED)
+        await until_ended(bench)
+        bench.gate(GateMode.DISARMED)
+        await bench.clock.sleep(0.2)
+        before = len(prepared)
+        await bench.clock.sleep(2.0)
+        assert len(prepared) == before
+        bench.pose = (bench.pose[0] - 0.2, *bench.pose[1:])
+        await bench.clock.sleep(2.0)
+        assert len(prepared) == before + 1
+
+    monkeypatch.setattr("monstertruck_planners.track.service.Line", line)
+    bench = on_bench(scenario, route)
+    assert [reason for reason, _ in bench.events] == [Reason.GOAL_REACHED]
 
 
 def test_a_truck_put_elsewhere_before_arming_starts_there():
