@@ -1,5 +1,6 @@
 """``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
 
+import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,8 @@ from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, com
 from monstertruckd.cli.output import JsonOption, print_json, print_table, remark
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruckd.calibrate.guide import Wizard
@@ -35,20 +38,52 @@ FileOption = Annotated[
 ]  # fmt: skip
 
 
-@app.command()
+@dataclass(frozen=True)
+class _Call:
+    """What every wizard's command is told."""
+
+    robot: str
+    endpoint: str
+    config: Path | None
+    answers: list[str]
+    yes: bool
+    undo: bool
+    json_output: bool
+
+
+def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
+    """Add a command that has the wizard's own options, which ``make`` takes, and those that all share."""
+
+    def command(
+        *,
+        yes: YesOption = False,
+        answer: AnswerOption = None,
+        undo: UndoOption = False,
+        robot: RobotOption = "truck",
+        endpoint: EndpointOption = ENDPOINT,
+        config: FileOption = None,
+        json_output: JsonOption = False,
+        **own: Any,
+    ) -> None:
+        _run(make(**own), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+    mine, shared = (inspect.signature(function).parameters.values() for function in (make, command))
+    together = [*mine, *(parameter for parameter in shared if parameter.kind is not parameter.VAR_KEYWORD)]
+    parameters = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in together]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    command.__doc__ = make.__doc__
+    app.command(make.__name__)(command)
+    return make
+
+
+@_wizard
 def drive(
     runs: Annotated[int, typer.Option(min=3, max=50, help="Taped runs.")] = 4,
     metres: Annotated[float, typer.Option(min=0.5, max=20, help="Length of a run.")] = 2.0,
     tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
     sign_only: Annotated[bool, typer.Option("--sign-only", help="End once it is clear where forward is.")] = False,
-    yes: YesOption = False,
-    answer: AnswerOption = None,
-    undo: UndoOption = False,
-    robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
-    config: FileOption = None,
-    json_output: JsonOption = False,
-) -> None:
+) -> "Wizard":
     """Which way is forward, and how far a turn of the motor goes: runs along a tape.
 
     Asks [b]clear[/b], [b]forward[/b] and, for each run, [b]mark[/b] and [b]distance[/b] (m).
@@ -56,11 +91,10 @@ def drive(
     from monstertruckd.calibrate.catalog import drive_wizard
     from monstertruckd.calibrate.drive import DriveWizard
 
-    wizard = drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
-    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+    return drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
 
 
-@app.command()
+@_wizard
 def steering(
     rough: Annotated[
         bool, typer.Option("--rough", help="Directions and a first centre: before the compass is calibrated.")
@@ -69,14 +103,7 @@ def steering(
     string_error: Annotated[
         float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
     ] = 3.5,
-    yes: YesOption = False,
-    answer: AnswerOption = None,
-    undo: UndoOption = False,
-    robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
-    config: FileOption = None,
-    json_output: JsonOption = False,
-) -> None:
+) -> "Wizard":
     """Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
 
     Asks [b]clear[/b] and, for each string, [b]string[/b] and [b]offset[/b] (cm).
@@ -84,39 +111,23 @@ def steering(
     from monstertruckd.calibrate.catalog import steering_wizard
     from monstertruckd.calibrate.steering import SteeringWizard
 
-    wizard = steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
-    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+    return steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
 
 
-@app.command()
-def compass(
-    yes: YesOption = False,
-    answer: AnswerOption = None,
-    undo: UndoOption = False,
-    robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
-    config: FileOption = None,
-    json_output: JsonOption = False,
-) -> None:
+@_wizard
+def compass() -> "Wizard":
     """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks [b]clear[/b]."""
     from monstertruckd.calibrate.catalog import compass_wizard
 
-    _run(compass_wizard(), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+    return compass_wizard()
 
 
-@app.command()
+@_wizard
 def battery(
     meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent.")] = 0.5,
     meter_digits: Annotated[float, typer.Option(min=0, max=1, help="And the rest of it, V.")] = 0.02,
     fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
-    yes: YesOption = False,
-    answer: AnswerOption = None,
-    undo: UndoOption = False,
-    robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
-    config: FileOption = None,
-    json_output: JsonOption = False,
-) -> None:
+) -> "Wizard":
     """Scale of the battery voltage from a multimeter; nothing moves.
 
     Asks [b]meter[/b] (V) and [b]another[/b] (yes or no), until that is no.
@@ -124,8 +135,7 @@ def battery(
     from monstertruckd.calibrate.battery import BatteryWizard
     from monstertruckd.calibrate.catalog import battery_wizard
 
-    wizard = battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
-    _run(wizard, _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+    return battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
 
 
 @app.command()
@@ -164,19 +174,6 @@ def show(
     remark(f"file: {state['newest']} ({file.change})")
     if "loaded" in state and state["loaded"] != state["newest"]:
         remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What every wizard's command is told."""
-
-    robot: str
-    endpoint: str
-    config: Path | None
-    answers: list[str]
-    yes: bool
-    undo: bool
-    json_output: bool
 
 
 def _run(wizard: "Wizard", call: _Call) -> None:
