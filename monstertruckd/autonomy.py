@@ -24,7 +24,7 @@ from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.yaml_tree import Tree
-from monstertruckd.goal_build import build_goals
+from monstertruckd.goals.build import build_goals
 from monstertruckd.map_service import MapService
 from monstertruckd.paths import PathService, load_path
 from monstertruckd.placed_tracker import TARGET, PlacedTracker

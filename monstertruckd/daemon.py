@@ -26,7 +26,6 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd import goal_rpc
 from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -40,7 +39,8 @@ from monstertruckd.devices import build_drivers, build_monitors
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
-from monstertruckd.goal_service import GoalService
+from monstertruckd.goals import rpc as goal_rpc
+from monstertruckd.goals.service import GoalService
 from monstertruckd.health import ClockService, HealthBoard, MeterService
 from monstertruckd.journal import published
 from monstertruckd.notify import notify_from, status_line

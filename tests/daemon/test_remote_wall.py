@@ -9,8 +9,8 @@ import pytest
 
 from monstertruck_planners.manage.exchange import DeformAnswer, PlanAnswer
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruckd.goal_build import DEFORMER
-from monstertruckd.goal_build import TARGET as PLANNER
+from monstertruckd.goals.build import DEFORMER
+from monstertruckd.goals.build import TARGET as PLANNER
 from monstertruckd.placed_tracker import TARGET as TRACKER
 from monstertruckd.workers.codec import to_json
 from monstertruckd.workers.placement import Placement, Places

@@ -19,7 +19,7 @@ from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.goal_deform import Deformation, told_of
+from monstertruckd.goals.deform import Deformation, told_of
 
 POSES = np.column_stack((np.linspace(0.0, 2.0, 21), np.zeros(21), np.zeros(21)))
 ROUTE = PlanAnswer(Reason.OK, "", POSES, np.ones(21), ("counter",) * 21, 2.0, 2.0)

@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
-from monstertruckd.goal_parts import pose_of
+from monstertruckd.goals.parts import pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]

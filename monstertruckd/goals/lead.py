@@ -13,7 +13,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.goal_parts import Followed, Inputs, Outputs, pose_of
+from monstertruckd.goals.parts import Followed, Inputs, Outputs, pose_of
 
 Array = NDArray[np.float64]
 

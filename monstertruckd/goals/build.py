@@ -15,9 +15,9 @@ from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.goal_deform import Deformation
-from monstertruckd.goal_parts import Inputs, Outputs
-from monstertruckd.goal_service import GoalService
+from monstertruckd.goals.deform import Deformation
+from monstertruckd.goals.parts import Inputs, Outputs
+from monstertruckd.goals.service import GoalService
 from monstertruckd.workers.placement import Places
 
 TARGET: Final = "monstertruckd.workers.planning:PlanningWorker"

@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalControl, GoalRequest, Request
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.goal_service import GoalService
+from monstertruckd.goals.service import GoalService
 
 GOAL: Final = "goal"
 CONTROL: Final = "goal_control"

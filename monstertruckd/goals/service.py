@@ -25,9 +25,9 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.gate.sources import Sequences, refusal
-from monstertruckd.goal_deform import Deformation, told_of
-from monstertruckd.goal_lead import ACTIVE, AT_REST, Lead
-from monstertruckd.goal_parts import Followed, Inputs, Outputs, goal_state, pose_of
+from monstertruckd.goals.deform import Deformation, told_of
+from monstertruckd.goals.lead import ACTIVE, AT_REST, Lead
+from monstertruckd.goals.parts import Followed, Inputs, Outputs, goal_state, pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]

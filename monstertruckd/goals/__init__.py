@@ -1,0 +1,1 @@
+"""Goals in the daemon: requests in, routes planned and deformed elsewhere, paths out."""
