@@ -101,8 +101,11 @@ class TrackerService:
         self._followed: Path | None = None
         self._line: Line | None = None
         self._progress = Progress()
-        self._stood = (0.0, 0.0, 0.0)
+        self._begun: tuple[float, float, float] | None = None
+        """Pose the line was begun from; None for one that may have to be begun anew."""
         self._outcome = Reason.DRIVING
+        self._told = Reason.DRIVING
+        """Outcome of the newest event since the path came or the truck was armed."""
         self._active = False
 
     async def run(self, ready: Ready) -> None:
@@ -137,18 +140,20 @@ class TrackerService:
 
     def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
         """Take a new path, or start the present one over: until armed it may still begin anywhere."""
-        changed, self._active = armed != self._active, armed
-        if changed and armed:
+        idle, self._active = not self._active, armed
+        if armed and idle:
             self._law.reset()
+            self._told = Reason.DRIVING
+        elif not armed and not idle:
+            self._begun = None
         here = (pose.pose.x, pose.pose.y, pose.pose.yaw)
         if path is self._followed:
-            moved = not armed and self._moved(here)
-            if changed or moved:
-                self._stood = here
-            again = armed or path.closed if changed else moved
+            again = idle and (armed or self._moved(here))
             if self._line is None or not again or not self._to_begin():
                 return
-        self._followed, self._line, self._outcome, self._stood = path, None, Reason.DRIVING, here
+        else:
+            self._told = Reason.DRIVING
+        self._followed, self._line, self._outcome, self._begun = path, None, Reason.DRIVING, here
         try:
             if path.frame != pose.frame:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
@@ -163,8 +168,10 @@ class TrackerService:
         return self._outcome is not Reason.DRIVING or self._at_start()
 
     def _moved(self, here: tuple[float, float, float]) -> bool:
-        """Whether the truck is somewhere else than when the path was last looked at, so far as it matters."""
-        x, y, yaw = self._stood
+        """Whether the truck stands elsewhere than where the line was begun, so far as it matters."""
+        if self._begun is None:
+            return True
+        x, y, yaw = self._begun
         return math.hypot(here[0] - x, here[1] - y) > MOVED or abs(math.remainder(here[2] - yaw, math.tau)) > TURNED
 
     def _at_start(self) -> bool:
@@ -215,8 +222,9 @@ class TrackerService:
         )
 
     def _tell(self, command: Command, line: Line, now: int) -> None:
-        if command.outcome is not self._outcome:
-            self._outcome = command.outcome
+        self._outcome = command.outcome
+        if command.outcome is not self._told and (self._active or command.outcome is not Reason.DRIVING):
+            self._told = command.outcome
             severity = Severity.WARNING if command.outcome is Reason.PATH_LOST else Severity.INFO
             self._events(command.outcome, severity, self.name, path=line.name, cross_track=command.cross_track)
         self._tracker.put(
