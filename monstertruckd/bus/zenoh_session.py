@@ -25,6 +25,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic, Writer, alive_key, rpc_key
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
+from monstertruckd.bus.outgoing import Outgoing, Put
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 
@@ -95,8 +96,10 @@ class ZenohBridge:
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             guard = partial(_guarded, failed)
             publishers = await in_thread(partial(self._declare_publishers, self._session))
+            outgoing = Outgoing(self._config.gather_seconds, guard)
             tap = self._bus.tap(
-                partial(self._send, publishers), (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE)
+                partial(self._send, outgoing, publishers),
+                (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE),
             )
             try:
                 async with asyncio.TaskGroup() as calls:
@@ -121,6 +124,7 @@ class ZenohBridge:
                             await failed
             finally:
                 tap.close()
+                outgoing.close()
         finally:
             await self.close()
 
@@ -149,7 +153,7 @@ class ZenohBridge:
         except zenoh.ZError:  # none of them is up
             return False
 
-    def _declare_publishers(self, session: zenoh.Session) -> dict[str, Callable[[bytes], None]]:
+    def _declare_publishers(self, session: zenoh.Session) -> dict[str, Put]:
         """Put functions by topic name."""
         return {
             topic.name: _publisher(session, topic, topic.key(self._robot))
@@ -173,11 +177,11 @@ class ZenohBridge:
         return session.liveliness().declare_token(alive_key(self._robot))
 
     def _send(
-        self, publishers: dict[str, Callable[[bytes], None]], topic: Topic[Any], _message: Message, data: bytes
+        self, outgoing: Outgoing, publishers: dict[str, Put], topic: Topic[Any], _message: Message, data: bytes
     ) -> None:
         if topic.retained:
             self._held[topic.name] = data
-        publishers[topic.name](data)
+        outgoing.send(topic, publishers[topic.name], data)
 
     # Queries
 
@@ -240,7 +244,7 @@ def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:
         query.reply_err(failure(reason, text), encoding="application/json")
 
 
-def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Callable[[bytes], None]:
+def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     """Put function of one topic; a full queue drops the message rather than stalling the loop."""
     if topic.retained:
         return ext.declare_advanced_publisher(
