@@ -5,6 +5,10 @@ place, and the most alike by descriptor. The robot's own surroundings (not one s
 everywhere) are searched for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at
 once; in a wide one it waits until others, found from different places, agree with it (pairwise consistency: Mangelson
 et al. 2018). After the optimisation a closure that the graph resists is taken back.
+
+A place seen again from the other side shows little of what it showed before. At the end of a run (``review``), where
+the drift is small, so that little else is possible, a hit also counts if what must have been in view of the place fits,
+and neither side looked through the other's walls: one such hit proves nothing, so they need witnesses in any window.
 """
 
 import math
@@ -19,11 +23,11 @@ from monstertruck_estimation.slam.descriptor import describe, likeness
 from monstertruck_estimation.slam.frontend import degeneracy, deviations
 from monstertruck_estimation.slam.graph import optimise, residuals, trust
 from monstertruck_estimation.slam.keymap import KeyMap
-from monstertruck_estimation.slam.registration import register
+from monstertruck_estimation.slam.registration import measure, register
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import between, compose, inverse, rotation
-from monstertruck_estimation.slam.submap import merged
-from monstertruck_estimation.slam.visibility import contradiction
+from monstertruck_estimation.slam.se2 import between, compose, inverse, rotation, transform
+from monstertruck_estimation.slam.submap import Submap, merged
+from monstertruck_estimation.slam.visibility import contradiction, in_view
 
 Array = NDArray[np.float64]
 
@@ -59,6 +63,18 @@ FARTHEST: Final = 0.3
 """The fine fit ends this near to the coarse one, m."""
 CONTRADICTION: Final = 0.15
 """Share of the points looked through by scans of the other side, from which a place is another one."""
+PART_SCORE: Final = 0.15
+"""Mean likelihood of surroundings of which only a part was seen before,"""
+PART_OVERLAP: Final = 0.7
+"""share of their points in view of the place that must fit,"""
+PART_POINTS: Final = 20
+"""least number of those,"""
+PART_CONTRADICTION: Final = 0.05
+"""share that may be looked through,"""
+PART_WIDER: Final = (1.0, 2.0)
+"""and how much wider the search is: scans alone drift further than any covariance says."""
+REVIEWED: Final = 250
+"""Key scans from which it begins, at most."""
 RIVAL: Final = 0.9
 """A second place this nearly as good makes the first one worthless."""
 APART: Final = 1.0
@@ -116,13 +132,30 @@ class LoopCloser:
         covariances, far = keymap.drift(newest)
         self._hits = [hit for hit in self._hits if newest - hit.target < FORGET]
         self._tried = {place: when for place, when in self._tried.items() if newest - when < REST}
-        for candidate in self._candidates(keymap, covariances, far):
+        for candidate in self._candidates(keymap, newest, covariances, far):
             self._tried[candidate] = newest
             window = _window(covariances[candidate])
-            hit = self._search(keymap, query, own, candidate, window)
-            if hit is not None and self._believed(keymap, hit, window):
+            hit = self._search(keymap, query, own, newest, candidate, window)
+            sure = window[0] <= SURE[0] and window[1] <= SURE[1]
+            if hit is not None and self._believed(keymap, hit, sure=sure):
                 return True
         return False
+
+    def review(self, keymap: KeyMap) -> bool:
+        """Search from everywhere (seconds of work) for places of which only a part was seen before.
+
+        For the end of a run: what came after a place belongs to its surroundings then, too. True if a closure has moved
+        the poses.
+        """
+        closed = False
+        self._hits.clear()
+        self._tried.clear()
+        count = len(keymap)
+        for at in np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist():
+            hit = self._seen_in_part(keymap, at)
+            closed |= hit is not None and self._believed(keymap, hit, sure=False)
+        self._hits.clear()
+        return closed
 
     def forget(self, kept: NDArray[np.bool_]) -> None:
         """Only the marked key scans are left, with new numbers."""
@@ -130,69 +163,101 @@ class LoopCloser:
         self._tried.clear()
         self._fingerprints = [one for one, left in zip(self._fingerprints, kept.tolist(), strict=False) if left]
 
-    def _candidates(self, keymap: KeyMap, covariances: Array, far: Array) -> list[int]:
+    def _seen_in_part(self, keymap: KeyMap, at: int) -> _Hit | None:
+        """Key scan ``at`` found near the likeliest place before it, if little else is possible."""
+        covariances, far = keymap.drift(at)
+        numbers = self._possible(keymap, at, covariances, far)
+        if not len(numbers):
+            return None
+        place, turn = _window(covariances[numbers[0]])
+        if place > SURE[0] or turn > SURE[1]:
+            return None
+        own = keymap.around(at, QUERY_KEYS, QUERY_REACH)
+        query = _surroundings(keymap, own, at)
+        tries = (
+            self._search(keymap, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True)
+            for wider in PART_WIDER
+        )
+        return next((hit for hit in tries if hit is not None), None)
+
+    def _candidates(self, keymap: KeyMap, newest: int, covariances: Array, far: Array) -> list[int]:
         """At most two key scans: the likeliest by place, and one elsewhere that looks most alike."""
-        newest = len(keymap) - 1
-        off = between(keymap.poses[newest], keymap.poses)
-        distance = np.hypot(off[:, 0], off[:, 1])
-        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), WIDEST[0])
-        possible = (far > keymap.config.local_spread**2) & (distance < VIEW + reach)
-        for place in self._tried:
-            possible &= _distance(keymap, place) > VIEW
-        numbers = np.flatnonzero(possible)
+        numbers = self._possible(keymap, newest, covariances, far)
         if not len(numbers):
             return []
-        cost = distance[numbers] / (VIEW + reach[numbers]) + 0.15 * np.abs(off[numbers, 2])
-        first = int(numbers[np.argmin(cost)])
-        elsewhere = numbers[_distance(keymap, first)[numbers] > VIEW]
+        first = int(numbers[0])
+        elsewhere = np.sort(numbers[_distance(keymap, first)[numbers] > VIEW])
         if not len(elsewhere):
             return [first]
         alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
         best = int(np.argmax(alike))
         return [first, int(elsewhere[best])] if alike[best] > LEAST_LIKENESS else [first]
 
+    def _possible(self, keymap: KeyMap, at: int, covariances: Array, far: Array) -> NDArray[np.intp]:
+        """Key scans before ``at`` that may be near it, though the graph is not sure of them, the likeliest first."""
+        off = between(keymap.poses[at], keymap.poses)
+        distance = np.hypot(off[:, 0], off[:, 1])
+        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), WIDEST[0])
+        possible = (far > keymap.config.local_spread**2) & (distance < VIEW + reach)
+        possible[at:] = False
+        for place in self._tried:
+            possible &= _distance(keymap, place) > VIEW
+        numbers = np.flatnonzero(possible)
+        cost = distance[numbers] / (VIEW + reach[numbers]) + 0.15 * np.abs(off[numbers, 2])
+        return np.asarray(numbers[np.argsort(cost, kind="stable")])
+
     def _search(
-        self, keymap: KeyMap, query: Scan, own: NDArray[np.intp], candidate: int, window: tuple[float, float]
+        self,
+        keymap: KeyMap,
+        query: Scan,
+        own: NDArray[np.intp],
+        at: int,
+        candidate: int,
+        window: tuple[float, float],
+        *,
+        part: bool = False,
     ) -> _Hit | None:
-        """Look for ``query``, the surroundings of the newest key scan, in those of ``candidate``."""
+        """Look for ``query``, the surroundings of key scan ``at``, or a part of it, in those of ``candidate``."""
         self.searches += 1
-        newest = len(keymap) - 1
         window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
         # All of the window, not only what is round the candidate: a place that looks alike must not win by default.
         numbers = keymap.sure(candidate)
         numbers = numbers[~np.isin(numbers, own)]
-        numbers = numbers[_distance(keymap, newest)[numbers] < window[0] + keymap.config.local_reach]
+        numbers = numbers[_distance(keymap, at)[numbers] < window[0] + keymap.config.local_reach]
         if not len(numbers):
             return None
         numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
         submap = keymap.submap(numbers)
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
-        guess = keymap.poses[newest]
-        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, LEAST_SCORE, APART)
+        guess = keymap.poses[at]
+        least = PART_SCORE if part else LEAST_SCORE
+        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, least, APART)
         if peak is None or peak.rival > RIVAL * peak.score:
             return None
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
-        if fit.overlap < LEAST_OVERLAP or ratio < LEAST_RATIO or math.hypot(moved[0], moved[1]) > FARTHEST:
+        if ratio < LEAST_RATIO or math.hypot(moved[0], moved[1]) > FARTHEST:
             return None
         off = keymap.poses[numbers, :2] - fit.pose[:2]
         near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
-        if _contradicted(keymap, own, newest, near, fit.pose):
+        overlap = _overlap_in_view(keymap, near, query, submap, fit.pose) if part else fit.overlap
+        if overlap < (PART_OVERLAP if part else LEAST_OVERLAP):
+            return None
+        if _contradiction(keymap, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
             return None
         origin = int(near[0])
         # The information is about x, y in map; the relation is in the frame of its origin.
         turn = np.eye(3)
         turn[:2, :2] = rotation(keymap.poses[origin, 2])
         covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
-        return _Hit(origin, newest, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
+        return _Hit(origin, at, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
 
-    def _believed(self, keymap: KeyMap, hit: _Hit, window: tuple[float, float]) -> bool:
+    def _believed(self, keymap: KeyMap, hit: _Hit, *, sure: bool) -> bool:
         """Add ``hit`` and what agrees with it to the graph if that is enough, and if the graph bears it."""
         agreeing, against = self._compared(keymap, hit)
         witnesses = [hit, *agreeing]
         self._hits.append(hit)
-        sure = window[0] <= SURE[0] and window[1] <= SURE[1]
         enough = len(witnesses) >= WITNESSES * (1 + against) and _way(keymap, witnesses) >= BASELINE
         if not sure and not enough:
             return False
@@ -253,11 +318,19 @@ def _window(covariance: Array) -> tuple[float, float]:
     return WINDOW * place + MARGIN[0], WINDOW * turn + MARGIN[1]
 
 
-def _contradicted(keymap: KeyMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array) -> bool:
-    """Whether the scans of ``own`` and ``near`` looked through each other's walls, were ``newest`` at ``pose``."""
+def _contradiction(keymap: KeyMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array) -> float:
+    """Share of the points of ``own`` and ``near`` looked through by the others, were ``newest`` at ``pose``."""
     placed = compose(pose, between(keymap.poses[newest], keymap.poses[own]))
     mine, theirs = ([keymap.keys[k].scan for k in numbers] for numbers in (own, near))
-    return contradiction(mine, placed, theirs, keymap.poses[near]) > CONTRADICTION
+    return contradiction(mine, placed, theirs, keymap.poses[near])
+
+
+def _overlap_in_view(keymap: KeyMap, near: NDArray[np.intp], query: Scan, submap: Submap, pose: Array) -> float:
+    """Share of the points of ``query`` at ``pose`` that fit, of those that ``near`` would have seen; 0 if few."""
+    seen = in_view([keymap.keys[k].scan for k in near], keymap.poses[near], transform(pose, query.points))
+    if np.count_nonzero(seen) < PART_POINTS:
+        return 0.0
+    return measure(query.chosen(seen), submap.cloud, pose).overlap
 
 
 def _surroundings(keymap: KeyMap, numbers: NDArray[np.intp], centre: int) -> Scan:

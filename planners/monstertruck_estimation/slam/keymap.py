@@ -122,8 +122,8 @@ class KeyMap:
     def refine(self) -> None:
         """Register all key scans jointly: seconds of work."""
         if len(self) > 1:
-            steady = self.edges.edges().chosen(self.edges.odometry)
-            self.poses = refine(self.keys, self.poses, steady)
+            edges = self.edges.edges()
+            self.poses = refine(self.keys, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
 
     def thin(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
         """Leave out key scans that others stand in for.

@@ -136,6 +136,7 @@ class Mapper:
         """Register all key scans jointly (seconds of work): for the end of a run, or a robot that stands."""
         if len(self.map):
             place = between(self.map.poses[-1], self._pose)
+            self._closer.review(self.map)
             self.map.refine()
             self._pose = compose(self.map.poses[-1], place)
             self._look_around()

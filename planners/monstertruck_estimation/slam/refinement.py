@@ -5,6 +5,7 @@ present poses (one Gauss-Newton step's information and wish) and lets the pose g
 iterative closest point over the whole map (Lu, Milios 1997; Borrmann et al. 2008) with surface elements.
 """
 
+import itertools
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,8 @@ REACH: Final = 4.5
 TURN: Final = 1.0
 SPACING: Final = 1.0
 """Of the key scans on this much way one at most is a partner, beside the neighbours in time, m."""
+STRETCH: Final = 4
+"""Key scans within which a pair takes the place of a loop's relation."""
 LEAST_OVERLAP: Final = 0.4
 FARTHEST: Final = 0.2
 """A pair that wishes to move further than this, m, is not believed in this round."""
@@ -47,18 +50,42 @@ def partners(poses: Array) -> NDArray[np.int64]:
     return np.array(result, dtype=np.int64).reshape(-1, 2)
 
 
-def refine(keys: list[Key], poses: Array, steady: Edges, rounds: int = 8) -> Array:
-    """Poses, shape (n, 3), at which all scans fit each other best; ``steady`` relations (odometry) hold anyway."""
+def refine(keys: list[Key], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:
+    """Poses, shape (n, 3), at which all scans fit each other best.
+
+    Args:
+        keys: the key scans.
+        poses: shape (n, 3), where they are.
+        steady: relations that hold anyway (odometry).
+        loops: relations that hold where no pair of scans takes their place: two views of one place from opposite sides
+            overlap too little to be a pair, and without their closure what follows it would drift away again.
+        rounds: at most.
+    """
     pairs = partners(poses)
     for turn in range(rounds):
         reach = CELL if turn < rounds // 2 else CELL / 2
         wishes = _linearised(keys, poses, pairs, reach)
-        moved = optimise(poses, steady.joined(wishes), iterations=3)
+        missed = loops.chosen(~_covered(loops, wishes))
+        moved = optimise(poses, steady.joined(missed).joined(wishes), iterations=3)
         change = float(np.abs(between(poses, moved)[:, :2]).max())
         poses = moved
         if change < 5e-4 and reach < CELL:
             break
     return poses
+
+
+def _covered(loops: Edges, wishes: Edges) -> NDArray[np.bool_]:
+    """Which of ``loops`` have a wish between key scans less than about ``STRETCH`` from their own at either end."""
+    known = np.unique(_stretches(wishes.origin, wishes.target, 0, 0))
+    result = np.zeros(len(loops), bool)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        result |= np.isin(_stretches(loops.origin, loops.target, i, j), known)
+    return result
+
+
+def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: int) -> NDArray[np.int64]:
+    """One number for the two stretches that a relation joins, each that many further."""
+    return np.asarray((origin // STRETCH + i) * (1 << 32) + target // STRETCH + j)
 
 
 def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:

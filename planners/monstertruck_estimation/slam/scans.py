@@ -68,6 +68,10 @@ class Scan:
         kept = spread(self.points, cell)
         if len(kept) > most:
             kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
+        return self.chosen(kept)
+
+    def chosen(self, kept: NDArray[np.intp] | NDArray[np.bool_]) -> "Scan":
+        """The marked or numbered points."""
         return Scan(self.points[kept], self.normals[kept], self.variances[kept], self.extents[kept])
 
 

@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import between, transform
+from monstertruck_estimation.slam.se2 import between, inverse, transform
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,20 @@ def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses
                 through += counts[0]
                 judged += counts[1]
     return through / judged if judged else 0.0
+
+
+def in_view(viewers: list[Scan], poses: Array, points: Array) -> NDArray[np.bool_]:
+    """Which of ``points``, shape (n, 2), at least one of the scans would have seen: no nearer wall hides them.
+
+    Args:
+        viewers: scans, points in base.
+        poses: shape (m, 3), of ``viewers``, in the frame of ``points``.
+        points: shape (n, 2), m.
+    """
+    seen = np.zeros(len(points), bool)
+    for viewer, pose in zip(viewers, poses, strict=True):
+        _mark_seen(_view(viewer.points), transform(inverse(pose), points), seen)
+    return seen
 
 
 @njit(cache=True)
@@ -72,3 +86,12 @@ def _looked_through(view, points):  # type: ignore[no-untyped-def] # noqa: ANN00
             if r < limit - gap:
                 through += 1
     return through, judged
+
+
+@njit(cache=True)
+def _mark_seen(view, points, seen):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for i in range(points.shape[0]):
+        limit = view[_sector(points[i, 0], points[i, 1])]
+        r = math.hypot(points[i, 0], points[i, 1])
+        if limit > 0 and r < limit + MARGIN + SLACK * r:
+            seen[i] = True

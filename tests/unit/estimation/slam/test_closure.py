@@ -1,0 +1,71 @@
+"""Places of which only a part was seen before, found again at the end of a run."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam.closure import LoopCloser
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.keymap import KeyMap
+from monstertruck_estimation.slam.se2 import between, compose
+from monstertruck_estimation.slam.visibility import in_view
+from tests.unit.estimation.slam.kit import box, drifting, errors, scan
+
+POSTS = ((-1.6, 1.3), (-0.7, -0.2), (0.4, 1.0), (0.9, -2.0), (1.7, 0.3), (2.6, -1.0), (3.4, 1.5), (3.0, 0.5))
+OTHERS = ((-1.3, -1.7), (0.2, 0.2), (0.9, 1.6), (1.6, -0.4), (2.2, 1.1), (2.9, -1.6), (3.7, -0.5))
+
+
+def hall(posts):
+    """A hall with posts, and a second one the way leads through before it comes back."""
+    return [
+        *box(-4.5, -2.4, 4.5, 2.4),
+        *(wall for x, y in posts for wall in box(x, y, x + 0.3, y + 0.2)),
+        *box(9.0, -4.0, 20.0, 4.0),
+    ]
+
+
+def far_round(came_back_to=POSTS):
+    """Key scans of a way out of the hall, round, and back into it from the other side, related by wheels that drift."""
+    out = [(x, -1.0, 0.0) for x in np.arange(1.4, 3.1, 0.4)]
+    turns = np.linspace(-math.pi / 2, math.pi / 2, 40)
+    away = [(9.5 + 4 * math.cos(a), 1.6 * math.sin(a), a + math.pi / 2) for a in turns]
+    back = [(x, 1.0, math.pi) for x in np.arange(3.4, 0.6, -0.4)]
+    truth = np.array(out + away + back)
+    odom = drifting(truth, 0.004, 1.01)
+    keymap = KeyMap(MapperConfig())
+    for k, pose in enumerate(truth):
+        walls = hall(POSTS if k < len(out) + len(away) else came_back_to)
+        keymap.add(scan(walls, pose), k, odom[k])
+        if k:
+            keymap.relate_by_odometry(between(odom[k - 1], odom[k]), np.diag((0.02**2, 0.02**2, 0.004**2)))
+    return keymap, truth
+
+
+def test_the_review_finds_a_place_seen_again_from_the_other_side():
+    keymap, truth = far_round()
+    assert errors(keymap.poses, truth)[-1] > 0.6
+    assert LoopCloser().review(keymap)
+    assert errors(keymap.poses, truth)[-1] < 0.05
+
+
+def test_the_review_leaves_a_place_that_is_another_one():
+    keymap, _ = far_round(came_back_to=OTHERS)
+    before = keymap.poses.copy()
+    assert not LoopCloser().review(keymap)
+    assert keymap.poses == pytest.approx(before)
+
+
+def test_the_joint_registration_keeps_a_closure_that_no_pair_of_scans_shows():
+    keymap, truth = far_round()
+    LoopCloser().review(keymap)
+    keymap.refine()
+    assert errors(keymap.poses, truth)[-1] < 0.05
+
+
+def test_walls_hide_what_is_behind_them():
+    viewer = scan(hall(()), (0.0, 0.0, 0.0))
+    points = np.array(((4.0, 0.0), (4.5, 0.5), (5.5, 0.0), (-3.0, 0.0)))
+    pose = np.array((1.0, 2.0, math.pi / 2))
+    seen = in_view([viewer], pose[None], compose(pose, np.column_stack((points, np.zeros(4))))[:, :2])
+    assert seen.tolist() == [True, True, False, False]
