@@ -17,7 +17,8 @@ from monstertruck_planners.deform.config import DeformConfig
 from monstertruck_planners.deform.loosen import loosen
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.hybrid import LEVELS, SKIN, HybridPlanner
+from monstertruck_planners.route.hunt import LEVELS
+from monstertruck_planners.route.hybrid import SKIN, HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason

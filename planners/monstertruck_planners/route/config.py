@@ -59,6 +59,8 @@ class HybridConfig(DriveCosts):
     kind: Literal["hybrid"] = "hybrid"
     greed: AtLeastOne = 2.0
     """Factor on the heuristics: more finds a first route sooner."""
+    narrow_margin: NotNegative = 0.03
+    """Kept instead of a greater margin where that leaves no way, m."""
     improve: bool = True
     """Shorten the route and look for other ways while there is time."""
 

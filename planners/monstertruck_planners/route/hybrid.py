@@ -1,7 +1,8 @@
 """The main route planner: Hybrid-A* for a first route, then shortening and other ways while there is time. Compiled."""
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +12,8 @@ from monstertruck_planners.route import distance_to_go as togo
 from monstertruck_planners.route import hybrid_search as search
 from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
 from monstertruck_planners.route.config import HybridConfig
+from monstertruck_planners.route.fit import close_slits
+from monstertruck_planners.route.hunt import CHUNK, LEVELS, MOST_NODES, Hunt, Level, Question
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.pricing import Layer
 from monstertruck_planners.route.redraft import redraft
@@ -20,9 +23,6 @@ from monstertruck_planners.route.ways import brush_way, cheapest_new
 from monstertruck_schemas.reasons import Reason
 
 Array = NDArray[np.float64]
-
-CHUNK = 256
-"""Nodes expanded between two looks at the budget."""
 
 CHECK_STEP = 0.01
 """Between two collision checks close to obstacles, m."""
@@ -51,21 +51,45 @@ APART = 2.5
 DETOUR = 1.15
 """Other ways are tried up to this factor on the shortest."""
 
-MOST_NODES = 400_000
+FIRST_LOOK = 512
+"""Nodes expanded coarsely before gaps are measured and the fine search takes its turns."""
+
+GROWTH = 2
+"""Of the nodes expanded in a turn, from one round to the next."""
+
+SLIT = 0.06
+"""Nearer than this and half the footprint's width to obstacles a place may be a slit, m."""
+
+SLIT_SLACK = 0.01
+"""By that much the places and headings looked at may be off the best ones, m."""
+
+SLIT_ROUNDS = 30
+"""Ways looked at for slits."""
+
+SLIT_LANE = 0.35
+"""Looked at on both sides of a way, m."""
+
 EMPTY = np.empty((0, 3))
-HEADINGS = 36
+
+NARROWER = 0.005
+"""From one margin tried to the next, m."""
+
+WIDE_SHARE = 0.5
+"""Of what is left of the budget: for searches with narrower margins."""
+
+NARROW_COST = 1.0
+"""Clearance cost of routes with the narrow margin: they keep it only where they have to, m."""
+
+TRY_NARROWER = (Reason.START_BLOCKED, Reason.GOAL_BLOCKED, Reason.GOAL_UNREACHABLE, Reason.ROUTE_TIMEOUT)
 
 
 @dataclass(frozen=True)
-class Level:
-    """How finely poses are told apart, in turning radii."""
+class Try:
+    """Searching with one of several margins."""
 
-    cell: float
-    move: float
-
-
-LEVELS = (Level(0.35, 0.55), Level(0.15, 0.25))
-"""The second one is for narrow places, when the first finds nothing."""
+    reserve: float
+    """Share of the budget left for the others."""
+    first: bool
 
 
 class HybridPlanner:
@@ -83,9 +107,10 @@ class HybridPlanner:
         self.table = turning_table(vehicle.crab_angle)
         self.body = vehicle.footprint.body()
         self.side = self.body.half_width or self.body.radius
+        self._narrow = [HybridPlanner(vehicle, narrow) for narrow in narrower(self.config)]
 
     def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route of the vehicle's reference point.
+        """Route of the vehicle's reference point; ``statistics["margin"]`` tells the margin it keeps.
 
         Args:
             ground: the map.
@@ -93,14 +118,30 @@ class HybridPlanner:
             goal: the same.
             now: seconds, for the budget; None: the config's ``effort`` limits the work and the result is reproducible.
         """
-        config = self.config
-        budget = Budget(config.budget, now, config.effort)
-        ends = check_ends(
-            ground, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
-        )
+        budget = Budget(self.config.budget, now, self.config.effort)
+        planners, share = [self, *self._narrow], 1.0
+        for planner in planners:
+            share *= WIDE_SHARE
+            last = planner is planners[-1]
+            result = planner.within(budget, ground, start, goal, Try(0.0 if last else share, planner is self))
+            if result.reason not in TRY_NARROWER:
+                break
+        return replace(result, statistics={**result.statistics, "margin": planner.config.margin})
+
+    def within(
+        self, budget: Budget, ground: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: "Try"
+    ) -> RouteResult:
+        """Route with one margin, see ``plan``."""
+        position, yaw, margin = self.config.position_tolerance, self.config.yaw_tolerance, self.config.margin
+        ends = check_ends(ground, self.vehicle, start, goal, position, yaw, margin)
         if isinstance(ends, RouteResult):
             return ends
-        return _Run(self, ground, ends, budget).route()
+        return _Run(self, ground, ends, budget, attempt).route()
+
+    def keeping(self, margin: float) -> "HybridPlanner":
+        """The planner of the greatest margin tried that is not above this one; of the narrowest, if all are."""
+        planners = [self, *self._narrow]
+        return next((planner for planner in planners if planner.config.margin <= margin), planners[-1])
 
     @property
     def tolerance(self) -> float:
@@ -135,11 +176,22 @@ class HybridPlanner:
         return search.Car(radius, crab, weights, swing, np.array(moves), leaps, CHECK_STEP, margin)
 
 
+def narrower(config: HybridConfig) -> list[HybridConfig]:
+    """Settings with the margins that are tried after that of ``config``."""
+    spare = config.margin - config.narrow_margin
+    if spare <= 0.0:
+        return []
+    margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / NARROWER - 1e-6) + 1)[1:].tolist()
+    price = max(config.clearance_cost, NARROW_COST)
+    return [config.model_copy(update={"margin": m, "narrow_margin": m, "clearance_cost": price}) for m in margins]
+
+
 class _Run:
     """One planning request."""
 
-    def __init__(self, planner: HybridPlanner, ground: RouteMap, ends: Ends, budget: Budget) -> None:
+    def __init__(self, planner: HybridPlanner, ground: RouteMap, ends: Ends, budget: Budget, attempt: Try) -> None:
         self.planner, self.vehicle, self.config, self.budget = planner, planner.vehicle, planner.config, budget
+        self.attempt = attempt
         self.table, self.body = planner.table, planner.body
         self.start, self.goal = ends.start, ends.goal
         self.field = ground.field.data()
@@ -149,17 +201,18 @@ class _Run:
         self.car = planner.car(LEVELS[0])
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
+        self.question = Question(
+            self.field, self.body, self.layer, self.table, self.start, self.goal, self.config.greed, budget,
+            self.statistics,
+        )  # fmt: skip
 
     def route(self) -> RouteResult:
         rows = self._direct()
         if rows is None:
             go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-            row, column = self._cell(self.start)
-            if go.cost[row, column] >= togo.FAR:
-                return self._none(Reason.GOAL_UNREACHABLE, "no way is wide enough")
-            rows, reason = self._first(go)
+            rows, reason, text = self._first(go)
             if rows is None:
-                return self._none(reason, "no drivable way found")
+                return self._none(reason, text)
         self.statistics["first_s"] = self.budget.elapsed
         self.statistics["first_length"] = float(np.abs(rows[:, 0]).sum())
         if self.config.improve:
@@ -182,7 +235,7 @@ class _Run:
         side = self.planner.side
         return togo.tolls(
             self.field, self.layer.price, self.factor,
-            self.body.inscribed, side, side + 0.25 * self.vehicle.radius,
+            self.body.inscribed + self.config.margin, side, side + 0.25 * self.vehicle.radius,
         )  # fmt: skip
 
     def _ways(self, allowed: NDArray[np.bool_], stretch: float) -> togo.ToGo:
@@ -190,49 +243,68 @@ class _Run:
         cost, step = togo.spread(self.toll, allowed, *self._cell(self.goal), row * self.toll.shape[1] + column, stretch)
         return togo.ToGo(cost, step, self.toll, self.cell)
 
-    def _nodes(self, level: Level) -> search.Nodes:
-        cell = level.cell * self.vehicle.radius
-        rows, columns = (int(n * self.field.resolution / cell) + 1 for n in self.field.occupied.shape)
-        n = MOST_NODES
-        return search.Nodes(
-            np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n),
-            np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
-            np.zeros((rows, columns, HEADINGS), np.int32), cell, np.zeros(4, np.int64),
-        )  # fmt: skip
-
     def _direct(self) -> Array | None:
         """The best motion without obstacles, if it is free."""
         rows = self.planner.steer.path(self.start, self.goal).rows
         free = search.rows_free(self.field, self.body, self.car, self.start, np.ascontiguousarray(rows), len(rows))
         return np.array(rows) if free else None
 
-    def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason]:
-        for level in LEVELS:
-            rows, reason = self._search(go, level)
-            if rows is not None or reason is Reason.ROUTE_TIMEOUT:
-                return rows, reason
-        whole = self._ways(np.zeros((0, 0), np.bool_), stretch=1e4)
-        return self._search(whole, LEVELS[1])
+    def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason, str]:
+        """A first way: a short coarse search, then gaps are measured, and a fine and the coarse one take turns."""
+        narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
+        if not self._known(go):
+            return narrow
+        coarse = self._hunt(go, LEVELS[0])
+        rows = coarse.go_on(FIRST_LOOK, self.attempt.reserve) if self.attempt.first else None
+        if rows is not None:
+            return rows, Reason.OK, ""
+        if self._close_slits(go):
+            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
+            if not self._known(go):
+                return narrow
+            coarse = self._hunt(go, LEVELS[0])
+        fine = self._hunt(go, LEVELS[1])
+        rows = self._in_turns(fine, coarse)
+        if rows is None and fine.exhausted:
+            fine = self._hunt(self._ways(np.zeros((0, 0), np.bool_), stretch=1e4), LEVELS[2])
+            rows = fine.go_on(MOST_NODES, self.attempt.reserve)
+        if rows is not None:
+            return rows, Reason.OK, ""
+        return None, Reason.GOAL_UNREACHABLE if fine.exhausted else Reason.ROUTE_TIMEOUT, "no drivable way found"
 
-    def _search(
-        self, go: togo.ToGo, level: Level, *, sight: float = np.inf, most: int = MOST_NODES
-    ) -> tuple[Array | None, Reason]:
-        car, nodes = self.planner.car(level), self._nodes(level)
-        field, goal, (x, y, yaw) = self.field, self.goal, self.start
-        greed, bound = self.config.greed, np.inf
-        search.add(field, go, self.table, car, goal, nodes, greed, x, y, yaw, 0.0, -1, search.LEAP, 0.0, bound)
-        status = search.RUNNING
-        while status == search.RUNNING and self.budget.left() > 0.0 and nodes.counts[search.EXPANDED] < most:
-            before = int(nodes.counts[search.EXPANDED])
-            status = search.expand(
-                field, self.body, self.layer, go, self.table, car, goal, nodes, greed, bound, sight, CHUNK
-            )
-            done = int(nodes.counts[search.EXPANDED]) - before
-            self.budget.work += done
-            self.statistics["expanded"] += done
-        if status == search.FOUND:
-            return search.trace(car, goal, nodes), Reason.OK
-        return None, Reason.GOAL_UNREACHABLE if status == search.EXHAUSTED else Reason.ROUTE_TIMEOUT
+    def _hunt(self, go: togo.ToGo, level: Level, sight: float = np.inf) -> Hunt:
+        return Hunt(self.question, self.planner.car(level), go, level, sight)
+
+    def _in_turns(self, fine: Hunt, coarse: Hunt) -> Array | None:
+        quota = FIRST_LOOK
+        while self.budget.left() > self.attempt.reserve and not fine.exhausted:
+            for hunt in (fine, coarse):
+                rows = hunt.go_on(quota, self.attempt.reserve)
+                if rows is not None:
+                    return rows
+            quota *= GROWTH
+        return None
+
+    def _known(self, go: togo.ToGo) -> bool:
+        return bool(go.cost[self._cell(self.start)] < togo.FAR)
+
+    def _close_slits(self, go: togo.ToGo) -> bool:
+        """Close the slits on the shortest way, on that round these, and so on; False if there are none."""
+        lane, looked = np.zeros(self.toll.shape, np.bool_), np.zeros(self.toll.shape, np.bool_)
+        # Without a margin to spare, slits that may do just so are left to the search.
+        margin = self.config.margin + (SKIN if self.config.margin >= SLIT_SLACK else -SLIT_SLACK)
+        wide = self.planner.side + self.config.margin + SLIT
+        ends = self._cell(self.start), self._cell(self.goal)
+        any_closed = False
+        for _ in range(SLIT_ROUNDS):
+            brush_way(lane, go.step, *ends[0], SLIT_LANE / self.cell)
+            if not close_slits(self.field, self.body, margin, self.toll, self.factor, wide, lane, looked):
+                break
+            any_closed = True
+            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
+            if not self._known(go):
+                break
+        return any_closed
 
     def _improve(self, rows: Array) -> Array:
         car = self.car
@@ -310,7 +382,7 @@ class _Run:
             self.statistics["ways"] += 1
             # From far off the goal is not tried directly: that motion would leave the lane.
             near = 3.0 * self.vehicle.radius
-            rows, _ = self._search(self._ways(lane, 1.3), LEVELS[0], sight=near, most=CHUNK)
+            rows = self._hunt(self._ways(lane, 1.3), LEVELS[0], near).go_on(CHUNK)
             yield EMPTY if rows is None else rows
 
     def _draft(self, rows: Array) -> Draft:

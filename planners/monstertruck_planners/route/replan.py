@@ -56,8 +56,10 @@ def plan_through(
     cost, statistics = 0.0, dict[str, float]()
     for number, goal in enumerate(with_headings(here, waypoints), start=1):
         result = leg_planner.plan(ground, here, goal, now)
+        margin = min(statistics.get("margin", math.inf), result.statistics.get("margin", math.inf))
         for name, value in result.statistics.items():
             statistics[name] = statistics.get(name, 0.0) + value
+        statistics["margin"] = margin
         if result.path is None:
             return replace(result, text=f"waypoint {number} of {len(waypoints)}: {result.text}", statistics=statistics)
         legs.append(result.path)
@@ -115,15 +117,16 @@ def replan(
         via: poses of the reference point to be passed before the goal.
     """
     policy = policy or KeepPolicy()
-    kept = None if previous is None else rest_of(planner, ground, previous, pose, goal, policy.reach)
-    if kept is not None and not all(_passes(kept, place) for place in via):
-        kept = None
     stops = [Waypoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
     fresh = plan_through(planner, ground, pose, stops, now) if stops else planner.plan(ground, pose, goal, now)
-    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * planner.cost(ground, kept)):
+    keeper = planner.keeping(fresh.statistics.get("margin", planner.config.margin))
+    kept = None if previous is None else rest_of(keeper, ground, previous, pose, goal, policy.reach)
+    if kept is not None and not all(_passes(kept, place) for place in via):
+        kept = None
+    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * keeper.cost(ground, kept)):
         return replace(fresh, statistics={**fresh.statistics, "kept_route": 0.0})
     return RouteResult(
-        Reason.OK, kept, cost=planner.cost(ground, kept), statistics={**fresh.statistics, "kept_route": 1.0}
+        Reason.OK, kept, cost=keeper.cost(ground, kept), statistics={**fresh.statistics, "kept_route": 1.0}
     )
 
 
