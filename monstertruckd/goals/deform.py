@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
-from monstertruckd.goals.parts import pose_of
+from monstertruckd.goals.parts import level, pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]
@@ -154,6 +154,8 @@ class Deformation:
 
     def _task(self, scan: LaserScan) -> DeformTask | None:
         odometry = self._pose.latest
+        if not level(scan, self._setup.config):
+            return None
         if odometry is None or self._clock.now() - odometry.received > ODOMETRY.fresh_for() * SECOND:
             return None
         grid = None if self._grid is None else self._grid.latest

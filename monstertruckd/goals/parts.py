@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_planners.manage.config import PlannerConfig
 from monstertruck_planners.manage.exchange import Pose
 from monstertruck_planners.manage.mission import Mission
 from monstertruck_runtime.mailbox import Mailbox
@@ -62,6 +63,11 @@ class Followed:
         """Metres driven on it."""
         told = self.told(report)
         return 0.0 if told is None else told.along
+
+
+def level(scan: LaserScan, config: PlannerConfig) -> bool:
+    """Whether a scan lay flat enough to tell of the way, as far as it is known."""
+    return scan.tilt is None or scan.tilt <= config.max_tilt
 
 
 def pose_of(odometry: Odometry) -> Pose:

@@ -27,7 +27,7 @@ from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.gate.sources import Sequences, refusal
 from monstertruckd.goals.deform import Deformation, told_of
 from monstertruckd.goals.lead import ACTIVE, AT_REST, Lead
-from monstertruckd.goals.parts import Followed, Inputs, Outputs, goal_state, pose_of
+from monstertruckd.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
 from monstertruckd.workers.placement import Actor
 
 Array = NDArray[np.float64]
@@ -232,12 +232,13 @@ class GoalService:
         return blocked(self._setup.footprint, way, points, pose)
 
     def _scan(self, now: int) -> Array:
-        """Returns of the newest scan in base; none if it is old."""
+        """Returns of the newest scan in base; none if it is old or tilted."""
         scan = None if self._in.scan is None else self._in.scan.latest
         if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return np.empty((0, 2))
         if scan is not self._scanned:
-            self._scanned, self._points = scan, scan_points(scan, self._setup.lidar)
+            points = scan_points(scan, self._setup.lidar) if level(scan, self._config) else np.empty((0, 2))
+            self._scanned, self._points = scan, points
         return self._points
 
     # Decisions

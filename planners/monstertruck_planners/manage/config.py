@@ -106,6 +106,8 @@ class PlannerConfig(Schema):
     """Metres nearer to the goal along the route than ever before, after which the ladder begins anew"""
     routes: Annotated[int, Field(ge=1)] = 30
     """Routes for one goal at most."""
+    max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
+    """A scan tilted more than this says nothing about the way, rad: it looks over obstacles, or onto the ground"""
     scan_tolerance: Share = 0.08
     """Returns this near to an obstacle of the map are taken for it, m."""
     escape: EscapeConfig = EscapeConfig()

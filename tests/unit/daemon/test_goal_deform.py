@@ -65,7 +65,7 @@ class Stage:
             events=lambda reason, *_, **__: self.events.append(reason),
         )  # fmt: skip
 
-    async def scan(self, count: int = 1) -> None:
+    async def scan(self, count: int = 1, tilt: float | None = None) -> None:
         """Scans at 10 Hz, with poses."""
         for _ in range(count):
             head = {"stamp": self.clock.now(), "received": self.clock.now(), "seq": 0}
@@ -78,7 +78,7 @@ class Stage:
             self.scans.put(
                 LaserScan(
                     **head, frame="lidar", start_angle=0.0, end_angle=1.0, time_increment=0.0, scan_time=0.1,
-                    range_min=0.1, range_max=4.0, ranges=np.ones(2), codes=np.zeros(2, np.uint8),
+                    range_min=0.1, range_max=4.0, ranges=np.ones(2), codes=np.zeros(2, np.uint8), tilt=tilt,
                 )
             )  # fmt: skip
             await self.clock.sleep(0.1)
@@ -111,6 +111,16 @@ def test_setup_and_route_are_sent_once_and_again_after_a_failure():
         assert len(stage.events) == 1
 
     assert play(story).told == [("idle", "free"), ("free", "free"), ("free", "free")]
+
+
+def test_tilted_scans_say_nothing():
+    async def story(stage: Stage) -> None:
+        await stage.scan(2, tilt=0.05)
+        await stage.scan(3, tilt=0.3)
+        await stage.scan()
+        assert len(stage.actor.tasks) == 3
+
+    play(story)
 
 
 def test_the_route_counts_as_blocked_after_a_while_without_a_way_round():
