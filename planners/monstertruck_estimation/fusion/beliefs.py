@@ -39,6 +39,8 @@ WHEELS: Final = slice(11, 14)
 LOCAL: Final = 14
 LATER: Final = slice(15, 18)
 """Place of the scan that is just being taken in."""
+IDENTITY: Final = np.eye(SIZE)
+LARGER: Final = np.eye(SIZE + 3)
 AT_REST: Final = 0.05
 """Standard deviation of the velocity at the start, m/s and rad/s."""
 QUANTUM: Final = (1e-5, 1e-5)
@@ -72,6 +74,20 @@ class Belief:
     nis: float = 0.0
     """Normalised innovation squared of the last update."""
 
+    def estimated(self, mean: Array, covariance: Array, stamp: int | None = None, nis: float | None = None) -> "Belief":
+        """The same with another estimate: what ``dataclasses.replace`` does, in a tenth of its time."""
+        return Belief(
+            self.stamp if stamp is None else stamp,
+            mean,
+            covariance,
+            self.scan,
+            self.wheels,
+            self.gate,
+            self.tilt,
+            self.used,
+            self.nis if nis is None else nis,
+        )
+
 
 def initial(stamp: int, config: FusionConfig) -> Belief:
     """The start: the pose is known by definition, the truck stands."""
@@ -99,7 +115,7 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
     by_pose, by_twist = integration_jacobians((x, y, yaw), vx, vy, wz, span)
     mean[POSE] = integrate((x, y, yaw), vx, vy, wz, span)
     mean[TWIST] *= keep
-    step = np.eye(SIZE)
+    step = IDENTITY.copy()
     step[POSE, POSE], step[POSE, TWIST] = by_pose, by_twist
     step[TWIST, TWIST] *= keep
     like = math.exp(-(math.hypot(vx, vy) / LASTING[0] + abs(wz) / LASTING[1]) * span)
@@ -117,7 +133,7 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
         covariance[NORTH, NORTH] += config.compass.drift**2 * dt
         covariance[LOCAL, LOCAL] += config.compass.local**2 * (1 - like**2)
     covariance[TRIM, TRIM] += (config.wheels.trim_drift**2 if config.wheels is not None else 0.0) * dt
-    return replace(belief, stamp=stamp, mean=mean, covariance=(covariance + covariance.T) / 2)
+    return belief.estimated(mean, (covariance + covariance.T) / 2, stamp)
 
 
 def advanced(belief: Belief, operation: Operation, config: FusionConfig) -> Belief:
@@ -145,12 +161,12 @@ def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> B
     """
     spread = by_state @ belief.covariance
     innovation = spread @ by_state.T + noise
-    gain = np.linalg.solve(innovation, spread).T
-    left = np.eye(len(belief.mean)) - gain @ by_state
+    inverse: Array = np.linalg.inv(innovation) if len(residual) > 1 else 1.0 / innovation
+    gain = spread.T @ inverse
+    left = LARGER[: len(belief.mean), : len(belief.mean)] - gain @ by_state
     covariance = left @ belief.covariance @ left.T + gain @ noise @ gain.T
-    mean = belief.mean + gain @ residual
-    nis = float(residual @ np.linalg.solve(innovation, residual))
-    return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2, nis=nis)
+    nis = float(residual @ inverse @ residual)
+    return belief.estimated(belief.mean + gain @ residual, (covariance + covariance.T) / 2, nis=nis)
 
 
 def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
@@ -164,7 +180,7 @@ def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
 
 
 def _wheels(belief: Belief, way: WheelWay, config: FusionConfig) -> Belief:
-    slip = config.slip
+    slip, used = config.slip, belief.used
     if belief.wheels == way.since:
         level = np.array((*_level(belief), 1.0))
         delta, dt = way.delta * level, (way.stamp - way.since) / SECOND
@@ -177,8 +193,9 @@ def _wheels(belief: Belief, way: WheelWay, config: FusionConfig) -> Belief:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
         belief = updated(belief, residual, by_state, noise)
         if not way.slipping:
-            belief = replace(belief, used={**belief.used, "drive": way.stamp})
-    return replace(_cloned(belief, WHEELS), wheels=way.stamp)
+            used = {**used, "drive": way.stamp}
+    mean, covariance = _cloned(belief, WHEELS)
+    return replace(belief, mean=mean, covariance=covariance, wheels=way.stamp, used=used)
 
 
 def _level(belief: Belief) -> tuple[float, float]:
@@ -204,7 +221,7 @@ def _scan(belief: Belief, way: ScanWay, config: FusionConfig) -> Belief:
     by_state[:, SCAN], by_state[:, LATER] = between_jacobians(earlier, later)
     place, turn = config.scans.drift
     noise = np.diag((place**2, place**2, turn**2))
-    joint = updated(replace(belief, mean=mean, covariance=covariance), residual, by_state, noise)
+    joint = updated(belief.estimated(mean, covariance), residual, by_state, noise)
     kept = np.r_[0:SIZE]
     kept[SCAN] = np.r_[LATER]
     return replace(
@@ -226,19 +243,18 @@ def _turned(covariance: Array, yaw: float) -> Array:
 
 def _marked(belief: Belief, stamp: int, noise: Array) -> Belief:
     """The pose as a scan sees it becomes the clone of the scan."""
-    belief = _cloned(belief, SCAN)
-    covariance = belief.covariance.copy()
-    covariance[SCAN, SCAN] += _turned(noise, float(belief.mean[YAW]))
-    return replace(belief, covariance=covariance, scan=stamp)
+    mean, covariance = _cloned(belief, SCAN)
+    covariance[SCAN, SCAN] += _turned(noise, float(mean[YAW]))
+    return replace(belief, mean=mean, covariance=covariance, scan=stamp)
 
 
-def _cloned(belief: Belief, clone: slice) -> Belief:
-    """The pose as it is now becomes the clone."""
+def _cloned(belief: Belief, clone: slice) -> tuple[Array, Array]:
+    """Mean and covariance with the pose as it is now as the clone."""
     mean, covariance = belief.mean.copy(), belief.covariance.copy()
     mean[clone] = mean[POSE]
     covariance[clone, :] = covariance[POSE, :]
     covariance[:, clone] = covariance[:, POSE]
-    return replace(belief, mean=mean, covariance=covariance)
+    return mean, covariance
 
 
 def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 MARGIN: Final = (0.1, 0.1)
 """By which two scans may be wrong beside that, m and rad."""
+REDONE: Final = 6
+"""Readings that one estimate redoes at most, about a millisecond; what follows waits for the next."""
 NAMES: Final = ("drive", "steering", "compass", "tilt", "lidar")
 
 
@@ -67,6 +69,7 @@ class Fusion:
         self._correction = Correction(config.slew, math.inf, config.settle)
         self._left_out: Counter[str] = Counter()
         self._changes: deque[Change] = deque()
+        self._was_disturbed = False
 
     # What comes in
 
@@ -115,14 +118,11 @@ class Fusion:
         )
         if self._config.compass is None:
             heading = replace(heading, disturbed=True)
-        before = self._disturbed
-        if not self._insert(heading):
+        in_time = self._insert(heading)
+        if not in_time:
             self._left_out["compass: too late"] += 1
-        elif self._disturbed and not before and self._history is not None:
-            # A magnet comes nearer before it is noticed.
-            self._history.rewrite(0, _disturbed)
-            self._slip.forget_headings()
-        elif heading.field is not None and not heading.disturbed and not self._disturbed:
+        self._look_for_disturbance()
+        if in_time and heading.field is not None and not heading.disturbed and not self._disturbed:
             self._heed(self._slip.heading(attitude.stamp, heading.yaw))
         else:
             self._slip.forget_headings()
@@ -147,7 +147,7 @@ class Fusion:
             self._left_out["lidar: against the wheels when it has just been blind"] += 1
             return
         history = self._begin(way.since)
-        if history.before(way.stamp).scan != way.since:
+        if history.scan_before(way.stamp) != way.since:
             # The clone of the earlier pose has to be made where it was.
             self._insert(ScanMark(way.since, way.covariance))
         if not self._insert(way):
@@ -178,10 +178,20 @@ class Fusion:
         """What the filter believes at its newest measurement."""
         return None if self._history is None else self._history.newest
 
+    @property
+    def waiting(self) -> int:
+        """Readings that wait to be redone: those that came late, and what followed them."""
+        return 0 if self._history is None else self._history.waiting
+
     def estimate(self, now: int) -> Estimate | None:
-        """Pose at ``now`` (ns), continuous over corrections; None before the first reading."""
+        """Pose at ``now`` (ns), continuous over corrections; None before the first reading.
+
+        Every call redoes ``REDONE`` of the readings that wait for it.
+        """
         if self._history is None:
             return None
+        self._history.catch_up(REDONE)
+        self._look_for_disturbance()
         belief, config = self._history.newest, self._config
         moved = max((belief.used[name] for name in MOVED_BY if name in belief.used), default=belief.stamp)
         last = max(moved, belief.stamp)
@@ -245,6 +255,13 @@ class Fusion:
     @property
     def _disturbed(self) -> bool:
         return self._history is not None and self._history.newest.gate.disturbed
+
+    def _look_for_disturbance(self) -> None:
+        """Take back headings from before a disturbance was noticed: a magnet comes nearer before that."""
+        if self._disturbed and not self._was_disturbed and self._history is not None:
+            self._history.rewrite(0, _disturbed)
+            self._slip.forget_headings()
+        self._was_disturbed = self._disturbed
 
     def _heed(self, change: Change | None) -> None:
         if change is None:

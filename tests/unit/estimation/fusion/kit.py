@@ -106,6 +106,11 @@ class Rig:
             self.waiting.append(scan_motion(since, self.now, delta, noise))
         self.last = (self.now, place)
 
+    def settle(self):
+        """Estimates until nothing waits to be redone."""
+        while self.fusion.waiting:
+            self.fusion.estimate(self.now)
+
     @property
     def estimate(self):
         return self.shown[-1]

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import hypothesis.strategies as st
 import numpy as np
@@ -63,9 +64,66 @@ def test_the_order_in_which_measurements_come_does_not_matter(drawn, random):
     for shuffled in (made, random.sample(made, len(made))):
         history = History(initial(SECOND, CONFIG), lambda belief, op: advanced(belief, op, CONFIG), 10**12)
         assert all(history.insert(operation) for operation in shuffled)
+        history.catch_up(history.waiting)
         histories.append(history.newest)
     assert histories[0].mean == pytest.approx(histories[1].mean, abs=0.0)
     assert histories[0].covariance == pytest.approx(histories[1].covariance, abs=0.0)
+
+
+def counted():
+    """A history of thirty headings, a tenth of a second apart, and what it has advanced by."""
+    calls = []
+
+    def advance(belief, operation):
+        calls.append(operation)
+        return advanced(belief, operation, CONFIG)
+
+    history = History(initial(SECOND, CONFIG), advance, 10**12)
+    for k in range(30):
+        history.insert(Heading(SECOND + k * SECOND // 10, 0.1))
+    calls.clear()
+    return history, calls
+
+
+def flagged(operation):
+    return replace(operation, disturbed=True)
+
+
+def test_what_is_rewritten_is_redone_a_few_at_a_time_and_then_takes_over():
+    (history, calls), (at_once, _) = counted(), counted()
+    before = history.newest
+    history.rewrite(2 * SECOND, flagged)
+    at_once.rewrite(2 * SECOND, flagged)
+    at_once.catch_up(at_once.waiting)
+    assert not calls
+    for done in (7, 14):
+        history.catch_up(7)
+        assert len(calls) == done
+        assert history.newest is before
+    history.catch_up(7)
+    assert (len(calls), history.waiting) == (19, 0)
+    assert history.newest.mean == pytest.approx(at_once.newest.mean, abs=0.0)
+    assert history.newest.gate.disturbed
+    assert not before.gate.disturbed
+
+
+def test_while_something_waits_the_belief_goes_on_as_it_was():
+    (history, calls), (at_once, _) = counted(), counted()
+    for one in (history, at_once):
+        one.rewrite(2 * SECOND, flagged)
+    at_once.catch_up(at_once.waiting)
+    history.catch_up(7)
+    calls.clear()
+    for one in (history, at_once):
+        assert one.insert(Heading(4 * SECOND, 0.1))
+        assert one.insert(Heading(3 * SECOND + 1, 0.1))
+    assert len(calls) == 1
+    assert history.newest.stamp == 4 * SECOND
+    assert not history.newest.gate.disturbed
+    for one in (history, at_once):
+        one.catch_up(one.waiting)
+    assert history.newest.covariance == pytest.approx(at_once.newest.covariance, abs=0.0)
+    assert history.newest.gate == at_once.newest.gate
 
 
 def test_what_is_before_the_horizon_is_forgotten():

@@ -4,8 +4,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from monstertruck_estimation.fusion import estimator
 from monstertruck_estimation.fusion.config import SlipConfig
-from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.fusion.estimator import REDONE, Fusion
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, scan_motion, wander
 from tests.unit.estimation.kit import CHASSIS, drive_feedback, servo_feedback
@@ -88,6 +89,32 @@ def test_slip_that_the_scans_show_costs_little():
 
     assert error(ALL) < 0.05
     assert error(("wheels",)) > 0.2
+
+
+@pytest.mark.parametrize("trouble", ["slip", "magnet"])
+def test_no_call_redoes_more_than_a_few_readings(trouble, monkeypatch):
+    """At the onset of slip, or of a disturbance, a second and a half of readings is redone: over several estimates."""
+    calls, spent, waited = [], [], []
+    advance = estimator.advanced
+    monkeypatch.setattr(estimator, "advanced", lambda *given, **more: calls.append(1) or advance(*given, **more))
+    rig = Rig(ALL)
+    for name in ("observe_drive", "observe_attitude", "observe_scan", "estimate"):
+        call = getattr(rig.fusion, name)
+
+        def counted(*given, call=call):
+            calls.clear()
+            result = call(*given)
+            spent.append(len(calls))
+            waited.append(rig.fusion.waiting)
+            return result
+
+        monkeypatch.setattr(rig.fusion, name, counted)
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    setattr(rig, trouble, 1.8)
+    rig.drive(0.3, 0.0, 0.0, 2.0)
+    assert max(waited) > 2 * REDONE, "there was more to redo than one call may"
+    assert max(spent) <= REDONE
+    assert waited[-1] <= REDONE
 
 
 def test_wheels_that_slip_do_not_count_as_a_source():
@@ -190,6 +217,7 @@ def test_late_measurements_give_what_punctual_ones_give():
         for motion in rig.waiting:
             rig.fusion.observe_scan(motion)
         rig.waiting.clear()
+        rig.settle()
     assert late.fusion.belief.mean == pytest.approx(early.fusion.belief.mean, abs=1e-9)
     assert late.fusion.belief.covariance == pytest.approx(early.fusion.belief.covariance, abs=1e-12)
 

@@ -72,6 +72,7 @@ def test_headings_before_a_disturbance_was_noticed_are_not_believed():
     assert not rig.fusion.standing().disturbed
     disturbed(rig, 0.1, magnet=0.24, field=FIELD * 1.1)
     assert rig.fusion.standing().disturbed
+    rig.settle()
     assert abs(rig.fusion.belief.mean[2]) < 0.5 * abs(crept)
 
 
