@@ -161,7 +161,7 @@ def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> B
     """
     spread = by_state @ belief.covariance
     innovation = spread @ by_state.T + noise
-    inverse: Array = np.linalg.inv(innovation) if len(residual) > 1 else 1.0 / innovation
+    inverse: Array = np.asarray(np.linalg.inv(innovation), np.float64) if len(residual) > 1 else 1.0 / innovation
     gain = spread.T @ inverse
     left = LARGER[: len(belief.mean), : len(belief.mean)] - gain @ by_state
     covariance = left @ belief.covariance @ left.T + gain @ noise @ gain.T
