@@ -66,8 +66,8 @@ SLIT_SLACK = 0.01
 SLIT_ROUNDS = 30
 """Ways looked at for slits."""
 
-SLIT_LANE = 0.35
-"""Looked at on both sides of a way, m."""
+SLIT_LANE = 0.15
+"""Looked at on both sides of a way on which there is a slit, m."""
 
 EMPTY = np.empty((0, 3))
 
@@ -294,12 +294,13 @@ class _Run:
         # Without a margin to spare, slits that may do just so are left to the search.
         margin = self.config.margin + (SKIN if self.config.margin >= SLIT_SLACK else -SLIT_SLACK)
         wide = self.planner.side + self.config.margin + SLIT
-        ends = self._cell(self.start), self._cell(self.goal)
         any_closed = False
         for _ in range(SLIT_ROUNDS):
-            brush_way(lane, go.step, *ends[0], SLIT_LANE / self.cell)
-            if not close_slits(self.field, self.body, margin, self.toll, self.factor, wide, lane, looked):
-                break
+            for width in (0.0, SLIT_LANE / self.cell):
+                brush_way(lane, go.step, *self._cell(self.start), width)
+                closed = close_slits(self.field, self.body, margin, self.toll, self.factor, wide, lane, looked)
+                if not closed and not width:
+                    return any_closed
             any_closed = True
             go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
             if not self._known(go):
