@@ -63,6 +63,9 @@ SLIT = 0.06
 SLIT_SLACK = 0.01
 """By that much the places and headings looked at may be off the best ones, m."""
 
+PLAY = 0.005
+"""Needed in a slit beyond the margin on both sides: with less no search finds the way through, m."""
+
 SLIT_ROUNDS = 30
 """Ways looked at for slits."""
 
@@ -292,7 +295,7 @@ class _Run:
         """Close the slits on the shortest way, on that round these, and so on; False if there are none."""
         lane, looked = np.zeros(self.toll.shape, np.bool_), np.zeros(self.toll.shape, np.bool_)
         # Without a margin to spare, slits that may do just so are left to the search.
-        margin = self.config.margin + (SKIN if self.config.margin >= SLIT_SLACK else -SLIT_SLACK)
+        margin = self.config.margin + (PLAY if self.config.margin >= SLIT_SLACK else -SLIT_SLACK)
         wide = self.planner.side + self.config.margin + SLIT
         any_closed = False
         for _ in range(SLIT_ROUNDS):
