@@ -27,6 +27,8 @@ from monstertruck_schemas.reasons import Reason
 from navigation_parts import Options, Part, strict
 
 RADIUS_4WS, CRAB = 0.378, 0.4
+WALL = 0.9
+"""Radius of a ring of wall round a goal, m."""
 RUNS = 7
 SECONDS = 1.0
 
@@ -85,6 +87,13 @@ def run(options: Options) -> Part:
                 flush=True,
             )
         refuse(part, name, planners["2ws"], ground, query, world)
+        walled = RouteMap.from_cells(
+            np.where(walled_in(occupied, resolution, query.goal), 100, 0).astype(np.int8), resolution
+        )
+        since = time.thread_time()
+        result = planners["2ws"].plan(walled, query.start, query.goal, time.thread_time)
+        part.add(f"unreachable_ms_{name}", (time.thread_time() - since) * 1e3, 2000.0)
+        part.add(f"unreachable_not_told_{name}", int(result.reason is not Reason.GOAL_UNREACHABLE), 0)
     sum_up(part, rows)
     (options.out / "routes.json").write_text(json.dumps(rows, indent=1))
     draw(options, rows)
@@ -133,6 +142,13 @@ def refuse(part: Part, name: str, planner, ground, query: Query, world) -> None:
         if result.reason not in reasons:
             part.add(f"wrong_reason_{name}_{result.reason.value}", 1, 0)
     part.add(f"refused_ms_{name}", worst * 1e3, 100.0)
+
+
+def walled_in(occupied, resolution, goal):  # noqa: ANN001, ANN201
+    """The map with a ring of wall round a goal."""
+    rows, columns = np.indices(occupied.shape)
+    away = np.hypot((columns + 0.5) * resolution - goal[0], (rows + 0.5) * resolution - goal[1])
+    return occupied | (np.abs(away - WALL) < resolution)
 
 
 def middle_of_a_square(world):  # noqa: ANN001, ANN201
