@@ -37,7 +37,7 @@ class Link:
         self._hang_up = hang_up
         self._buffer = bytearray()
         self._lost: str | None = None
-        self._waiter: asyncio.Future[None] | None = None
+        self._waiting: Waiting | None = None
         self._due: float | None = None
         """Loop time at which the present wait has lasted too long."""
         self._alarm: asyncio.TimerHandle | None = None
@@ -75,8 +75,7 @@ class Link:
         Raises:
             DeviceLostError: the link is down.
         """
-        if self._lost is not None:
-            raise DeviceLostError(f"{self.name}: {self._lost}")
+        self._require_up()
         self._transmit(data)
 
     async def read(self, within: float | None = None) -> bytes:
@@ -134,6 +133,19 @@ class Link:
         del self._buffer[: at + len(end)]
         return data
 
+    def take(self, count: int) -> bytes | None:
+        """``count`` received bytes; None if there are not as many.
+
+        Raises:
+            DeviceLostError: there are not as many, and the link is down.
+        """
+        if len(self._buffer) < count:
+            self._require_up()
+            return None
+        data = bytes(self._buffer[:count])
+        del self._buffer[:count]
+        return data
+
     def discard(self) -> int:
         """Throw away what was received and not read; returns how many bytes."""
         count = len(self._buffer)
@@ -153,20 +165,37 @@ class Link:
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
+    def begin_wait(self, waiting: "Waiting", due: float | None) -> None:
+        """Tell ``waiting`` of the next bytes or the loss; or at ``due``, loop time, that it has waited too long.
+
+        A time limit is one timer for many waits, set anew only when it rings.
+
+        Raises:
+            RuntimeError: somebody waits already.
+        """
+        if self._waiting is not None:
+            raise RuntimeError(f"{self.name}: two readers")
+        self._waiting, self._due = waiting, due
+        if due is not None and (self._alarm is None or self._alarm.when() > due):
+            self._set_alarm(asyncio.get_running_loop(), due)
+
+    def end_wait(self) -> None:
+        """Tell nobody any more."""
+        self._waiting = self._due = None
+
     async def _more(self, due: float | None = None) -> None:
-        """Wait until something comes; a time limit is one timer for many waits, set anew only when it rings."""
+        """Wait until something comes."""
+        self._require_up()
+        waiter = _Sleeper()
+        self.begin_wait(waiter, due)
+        try:
+            await waiter.woken
+        finally:
+            self.end_wait()
+
+    def _require_up(self) -> None:
         if self._lost is not None:
             raise DeviceLostError(f"{self.name}: {self._lost}")
-        if self._waiter is not None:
-            raise RuntimeError(f"{self.name}: two readers")
-        loop = asyncio.get_running_loop()
-        self._waiter, self._due = loop.create_future(), due
-        if due is not None and (self._alarm is None or self._alarm.when() > due):
-            self._set_alarm(loop, due)
-        try:
-            await self._waiter
-        finally:
-            self._waiter = self._due = None
 
     def _set_alarm(self, loop: asyncio.AbstractEventLoop, due: float) -> None:
         if self._alarm is not None:
@@ -175,16 +204,43 @@ class Link:
 
     def _ring(self, loop: asyncio.AbstractEventLoop) -> None:
         self._alarm = None
-        if self._due is None or self._waiter is None:
+        if self._due is None or self._waiting is None:
             return
         if loop.time() < self._due:
             self._set_alarm(loop, self._due)
-        elif not self._waiter.done():
-            self._waiter.set_exception(TimeoutError())
+        else:
+            self._waiting.late()
 
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        if self._waiting is not None:
+            self._waiting.news()
+
+
+class Waiting(Protocol):
+    """Who waits at a link."""
+
+    def news(self) -> None:
+        """Bytes came, or the link is lost."""
+        ...
+
+    def late(self) -> None:
+        """The wait has lasted too long."""
+        ...
+
+
+class _Sleeper:
+    """A coroutine that waits."""
+
+    def __init__(self) -> None:
+        self.woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def news(self) -> None:
+        if not self.woken.done():
+            self.woken.set_result(None)
+
+    def late(self) -> None:
+        if not self.woken.done():
+            self.woken.set_exception(TimeoutError())
 
 
 def _nothing() -> None:

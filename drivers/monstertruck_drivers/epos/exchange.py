@@ -1,6 +1,5 @@
 """The byte handshake of the EPOS over a link: one exchange at a time, with its time-outs and recovery."""
 
-import asyncio
 from contextlib import suppress
 
 from monstertruck_drivers.epos.objects import Entry, abort_text
@@ -24,6 +23,7 @@ from monstertruck_drivers.epos.protocol import (
     write_request,
 )
 from monstertruck_drivers.link import Link
+from monstertruck_drivers.talk import Need, Steps, Talk
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 
@@ -78,7 +78,7 @@ class Exchanger:
         self._link = link
         self._clock = clock
         self._node = node
-        self._flight: asyncio.Task[Frame | None] | None = None
+        self._flight: Talk[Frame | None] | None = None
         self.quiet_until = quiet_until
         """Instant from which the controller listens again; in the past while all is well."""
         self.strange = b""
@@ -98,7 +98,7 @@ class Exchanger:
             DeviceTimeoutError, ProtocolError: no usable answer in ``attempts`` tries.
             DeviceLostError: the link is down.
         """
-        words = (await self._answer(read_request(entry, self._node), str(entry), attempts)).words
+        words = (await self._answer(read_request(entry, self._node), entry, attempts)).words
         if len(words) != 4:
             raise ProtocolError(f"{self._link.name}: {entry}: answer of {len(words)} words")
         return entry.decode(join(words[2], words[3]))
@@ -110,7 +110,7 @@ class Exchanger:
             ValueError: ``value`` does not fit the object.
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
-        await self._answer(write_request(entry, value, self._node), f"{entry} = {value}", attempts)
+        await self._answer(write_request(entry, value, self._node), entry, attempts, value)
 
     async def read_long(self, entry: Entry) -> bytes:
         """Raw bytes of an object of more than 32 bits, by segments.
@@ -118,10 +118,10 @@ class Exchanger:
         Raises:
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
-        await self._answer(segmented_read_request(entry, self._node), str(entry), 1)
+        await self._answer(segmented_read_request(entry, self._node), entry, 1)
         data, toggle = b"", False
         for _ in range(SEGMENT_LIMIT):
-            answer = await self._answer(segment_request(toggle), str(entry), 1)
+            answer = await self._answer(segment_request(toggle), entry, 1)
             try:
                 segment = decode_segment(answer.words[2:])
             except FrameError as error:
@@ -142,16 +142,15 @@ class Exchanger:
 
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
-        if self._flight is not None and not self._flight.done():
-            await asyncio.wait([self._flight])
+        if self._flight is not None:
+            await self._flight.end()
 
     async def close(self) -> None:
         """Give up an exchange that is still under way."""
         if self._flight is not None:
             self._flight.cancel()
-            await self.finish()
 
-    async def _answer(self, request: Frame, subject: str, attempts: int) -> Frame:
+    async def _answer(self, request: Frame, entry: Entry, attempts: int, value: int | None = None) -> Frame:
         for left in reversed(range(attempts)):
             try:
                 frame = await self._transact(request)
@@ -161,6 +160,7 @@ class Exchanger:
             else:
                 assert frame is not None
                 if code := error_of(frame):
+                    subject = entry if value is None else f"{entry} = {value}"
                     raise ObjectError(f"{self._link.name}: {subject}", code)
                 return frame
         raise ValueError("at least one attempt")
@@ -168,12 +168,11 @@ class Exchanger:
     async def _transact(self, request: Frame, *, answered: bool = True) -> Frame | None:
         await self.finish()
         await self.settle()
-        self._flight = flight = asyncio.create_task(self._run(request, answered))
-        flight.add_done_callback(_retrieve)
+        self._flight = flight = Talk(self._link, self._run(request, answered))
         try:
-            return await asyncio.shield(flight)
+            return await flight.result()
         finally:
-            if flight.done() and self._flight is flight:
+            if flight.ended and self._flight is flight:
                 self._flight = None  # its error's traceback holds this exchanger
 
     async def settle(self) -> None:
@@ -193,11 +192,11 @@ class Exchanger:
     def _quiet(self) -> int:
         return self._clock.now() + int(QUIET * SECOND)
 
-    async def _run(self, request: Frame, answered: bool) -> Frame | None:
+    def _run(self, request: Frame, answered: bool) -> Steps[Frame | None]:
         """One exchange; whatever goes wrong in its middle is followed by silence."""
         self.began = self._clock.now()
         try:
-            frame = await self._converse(request, answered)
+            frame = yield from self._converse(request, answered)
         except (_BusyError, _HeldUpError) as error:
             raise DeviceTimeoutError(str(error)) from None
         except BaseException:
@@ -206,82 +205,83 @@ class Exchanger:
         self.ended = self._clock.now()
         return frame
 
-    async def _converse(self, request: Frame, answered: bool) -> Frame | None:
+    def _converse(self, request: Frame, answered: bool) -> Steps[Frame | None]:
         for _ in range(2):
-            await self._send(request)
+            yield from self._send(request)
             if not answered:
                 return None
-            frame = await self._receive(_ANSWER_LENGTHS.get(request.opcode))
+            frame = yield from self._receive(_ANSWER_LENGTHS.get(request.opcode))
             if frame is not None:
                 return frame
         raise ProtocolError(f"{self._link.name}: answer damaged twice")
 
-    async def _send(self, request: Frame) -> None:
+    def _send(self, request: Frame) -> Steps[None]:
         for _ in range(2):
-            await self._ask(request)
+            yield from self._ask(request)
             self._link.write(request.body)
-            if await self._acknowledge() == READY:
+            if (yield from self._acknowledge()) == READY:
                 return
         raise ProtocolError(f"{self._link.name}: frame refused twice")
 
-    async def _ask(self, request: Frame) -> None:
+    def _ask(self, request: Frame) -> Steps[None]:
         for attempt in range(1 + BUSY_RETRIES):
             if attempt:
-                await self._clock.sleep(BUSY_PAUSE)
+                yield Need(0, BUSY_PAUSE)
             self._link.write(request.head)
-            if await self._acknowledge() == READY:
+            if (yield from self._acknowledge()) == READY:
                 return
         raise _BusyError(f"{self._link.name}: controller stays busy")
 
-    async def _acknowledge(self) -> int:
+    def _acknowledge(self) -> Steps[int]:
         skipped = b""
         while len(skipped) <= STRAY_LIMIT:
-            byte = await self._exactly(1, ACKNOWLEDGE_TIMEOUT)
+            byte = yield from self._exactly(1, ACKNOWLEDGE_TIMEOUT)
             if byte[0] in (READY, REFUSED):
                 self.acknowledged = True
                 return byte[0]
             self.strange = skipped = skipped + byte
         raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an acknowledge")
 
-    async def _receive(self, lengths: frozenset[int] | None) -> Frame | None:
+    def _receive(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
-        byte = await self._exactly(1, ANSWER_TIMEOUT)
+        byte = yield from self._exactly(1, ANSWER_TIMEOUT)
         if byte[0] != ANSWER:
             self.strange = byte
             raise ProtocolError(f"{self._link.name}: {byte.hex()} instead of an answer")
         self._link.write(bytes((READY,)))
         frame: Frame | None
         try:
-            frame = await self._frame(lengths)
+            frame = yield from self._frame(lengths)
         except FrameError:
-            frame = await self._repeated(lengths)
+            frame = yield from self._repeated(lengths)
         if frame is not None:
             self._link.write(bytes((READY,)))
         return frame
 
-    async def _repeated(self, lengths: frozenset[int] | None) -> Frame | None:
+    def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
-        await self._clock.sleep(REST_OF_FRAME)
+        yield Need(0, REST_OF_FRAME)
         self._link.discard()
         self._link.write(bytes((REFUSED,)))
         try:
-            async with self._clock.deadline(REPEAT_WAIT):
-                return await self._frame(lengths)
-        except TimeoutError:
+            return (yield from self._frame(lengths, REPEAT_WAIT))
+        except DeviceTimeoutError:
             return None
         except FrameError as error:
             raise ProtocolError(f"{self._link.name}: repeated answer is damaged too: {error}") from error
 
-    async def _frame(self, lengths: frozenset[int] | None) -> Frame:
-        head = await self._exactly(1, ACKNOWLEDGE_TIMEOUT)
+    def _frame(self, lengths: frozenset[int] | None, within: float | None = None) -> Steps[Frame]:
+        begin = self._clock.now()
+        head = yield from self._exactly(1, within or ACKNOWLEDGE_TIMEOUT)
         if lengths is not None and head[0] not in lengths:
             raise FrameError(f"length byte {head[0]}")
-        return decode_body(ANSWER, head + await self._exactly(body_size(head[0]), ACKNOWLEDGE_TIMEOUT))
+        left = within - (self._clock.now() - begin) / SECOND if within else ACKNOWLEDGE_TIMEOUT
+        return decode_body(ANSWER, head + (yield from self._exactly(body_size(head[0]), left)))
 
-    async def _exactly(self, count: int, timeout: float) -> bytes:
+    def _exactly(self, count: int, timeout: float) -> Steps[bytes]:
         asked = self._clock.now()
         try:
-            data = await self._link.exactly(count, timeout)
+            data = yield Need(count, timeout)
         except TimeoutError:
             self._check_held_up(asked)
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
@@ -291,12 +291,6 @@ class Exchanger:
     def _check_held_up(self, asked: int) -> None:
         if (waited := (self._clock.now() - asked) / SECOND) >= QUIET:
             raise _HeldUpError(f"{self._link.name}: this process stood still for {waited:.1f} s")
-
-
-def _retrieve(flight: "asyncio.Task[Frame | None]") -> None:
-    """Nobody may be left to ask how an exchange ended."""
-    if not flight.cancelled():
-        flight.exception()
 
 
 class _BusyError(Exception):

@@ -1,0 +1,122 @@
+"""Conversations over a link that go on in the very callback that brings the next bytes.
+
+A handshake byte by byte costs a coroutine a wake-up of its task per byte; here the bytes go straight to a generator.
+"""
+
+import asyncio
+from collections.abc import Generator
+from typing import Generic, NamedTuple, TypeVar
+
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.errors import DeviceLostError
+
+T = TypeVar("T")
+
+
+class Need(NamedTuple):
+    """What a conversation waits for: so many bytes within so many seconds; of size 0: that time."""
+
+    size: int
+    within: float
+
+
+Steps = Generator[Need, bytes, T]
+"""Yields what it needs and is sent the bytes; ``TimeoutError`` and ``DeviceLostError`` are thrown in."""
+
+
+class Talk(Generic[T]):
+    """One conversation, begun at once and carried to its end whether or not somebody waits for it.
+
+    Args:
+        link: of which it is the only reader until it has ended.
+        steps: the conversation.
+    """
+
+    def __init__(self, link: Link, steps: Steps[T]) -> None:
+        self.ended = False
+        self._link = link
+        self._steps = steps
+        self._size = 0
+        self._value: T | None = None
+        self._error: BaseException | None = None
+        self._waiters: list[asyncio.Future[None]] = []
+        self._loop = asyncio.get_running_loop()
+        self._advance(None)
+
+    async def result(self) -> T:
+        """Wait for the end; a cancelled wait does not end the conversation.
+
+        Raises:
+            Exception: what the conversation raised.
+        """
+        await self.end()
+        if self._error is not None:
+            raise self._error
+        return self._value  # type: ignore[return-value]  # set, as there was no error
+
+    async def end(self) -> None:
+        """Wait for the end, whatever it is."""
+        if not self.ended:
+            waiter = self._loop.create_future()
+            self._waiters.append(waiter)
+            await waiter
+
+    def cancel(self) -> None:
+        """Break it off."""
+        if not self.ended:
+            self._link.end_wait()
+            self._steps.close()
+            self._finish(None, asyncio.CancelledError())
+
+    def news(self) -> None:
+        """See ``link.Waiting``."""
+        if not self._size:
+            if not self._link.is_lost:
+                return
+            data: bytes | None = b""
+        else:
+            try:
+                data = self._link.take(self._size)
+            except DeviceLostError as error:
+                self._throw(error)
+                return
+        if data is not None:
+            self._link.end_wait()
+            self._advance(data)
+
+    def late(self) -> None:
+        """See ``link.Waiting``."""
+        if self._size:
+            self._throw(TimeoutError())
+        else:
+            self._link.end_wait()
+            self._advance(b"")
+
+    def _throw(self, error: Exception) -> None:
+        self._link.end_wait()
+        self._advance(None, error)
+
+    def _advance(self, data: bytes | None, error: Exception | None = None) -> None:
+        """Go on until bytes are needed that are not here yet."""
+        try:
+            while True:
+                need = self._steps.send(data) if error is None else self._steps.throw(error)  # type: ignore[arg-type]
+                self._size, error, data = need.size, None, None
+                if need.size:
+                    try:
+                        data = self._link.take(need.size)
+                    except DeviceLostError as lost:
+                        error = lost
+                if data is None and error is None:
+                    self._link.begin_wait(self, self._loop.time() + need.within)
+                    return
+        except StopIteration as stop:
+            self._finish(stop.value, None)
+        except Exception as raised:  # noqa: BLE001  # for whoever waits
+            self._finish(None, raised)
+
+    def _finish(self, value: T | None, error: BaseException | None) -> None:
+        self.ended, self._value, self._error = True, value, error
+        for waiter in self._waiters:
+            if not waiter.done():
+                waiter.set_result(None)
