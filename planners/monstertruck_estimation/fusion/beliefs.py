@@ -3,8 +3,8 @@
 State: pose in odom (x, y, yaw), velocity in base (vx, vy, wz), north (yaw in odom at which the compass reads 0: the
 bias of the compass), trim (the bias of the wheels' curvature, rad/m), the place of the last scan, the pose at the
 last wheel reading, and the local deviation of the compass (iron near by, and what is left of the truck's own). That
-lasts a metre or a radian: readings taken close together err alike, and a magnet that comes nearer moves it rather than
-the yaw. All errors are additive, yaw on the circle.
+lasts two metres or a radian: readings taken close together err alike, and a magnet that comes nearer moves it rather
+than the yaw. All errors are additive, yaw on the circle.
 
 Wheels and scans tell motion between two instants, so they are compared with the pose and the clone of the earlier one;
 pose and clone stay correlated, and nothing is counted twice (Roumeliotis and Burdick, "Stochastic cloning", 2002).
@@ -276,6 +276,7 @@ def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
         north=(float(mean[NORTH]), float(covariance[NORTH, NORTH])),
         local=float(mean[LOCAL]),
         flagged=heading.disturbed,
+        taken_back=heading.taken_back,
         field=heading.field,
     )
     before = belief.gate

@@ -9,8 +9,8 @@ from monstertruck_schemas.base import Pose2D, Schema
 
 Share = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
-LASTING: Final = (1.0, 1.0)
-"""Way, m, and turn, rad, after which the local deviation of the compass is another."""
+LASTING: Final = (2.0, 1.0)
+"""Way, m, and turn, rad, after which the local deviation of the compass is another: iron is in floors and furniture."""
 
 
 class WheelTrust(Schema):
@@ -34,7 +34,7 @@ class HeadingTrust(Schema):
     noise: Positive = 0.02
     """Standard deviation of a heading, rad."""
     local: Positive = 0.05
-    """Standard deviation of what iron near by and the truck's own adds to it, rad; it lasts a metre or a radian."""
+    """Standard deviation of what iron near by and the truck's own adds to it, rad; it lasts two metres or a radian."""
     drift: Positive = 0.001
     """How fast its north may wander, rad per root second."""
     gate: Positive = 3.0
@@ -43,7 +43,7 @@ class HeadingTrust(Schema):
     """Share by which the strength of the magnetic field may differ from what it was at the start."""
     recover: Annotated[int, Field(ge=1)] = 10
     """Good headings in a row until a compass that was disturbed counts again,"""
-    regain: Positive = 1.0
+    regain: Positive = 2.0
     """over at least so many metres, or radians, or else over the time of patience."""
     patience: Positive = 10.0
     """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
@@ -95,8 +95,8 @@ class FusionConfig(Schema):
     """How fast the velocity may change, forward and sideways (m/s) and in yaw (rad/s), per root second."""
     persistence: Positive = 2.0
     """Time constant with which an unobserved velocity dies away, s."""
-    horizon: Positive = 1.5
-    """Measurements may come this late, s."""
+    horizon: Positive = 5.0
+    """Measurements may come this late, s, and headings of so long before a disturbance was noticed are taken back."""
     slew: tuple[Positive, Positive] = (0.5, 1.0)
     """The published pose follows corrections no faster than this, m/s and rad/s: it never jumps,"""
     settle: Positive = 0.4

@@ -259,7 +259,7 @@ class Fusion:
     def _look_for_disturbance(self) -> None:
         """Take back headings from before a disturbance was noticed: a magnet comes nearer before that."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
-            self._history.rewrite(0, _disturbed)
+            self._history.rewrite(0, _taken_back)
             self._slip.forget_headings()
         self._was_disturbed = self._disturbed
 
@@ -282,8 +282,8 @@ def _slipping(operation: Operation) -> Operation:
     return replace(operation, slipping=True) if isinstance(operation, WheelWay) else operation
 
 
-def _disturbed(operation: Operation) -> Operation:
-    return replace(operation, disturbed=True) if isinstance(operation, Heading) else operation
+def _taken_back(operation: Operation) -> Operation:
+    return replace(operation, taken_back=True) if isinstance(operation, Heading) else operation
 
 
 def _scan_way(motion: ScanMotion, scale: float) -> ScanWay | None:

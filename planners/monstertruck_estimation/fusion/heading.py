@@ -72,6 +72,8 @@ class Evidence:
     """Local deviation as it is believed to be, rad."""
     flagged: bool
     """The device calls itself disturbed."""
+    taken_back: bool
+    """A disturbance was noticed soon after."""
     field: float | None
 
 
@@ -87,7 +89,8 @@ def judged(gate: Gate, evidence: Evidence, config: HeadingTrust) -> tuple[Verdic
     """
     gate, disturbed = _field(gate, evidence, config)
     crept = not gate.disturbed and abs(evidence.local) > config.gate * config.local
-    if disturbed or crept:
+    # The first heading stays, or there would be no north to come back to.
+    if disturbed or crept or (evidence.taken_back and gate.anchored):
         return Verdict.LEFT_OUT, _off(gate, evidence, steady=False)
     if not gate.anchored:
         return Verdict.ANCHORED, replace(gate, anchored=True, disturbed=False, good=0)

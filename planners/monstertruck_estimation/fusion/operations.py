@@ -52,6 +52,8 @@ class Heading:
     """Counter-clockwise from magnetic north, rad."""
     disturbed: bool = False
     """The device itself says so."""
+    taken_back: bool = False
+    """A disturbance was noticed soon after it."""
     field: float | None = None
     """Strength of the magnetic field, in the device's unit."""
     tilt: tuple[float, float] | None = None
