@@ -2,14 +2,14 @@
 
     python benchmarks/loop.py [--rounds N] [--seconds S] [--with slam|planning]
 
-The whole truck drives laps: the daemon with every device at full rate, recording to disk, in one process; world and
-emulated devices behind ptys in another; a third subscribes to all it publishes. Rounds alternate with an empty
-event loop that only ticks at the same rate, while world and emulators go on: that is the floor. Lateness is that of
-the gate's 50 Hz tick; the figure is the median of the rounds. Processor time and memory are those of the daemon's
-process alone, without its workers, from ``WARM_UP`` seconds after the truck is armed. For as long again the callbacks
-of its event loop are measured, in processor time of the thread, which has a cost of its own. ``--with`` adds mapping,
-or planner, deformer and goals in the rooms instead of the laps; then only the lateness has a goal. The last line is
-JSON.
+The whole truck drives lap after lap, armed again after every stop: the daemon with every device at full rate, recording
+to disk, in one process; world and emulated devices behind ptys in another; a third subscribes to all it publishes.
+Rounds alternate with an empty event loop that only ticks at the same rate, while world and emulators go on: that is the
+floor. Lateness is that of the gate's 50 Hz tick; the figure is the median of the rounds. Processor time and memory are
+those of the daemon's process alone, without its workers, from ``WARM_UP`` seconds after the truck drives. For as long
+again the callbacks of its event loop are measured, in processor time of the thread, which has a cost of its own.
+``--with`` adds mapping, or planner, deformer and goals in the rooms instead of the laps; then only the lateness has a
+goal. The last line is JSON.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,11 +30,12 @@ import numpy as np
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
-from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import Order
-from monstertruckd.demo.operator import MOVING
+from monstertruck_schemas.state import GateMode
+from monstertruckd.demo.operator import MOVING, drive_lap
 from monstertruckd.demo.wall import connect, free_endpoint, program, write_overlay
 
 HERE = Path(__file__).resolve().parent
@@ -60,6 +62,8 @@ ADDED: dict[str, dict[str, Any]] = {
 }
 """Sections that ``--with`` adds."""
 PLACES = ((3.5, 3.9, 0.0), (2.4, 1.5, -1.57), (1.2, 3.9, 3.14))
+LEAST_DRIVEN = 0.5
+"""Share of the time in which the truck has to drive."""
 EXPLAINED: dict[str, str] = {}
 """Callbacks that may take more than 2 ms, with the reason."""
 
@@ -96,13 +100,49 @@ async def process(*arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
         await running.communicate()
 
 
-async def arm(client: TruckClient, clock: Clock) -> None:
-    """Arm the truck; the tracker then drives."""
-    with client.subscribe(topics.GATE, latest()) as gate:
-        async with clock.deadline(PATIENCE):
-            while gate.latest is None or gate.latest.mode not in MOVING:
+async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bool) -> None:
+    """Keep the truck driving: one lap after the other, or as the goals have it; armed again after every stop."""
+    while laps:
+        lap = await drive_lap(client, clock)
+        drives.stops += [reason.value for reason in lap.interruptions]
+    with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.STOP, latest()) as stop:
+        while True:
+            if gate.latest is not None and gate.latest.mode not in MOVING:
+                if drives.states:
+                    drives.stops.append("unknown" if stop.latest is None else stop.latest.reason.value)
                 await client.order(Order.ARM)
-                await clock.sleep(0.25)
+            await clock.sleep(0.25)
+
+
+@dataclass
+class Drives:
+    """What the gate said of the truck's driving."""
+
+    states: list[tuple[int, bool]] = field(default_factory=list)
+    """When, and whether the truck drove."""
+    stops: list[str] = field(default_factory=list)
+    """Why it had to be armed again."""
+
+    async def watch(self, client: TruckClient) -> None:
+        """Note every state from the first drive on."""
+        with client.subscribe(topics.GATE, fifo(256)) as gate:
+            while True:
+                state = await gate.next()
+                if self.states or state.mode is GateMode.DRIVING:
+                    self.states.append((state.received, state.mode is GateMode.DRIVING))
+
+    def share(self, begin: int, end: int) -> float:
+        """Of the time between two instants in which the truck drove.
+
+        Raises:
+            SystemExit: it hardly did, so there is nothing to measure.
+        """
+        drove = [driving for at, driving in self.states if begin <= at < end]
+        share = sum(drove) / max(len(drove), 1)
+        if share < LEAST_DRIVEN:
+            why = ", ".join(dict.fromkeys(self.stops)) or "nothing stopped it"
+            raise SystemExit(f"the truck drove only {share:.0%} of the time ({why}): nothing to measure")
+        return share
 
 
 async def wander(client: TruckClient, clock: Clock) -> None:
@@ -124,11 +164,16 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
             assert subscriber.stdout is not None
             assert subscriber.stdin is not None
             await subscriber.stdout.readline()
-            wandering = asyncio.create_task(wander(client, clock)) if goals else None
+            drives = Drives()
+            tasks = [asyncio.create_task(drives.watch(client))]
             if goals:
+                tasks.append(asyncio.create_task(wander(client, clock)))
                 with client.subscribe(topics.PATH, latest()) as paths:
                     await paths.next()
-            await arm(client, clock)
+            tasks.append(asyncio.create_task(drive(client, clock, drives, laps=not goals)))
+            async with clock.deadline(PATIENCE):
+                while not drives.states:
+                    await clock.sleep(0.1)
             await clock.sleep(WARM_UP)
             begin, used = clock.now(), _used(daemon.pid)
             await clock.sleep(seconds)
@@ -137,8 +182,9 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
             await clock.sleep(seconds)
             end = clock.now()
             memory = _memory(daemon.pid)
-            if wandering is not None and not wandering.cancel():
-                wandering.result()
+            for task in tasks:
+                if not task.cancel():
+                    task.result()
             subscriber.stdin.close()
             received = int(await subscriber.stdout.readline())
     found = json.loads(report.read_text())
@@ -152,6 +198,8 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
         "cpu_percent": 100 * used / (unwatched - begin) * SECOND,
         "received": received,
         "seconds": (end - begin) / SECOND,
+        "driven": drives.share(begin, end),
+        "stops": len(drives.stops),
         **memory,
     }
 
@@ -227,6 +275,8 @@ def figures(floor: list[np.ndarray], runs: list[dict[str, Any]]) -> dict[str, An
         "cpu_percent": median([run["cpu_percent"] for run in runs]),
         "rss_mb": median([run["rss_mb"] for run in runs]),
         "peak_rss_mb": median([run["peak_rss_mb"] for run in runs]),
+        "driven_share": median([run["driven"] for run in runs]),
+        "armed_again": sum(run["stops"] for run in runs),
         "messages_received": sum(run["received"] for run in runs),
     }
 
