@@ -215,7 +215,8 @@ def _at(truth: Array, second: float) -> Array:
 def judged(run: Run, drive: Drive) -> dict[str, float]:
     """ATE (m), RPE (m and degrees per metre), NEES and the greatest step of one run."""
     stamps, poses = np.array(run.stamps), np.array(run.poses)
-    truth = np.array([_at(np.array(drive.truth), second) for second in stamps])
+    every = np.array(drive.truth)
+    truth = np.array([_at(every, second) for second in stamps])
     carried = math.inf if drive.carried is None else drive.carried / SECOND
     errors, moves = [], []
     for leg in (stamps < carried, stamps >= carried):

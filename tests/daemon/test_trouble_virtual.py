@@ -1,4 +1,4 @@
-"""What goes wrong with the estimation is told by the whole daemon: a corridor, wheels that slip, iron near the compass."""
+"""What goes wrong with the estimation is told by the whole daemon: a corridor, slipping wheels, iron at the compass."""
 
 from dataclasses import replace
 from pathlib import Path
