@@ -46,14 +46,16 @@ class DeformConfig(Schema):
     """Length of the route looked at, m."""
     inset: NotNegative = 0.1
     """Kept between the window's border and the circle round the footprint where the route is cut, m."""
-    effort: Count = 1500
-    """Search steps and improvement trials of a local search."""
+    effort: Count = 1100
+    """Search steps and improvement trials of a local search: bounds the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
     """Of a metre backward, where the lidar does not look, m."""
     cusp_cost: NotNegative = 0.3
     """Of a change of direction, m."""
     crab_cost: Annotated[float, Field(ge=1)] = 1.05
     """Of a metre beside the heading, m."""
+    clearance_cost: NotNegative = 0.5
+    """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away, m."""
     shortest: Positive = 0.15
     """A free beginning of a blocked path is used from this length on, m."""
 

@@ -38,10 +38,7 @@ TURNED = (0.0, 1.0, -1.0)
 """Headings at the end of the way round, beside the route's, rad."""
 
 PATIENCE = 5
-"""Searches that fail before another heading is tried, each beginning with a deep search."""
-
-DEEP = 3
-"""Effort of a deep search, as a factor."""
+"""Searches that fail before another heading is tried."""
 
 LOOK_BACK = 0.05
 """Sampling of a path where the truck looks for its place on it, m."""
@@ -84,10 +81,8 @@ class Surveyor:
         self.cover = cover_of(vehicle.footprint)
         search = search or HybridConfig(effort=config.effort)
         margins = dict.fromkeys((config.margin, 0.0))
-        deep = search.model_copy(update={"margin": config.margin, "effort": DEEP * search.effort})
-        self._deep = HybridPlanner(vehicle, deep)
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
-        self._moves = self._deep.car(LEVELS[0]).moves
+        self._moves = self._planners[0].car(LEVELS[0]).moves
 
     def begin(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> Cycle | DeformResult:
         """The route cut to the window for one cycle, see ``api.Deformer``, or the result if nothing of it is free.
@@ -179,25 +174,22 @@ class Surveyor:
         inside = np.flatnonzero(self._in_window(band.poses, surroundings, 0.0) & free)
         last = int(inside[-1]) if len(inside) else len(band.poses) - 1
         goal = band.poses[last].copy()
-        if last == len(band.poses) - 1 and not local.final:
+        if last < len(band.poses) - 1 or not local.final:
             goal[2] += TURNED[failed // PATIENCE % len(TURNED)]
-        path, reason = self._way(surroundings, pose, goal, deep=failed % PATIENCE == 1)
+        path, reason = self._way(surroundings, pose, goal)
         if path is None:
             return None, None, reason
         found = Guide.from_motion(path)
         rest = band.part(last + 1, len(band.poses)) if last + 1 < len(band.poses) else None
         return path, found if rest is None else found.then(rest), Reason.OK
 
-    def _way(
-        self, surroundings: DistanceField, pose: Array, goal: Array, *, deep: bool
-    ) -> tuple[MotionPath | None, Reason]:
+    def _way(self, surroundings: DistanceField, pose: Array, goal: Array) -> tuple[MotionPath | None, Reason]:
         """Path to a goal; a truck nearer to something than the margin first goes away from it."""
         out = self.loosened(surroundings, pose)
         if out is not None:
             pose = out.end
-        first, *others = self._planners
         reason = Reason.PATH_BLOCKED
-        for planner in (self._deep if deep else first, *others):
+        for planner in self._planners:
             result = planner.plan(RouteMap(surroundings), pose, goal)
             if result.path is not None and len(result.path.rows):
                 return result.path if out is None else out.then(result.path), Reason.OK
@@ -268,9 +260,8 @@ def checked(pose: ArrayLike) -> Array:
 
 def costs_of(config: DeformConfig) -> HybridConfig:
     """Costs of local searches and motions."""
-    return HybridConfig(
-        reverse_cost=config.reverse_cost, cusp_cost=config.cusp_cost, crab_cost=config.crab_cost, effort=config.effort
-    )
+    names = ("reverse_cost", "cusp_cost", "crab_cost", "clearance_cost", "effort")
+    return HybridConfig(**{name: getattr(config, name) for name in names})
 
 
 def onward(band: Guide, pose: Array) -> Guide:
