@@ -94,7 +94,8 @@ def _build_odometry(config: TruckConfig, bus: Bus, clock: Clock, chassis: Chassi
         return OdometryService(DeadReckoning(odometry, chassis), clock, **ends)
     used = config.slam is not None and odometry.scans is not None
     scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if used else None
-    return FusionService(Fusion(odometry, chassis), clock, scans=scans, events=bus.event_sink(), **ends)
+    health = bus.publisher(topics.FUSION, Writer.ESTIMATION)
+    return FusionService(Fusion(odometry, chassis), clock, scans=scans, health=health, events=bus.event_sink(), **ends)
 
 
 def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:

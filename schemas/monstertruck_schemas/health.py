@@ -105,6 +105,25 @@ class SlamHealth(Message):
     """Seconds by which odometry runs ahead of the scans, if it clearly does."""
 
 
+class OdometryHealth(Message):
+    """What the odometry of ``kind: fusion`` may rely on; published on change and once a second."""
+
+    slipping: bool
+    """The wheels do not hold the ground: they hardly count."""
+    disturbed: bool
+    """Headings are left out: something magnetic is near."""
+    sources: tuple[str, ...]
+    """Sensors of the last second."""
+    north: float | None = None
+    """Yaw in odom of the compass's zero, rad; None until it was found."""
+    trim: float = 0.0
+    """Estimated error of the wheels' curvature, rad/m."""
+    left_out: Annotated[int, Field(ge=0)] = 0
+    """Readings that could not be used: late, twice, out of order, impossible or no number."""
+    waiting: Annotated[int, Field(ge=0)] = 0
+    """Readings that wait to be taken in once more, after a late one or the onset of trouble."""
+
+
 class LinkMedium(StrEnum):
     """What a network interface is."""
 

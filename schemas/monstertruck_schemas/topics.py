@@ -9,7 +9,15 @@ from typing import Final, Generic, TypeVar
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, LogRecord, Stop
-from monstertruck_schemas.health import HealthTable, HostHealth, LinkHealth, LoopHealth, RecorderHealth, SlamHealth
+from monstertruck_schemas.health import (
+    HealthTable,
+    HostHealth,
+    LinkHealth,
+    LoopHealth,
+    OdometryHealth,
+    RecorderHealth,
+    SlamHealth,
+)
 from monstertruck_schemas.plan import GoalState, Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
@@ -158,6 +166,7 @@ RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder",
 LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, 3.0)
 HOST: Final = Topic("health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, 3.0)
 SLAM: Final = Topic("health/slam", SlamHealth, W.ESTIMATION, "How well the scans fit the map", 10, 3.0)
+FUSION: Final = Topic("health/odometry", OdometryHealth, W.ESTIMATION, "Slip, and a disturbed compass", 1, 3.0)
 USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")

@@ -12,7 +12,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import OdometryHealth, Standing
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruckd.config.validate import load_config
@@ -68,7 +68,10 @@ def troubled() -> dict:
 
     async def main(clock: VirtualClock) -> dict:
         rig = VirtualRig(config, clock)
-        boxes = {topic.name: rig.bus.subscribe(topic, fifo(20_000)) for topic in (topics.ODOMETRY, topics.EVENT)}
+        boxes = {
+            topic.name: rig.bus.subscribe(topic, fifo(20_000))
+            for topic in (topics.ODOMETRY, topics.FUSION, topics.EVENT)
+        }
         operator = LocalOperator(rig.bus, clock)
         compass, motor = rig.world.compass, rig.world.motor
         at = {}
@@ -108,10 +111,17 @@ def sources(run: dict, second: float) -> set[str]:
     return set(next(message.sources for message in run["state/odometry"] if message.stamp >= second * SECOND))
 
 
+def health(run: dict, second: float) -> OdometryHealth:
+    """The newest health of the odometry at an instant, s."""
+    return [one for one in run[topics.FUSION.name] if one.stamp <= second * SECOND][-1]
+
+
 def test_iron_near_the_compass_is_told_and_the_compass_no_source(troubled: dict):
     begin = troubled["iron"] / SECOND
     assert any(begin < second < begin + 0.5 for second in told(troubled, Reason.HEADING_DISTURBED))
     assert "compass" in sources(troubled, begin)
+    assert not health(troubled, begin).disturbed
+    assert health(troubled, begin + 1.9).disturbed
     assert "compass" not in sources(troubled, begin + 1.9)
 
 
@@ -119,3 +129,4 @@ def test_slip_and_its_end_are_told(troubled: dict):
     begin = troubled["slip"] / SECOND
     assert any(begin < second < begin + 1.0 for second in told(troubled, Reason.WHEEL_SLIP))
     assert any(begin + 1.0 < second < begin + 4.0 for second in told(troubled, Reason.WHEEL_GRIP))
+    assert [health(troubled, begin + later).slipping for later in (0.0, 1.0, 4.0)] == [False, True, False]

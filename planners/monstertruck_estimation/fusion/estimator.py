@@ -183,6 +183,13 @@ class Fusion:
         """Readings that wait to be redone: those that came late, and what followed them."""
         return 0 if self._history is None else self._history.waiting
 
+    def sources(self, now: int) -> tuple[str, ...]:
+        """Sensors of the last second, at ``now`` (ns)."""
+        used = {} if self._history is None else dict(self._history.newest.used)
+        if self._wheels is not None and self._wheels.steered is not None and "drive" in used:
+            used["steering"] = self._wheels.steered
+        return tuple(name for name in NAMES if name in used and now - used[name] <= MEMORY)
+
     def estimate(self, now: int) -> Estimate | None:
         """Pose at ``now`` (ns), continuous over corrections; None before the first reading.
 
@@ -207,7 +214,7 @@ class Fusion:
             pose_covariance=grown[POSE, POSE] + np.outer(off, off),
             twist_covariance=grown[TWIST, TWIST].copy(),
             age=max((now - moved) / SECOND, 0.0),
-            sources=self._sources(belief, now),
+            sources=self.sources(now),
         )
 
     def _continuous(self, ahead: Belief, now: int) -> Array:
@@ -226,12 +233,6 @@ class Fusion:
         x, y, yaw = compose(target, inverse(carried)).tolist()
         self._correction.aim((x, y, yaw))
         return np.array(self._correction.pose((carried[0], carried[1], carried[2]), dt))
-
-    def _sources(self, belief: Belief, now: int) -> tuple[str, ...]:
-        used = dict(belief.used)
-        if self._wheels is not None and self._wheels.steered is not None and "drive" in used:
-            used["steering"] = self._wheels.steered
-        return tuple(name for name in NAMES if name in used and now - used[name] <= MEMORY)
 
     # Order
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 
-from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.fusion.estimator import Fusion, Standing
 from monstertruck_estimation.odometry import OdometryService
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
 from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import OdometryHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry, ScanMotion
@@ -25,6 +26,7 @@ class FusionService(OdometryService):
         scans: motion between scans, bounded and counted, if something finds it.
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = something else publishes it.
+        health: ``health/odometry``.
         events: where slip and disturbances are told.
         rate: poses per second.
     """
@@ -40,6 +42,7 @@ class FusionService(OdometryService):
         scans: Mailbox[ScanMotion] | None,
         odometry: Publisher[Odometry],
         pose: Publisher[Odometry] | None,
+        health: Publisher[OdometryHealth],
         events: EventSink,
         rate: float = 50.0,
     ) -> None:
@@ -48,8 +51,10 @@ class FusionService(OdometryService):
         )
         self._fusion = fusion
         self._scans = scans
+        self._health = health
         self._events = events
         self._disturbed = False
+        self._told: tuple[int, tuple[bool, bool]] | None = None
 
     def take(self) -> None:
         """Hand on what is new, and tell what has changed."""
@@ -69,6 +74,29 @@ class FusionService(OdometryService):
                 self._events(
                     Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {standing.north or 0:.2f} rad in odom"
                 )
+
+        self._tell_health(standing)
+
+    def _tell_health(self, standing: Standing) -> None:
+        now, trouble = self._clock.now(), (standing.slipping, standing.disturbed)
+        if self._told is not None and trouble == self._told[1] and now - self._told[0] < SECOND:
+            return
+        self._told = (now, trouble)
+        self._health.put(
+            OdometryHealth(
+                stamp=now,
+                received=now,
+                seq=self._health.next_seq(),
+                frame="odom",
+                slipping=standing.slipping,
+                disturbed=standing.disturbed,
+                sources=self._fusion.sources(now),
+                north=standing.north,
+                trim=standing.trim,
+                left_out=sum(standing.left_out.values()),
+                waiting=self._fusion.waiting,
+            )
+        )
 
     def hears_compass(self) -> bool:
         """Always: a heading can be the first reading."""

@@ -9,7 +9,7 @@ from monstertruck_estimation.fusion.slip import Change
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_schemas.reasons import Reason
-from tests.unit.estimation.fusion.kit import FIELD, Rig
+from tests.unit.estimation.fusion.kit import FIELD, Rig, attitude
 
 READ = TypeAdapter(AnyOdometry)
 
@@ -30,7 +30,7 @@ class Scans:
         return motions
 
 
-def served(rig, scans=None):
+def served(rig, scans=None, seconds=0.1, health=None):
     """What a service over the rig's fusion tells in a tenth of a second."""
     events, odometry = [], Outbox()
 
@@ -44,10 +44,11 @@ def served(rig, scans=None):
             scans=scans,
             odometry=odometry,
             pose=None,
+            health=Outbox() if health is None else health,
             events=lambda reason, severity, source, text="", **_: events.append((reason, text)),
         )
         task = asyncio.create_task(service.run(lambda: None))
-        await clock.sleep(0.1)
+        await clock.sleep(seconds)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
@@ -65,6 +66,21 @@ def test_slip_and_a_disturbed_compass_are_events():
     assert events[0][1] == "apart"
     assert "lidar" in odometry[-1].sources
     assert odometry[-1].frame == "odom"
+
+
+def test_health_is_told_once_a_second_and_at_once_when_it_changes():
+    rig = Rig().drive(0.3, 0.0, 0.0, 2.0)
+    health = Outbox()
+    served(rig, seconds=2.5, health=health)
+    assert [(one.slipping, one.disturbed) for one in health] == [(False, False)] * 3
+    assert set(health[0].sources) == {"drive", "steering", "compass", "tilt", "lidar"}
+    assert health[-1].sources == ()
+    rig.fusion.observe_attitude(attitude(rig.now + 1, 2.0, heading_disturbed=True))
+    rig.fusion.observe_attitude(attitude(rig.now, 2.0))
+    served(rig, health=health)
+    assert health[3].disturbed
+    assert health[3].left_out == 1
+    assert health[3].north is not None
 
 
 def test_the_motion_between_scans_is_taken_from_the_bus():
