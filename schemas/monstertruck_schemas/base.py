@@ -4,7 +4,7 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 (map > odom > base > sensors). A value that is absent is ``None``, never NaN.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,27 @@ class Schema(BaseModel):
         return all(_equal(a, b) for a, b in zip(self.__dict__.values(), other.__dict__.values(), strict=True))
 
     __hash__ = None  # type: ignore[assignment]  # messages carry arrays
+
+
+S = TypeVar("S", bound=Schema)
+
+
+def assembled(model: type[S], values: dict[str, Any]) -> S:
+    """A record of values known to be valid, which are not looked at again; ``values`` is then the record's own.
+
+    Args:
+        model: what it is.
+        values: of every field, in their order; arrays read-only.
+    """
+    record = object.__new__(model)
+    for name, value in (
+        ("__dict__", values),
+        ("__pydantic_fields_set__", set(values)),
+        ("__pydantic_extra__", None),
+        ("__pydantic_private__", None),
+    ):
+        object.__setattr__(record, name, value)
+    return record
 
 
 def _equal(a: object, b: object) -> bool:

@@ -1,6 +1,7 @@
 import contextlib
 import json
 import math
+import struct
 from functools import cache
 
 import numpy as np
@@ -105,13 +106,40 @@ def test_the_scans_own_codec_writes_what_its_layout_says_and_reads_it_without_th
     assert data == foxglove_layouts.LASER_SCAN.encode(vars(message))
     assert LaserScan.model_validate(foxglove_layouts.LASER_SCAN.decode(data)) == message
     if message.stamp >= 0:
-        assert foxglove_scan._decode_own(data) == message
+        assert wire.decode(t.SCAN, data) == message  # which teaches the shape
+        known = foxglove_scan._decode_known(foxglove_scan._shapes[len(data), data[1]], data)
+        assert known == message
+        assert list(vars(known)) == list(vars(message))
+        assert known.model_fields_set == set(LaserScan.model_fields)
+        assert not known.ranges.flags.writeable
 
 
 @pytest.mark.parametrize("padded", [b"\x12\x85\x00laser", b"\x12\x05laser" * 2])
 def test_a_scan_in_unusual_protobuf_is_read_as_the_standard_says(padded):
     data = wire.encode(t.SCAN, scan()).replace(b"\x12\x05laser", padded)
     assert wire.decode(t.SCAN, data) == scan()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        (struct.pack("<d", 0.125), struct.pack("<d", math.nan), "scan_time"),
+        (struct.pack("<d", 0.125), struct.pack("<d", 0.0), "scan_time"),
+        (struct.pack("<d", 0.0625), struct.pack("<d", -1.0), "range_min"),
+        (struct.pack("<d", -2.0), struct.pack("<d", -math.inf), "start_angle"),
+        (struct.pack("<d", 0.03125), struct.pack("<d", -0.5), "tilt"),
+        (b"laser", b"Laser", "frame"),
+        (varint(1_700_000_000), varint(2**35 - 1), "stamp"),
+    ],
+)
+def test_values_beyond_the_limits_are_refused_in_a_known_shape(old, new, field):
+    message = scan(scan_time=0.125, range_min=0.0625, tilt=0.03125)
+    data = wire.encode(t.SCAN, message)
+    assert wire.decode(t.SCAN, data) == wire.decode(t.SCAN, data) == message
+    assert data.count(old) == 1, old
+    assert len(old) == len(new)
+    with pytest.raises(InputError, match=field):
+        wire.decode(t.SCAN, data.replace(old, new))
 
 
 def test_stock_reader_sees_the_standard_scan():
