@@ -18,8 +18,8 @@ from monstertruckd.logs import info
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "tests" / "data" / "replay"
-RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8)}
-"""Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and one that maps."""
+RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8), "fusion": ("fusion.yaml", 0.6)}
+"""Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and two that map."""
 
 
 def short_config(source: Path, folder: Path, length: float) -> Path:

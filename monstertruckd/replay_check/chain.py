@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
+from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.scan_tilt import TiltStamper
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError, TruckError
@@ -29,7 +30,7 @@ from monstertruckd.workers.remote import RemoteDesk
 
 TICKS: Final[Mapping[str, tuple[str, ...]]] = {
     "transforms": (topics.TRANSFORMS.name,),
-    "odometry": (topics.ODOMETRY.name,),
+    "odometry": (topics.ODOMETRY.name, topics.FUSION.name),
     "levelling": (topics.PLAN_STABILISER.name,),
     "tracker": (topics.PLAN_DRIVE.name, topics.TRACKER.name),
 }
@@ -74,6 +75,8 @@ def outputs_of(config: TruckConfig) -> frozenset[str]:
     names = {topics.TRANSFORMS.name}
     if config.missing_actuators() is None:
         names |= {topics.ODOMETRY.name, topics.POSE.name}
+        if not isinstance(config.odometry, OdometryConfig):
+            names.add(topics.FUSION.name)
     if config.slam is not None:
         names |= {topics.POSE.name, *WORKER}
     if devices.compass is not None and devices.lidar is not None:
