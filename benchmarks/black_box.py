@@ -45,7 +45,7 @@ def traffic() -> Traffic:
         async with rig.running():
             await clock.sleep(6.0)
             begin = clock.now()
-            rig.bus.tap(lambda topic, _, data: kept.append((clock.now() - begin, topic.name, data)), TOPICS)
+            rig.bus.tap(lambda topic, _, data, at: kept.append((at - begin, topic.name, data)), TOPICS)
             await clock.sleep(SAMPLE)
 
     run_virtual(main)

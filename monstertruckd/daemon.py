@@ -84,7 +84,7 @@ class Daemon:
     ) -> None:
         self.config = config
         self.clock = clock
-        self.bus = Bus(clock)
+        self.bus = Bus(clock, config.zenoh.gather_seconds if seed is None else 0.0)
         self.digest = LogDigest()
         self._seed = seed
         self._offload: Offload = in_thread if seed is None else inline
@@ -184,7 +184,7 @@ class Daemon:
         async with self.recorder as recorder:
             self._board.report(ServiceHealth(name=recorder.name, state=ServiceState.READY, since=self.clock.now()))
             tap = self.bus.tap(
-                lambda topic, message, data: recorder.record(topic, message.stamp, data),
+                lambda topic, message, data, at: recorder.record(topic, message.stamp, data, at),
                 (topic for topic in TOPICS if topic.logged),
             )
             try:
@@ -208,7 +208,7 @@ class Daemon:
             yield
             return
         tap = self.bus.tap(
-            lambda topic, message, data: box.record(topic, message.stamp, data),
+            lambda topic, message, data, at: box.record(topic, message.stamp, data, at),
             (topic for topic in TOPICS if topic.logged),
         )
         try:

@@ -1,7 +1,8 @@
 """In-process hand-over: one write end per topic, any number of read ends, messages passed by reference.
 
 Everything happens on the event loop. A message reaches listeners at once, then its readers in the order in which they
-subscribed; then the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all of them.
+subscribed; then, at once or a moment later, the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all
+of them.
 """
 
 import math
@@ -18,11 +19,14 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import CMD_DRIVES, CMD_STEERING, EVENT, Topic, Writer
+from monstertruckd.bus.outgoing import Outgoing
 
 M = TypeVar("M", bound=Message)
 
-TapCallback = Callable[[Topic[Any], Message, bytes], None]
-"""Gets every message of its topics with the bytes that stand for it outside; must not block."""
+TapCallback = Callable[[Topic[Any], Message, bytes, int], None]
+"""Gets every message of its topics with the bytes that stand for it outside, and when it was published, ns.
+
+Must not block, nor raise."""
 
 
 class LocalPublisher(Generic[M]):
@@ -62,10 +66,15 @@ class Bus:
 
     Write ends are handed out once each and only to the writer the topic table names, so that who may write what
     is settled while the daemon is put together.
+
+    Args:
+        clock: time.
+        gather_seconds: messages of frequent topics reach the taps together, after this time at the latest; 0: at once.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, gather_seconds: float = 0.0) -> None:
         self._clock = clock
+        self._outgoing = Outgoing(gather_seconds, self._tell_taps)
         self._claimed: set[str] = set()
         self._listeners: defaultdict[str, list[Callable[[Any], object]]] = defaultdict(list)
         self._readers: defaultdict[str, list[Mailbox[Any]]] = defaultdict(list)
@@ -128,13 +137,14 @@ class Bus:
 
         All taps of a topic share one encoding; a topic without taps is never encoded.
         """
+        self._outgoing.flush()
         chosen = tuple(topics)
         tap = Tap(self, callback, frozenset(topic.name for topic in chosen))
         for topic in chosen:
             self._taps[topic.name].append(tap)
         for topic, message, data in self.retained():
             if topic.name in tap.topics:
-                callback(topic, message, data)
+                callback(topic, message, data, self._clock.now())
         return tap
 
     def inject(self, topic: Topic[M], message: M) -> None:
@@ -166,17 +176,22 @@ class Bus:
             listener(message)
         for mailbox in tuple(self._readers[name]):
             mailbox.put(message)
-        taps = tuple(self._taps[name])
-        if taps:
-            data = wire.encode(topic, message)
-            for tap in taps:
-                tap.callback(topic, message, data)
+        if self._taps[name]:
+            self._outgoing.send(topic, message, self._clock.now())
 
     def untap(self, tap: Tap) -> None:
         """End ``tap``; see ``Tap.close``."""
+        self._outgoing.flush()
         for name in tap.topics:
             if tap in self._taps[name]:
                 self._taps[name].remove(tap)
+
+    def _tell_taps(self, topic: Topic[Any], message: Message, at: int) -> None:
+        taps = tuple(self._taps[topic.name])
+        if taps:
+            data = wire.encode(topic, message)
+            for tap in taps:
+                tap.callback(topic, message, data, at)
 
     def _claim(self, topic: Topic[M]) -> LocalPublisher[M]:
         if topic.name in self._claimed:

@@ -25,7 +25,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic, Writer, alive_key, rpc_key
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.outgoing import Outgoing, Put
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 
@@ -36,6 +35,8 @@ MAX_CALLS = 16
 MAX_WAITING_CALLS = 64
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
+Put = Callable[[bytes], None]
+
 _SCHEMA_PREFIX = "schema/"
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
 _SCHEMA_MEDIA = {
@@ -96,9 +97,8 @@ class ZenohBridge:
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             guard = partial(_guarded, failed)
             publishers = await in_thread(partial(self._declare_publishers, self._session))
-            outgoing = Outgoing(self._config.gather_seconds, guard)
             tap = self._bus.tap(
-                partial(self._send, outgoing, publishers),
+                partial(self._send, publishers, failed),
                 (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE),
             )
             try:
@@ -124,7 +124,6 @@ class ZenohBridge:
                             await failed
             finally:
                 tap.close()
-                outgoing.close()
         finally:
             await self.close()
 
@@ -177,11 +176,21 @@ class ZenohBridge:
         return session.liveliness().declare_token(alive_key(self._robot))
 
     def _send(
-        self, outgoing: Outgoing, publishers: dict[str, Put], topic: Topic[Any], _message: Message, data: bytes
+        self,
+        publishers: dict[str, Put],
+        failed: "asyncio.Future[None]",
+        topic: Topic[Any],
+        _message: Message,
+        data: bytes,
+        _at: int,
     ) -> None:
         if topic.retained:
             self._held[topic.name] = data
-        outgoing.send(topic, publishers[topic.name], data)
+        try:
+            publishers[topic.name](data)
+        except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine
+            if not failed.done():
+                failed.set_exception(bug)
 
     # Queries
 

@@ -149,17 +149,18 @@ class BlackBox:
         self._pending.clear()
         self._wake.set()
 
-    def record(self, topic: Topic[Any], stamp: int, payload: bytes) -> None:
+    def record(self, topic: Topic[Any], stamp: int, payload: bytes, at: int | None = None) -> None:
         """Remember one encoded message.
 
         Args:
             topic: its row of the table.
             stamp: the message's own stamp, ns.
             payload: its bytes on the wire.
+            at: when it was published, ns; None = now.
         """
         sequence = self._sequences[topic.name]
         self._sequences[topic.name] = sequence + 1
-        self.ring.add(Entry(topic, self._clock.now(), stamp, sequence, payload))
+        self.ring.add(Entry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
 
     def trip(self, trip: Trip) -> str | None:
         """Note a trip of the gate.

@@ -104,13 +104,14 @@ class Recorder:
         self._queue.put(None)
         await asyncio.shield(self._done)
 
-    def record(self, topic: Topic[Any], stamp: int, payload: bytes) -> None:
+    def record(self, topic: Topic[Any], stamp: int, payload: bytes, at: int | None = None) -> None:
         """Take one encoded message; never waits for the disk (except in deterministic runs).
 
         Args:
             topic: its row of the table; topics that are not logged are ignored.
             stamp: the message's own stamp, ns.
             payload: its bytes on the wire.
+            at: when it was published, ns; None = now.
         """
         if not topic.logged:
             return
@@ -125,7 +126,7 @@ class Recorder:
         self._bytes += len(payload)
         if not self._batch and not self._deterministic:
             self._loop.call_later(_BATCH_SECONDS, self._hand_over)
-        self._batch.append(Entry(topic, self._clock.now(), stamp, sequence, payload))
+        self._batch.append(Entry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
         if len(self._batch) >= _BATCH:
             self._hand_over()
 

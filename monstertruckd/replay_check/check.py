@@ -76,7 +76,7 @@ def check_log(
 
     async def main(clock: PacedClock) -> None:
         chain = Chain(used, clock, early_ticks(own, found), found)
-        tap = chain.bus.tap(_into(rows, clock), (row.topic for row in rows.values()))
+        tap = chain.bus.tap(_into(rows), (row.topic for row in rows.values()))
         async with chain.running():
             relevant = (entry for entry in reader if entry.topic in rows or chain.takes(entry.topic))
             for bunch in _bunches(relevant, chain.ticks):
@@ -144,9 +144,9 @@ async def _feed(
         await chain.take(BY_NAME[entry.topic], message, entry.log_time)
 
 
-def _into(rows: Mapping[str, TopicComparison], clock: PacedClock) -> TapCallback:
-    def take(topic: Topic[Message], _: Message, payload: bytes) -> None:
-        rows[topic.name].recomputed(clock.now(), payload)
+def _into(rows: Mapping[str, TopicComparison]) -> TapCallback:
+    def take(topic: Topic[Message], _: Message, payload: bytes, at: int) -> None:
+        rows[topic.name].recomputed(at, payload)
 
     return take
 

@@ -122,7 +122,7 @@ def test_taps_share_one_encoding_and_untapped_topics_are_not_encoded(bus: Bus, m
     monkeypatch.setattr(wire, "encode", counting)
     got: list[tuple[str, str, int, bytes]] = []
     taps = [
-        bus.tap(lambda topic, m, data, who=who: got.append((who, topic.name, m.seq, data)), [POSE, GATE])
+        bus.tap(lambda topic, m, data, _, who=who: got.append((who, topic.name, m.seq, data)), [POSE, GATE])
         for who in ("recorder", "zenoh")
     ]
     pose = bus.publisher(POSE, Writer.ESTIMATION)
@@ -142,9 +142,9 @@ def test_taps_share_one_encoding_and_untapped_topics_are_not_encoded(bus: Bus, m
 def test_a_tap_starts_with_what_is_retained_of_its_topics(bus: Bus):
     bus.publisher(GATE, Writer.GATE).put(state := gate_state(3))
     got: list[tuple[str, int]] = []
-    bus.tap(lambda topic, m, _: got.append((topic.name, m.seq)), TOPICS)
+    bus.tap(lambda topic, m, *_: got.append((topic.name, m.seq)), TOPICS)
     assert got == [("state/gate", 3)]
-    bus.tap(lambda topic, m, _: got.append((topic.name, m.seq)), [POSE])
+    bus.tap(lambda topic, m, *_: got.append((topic.name, m.seq)), [POSE])
     assert len(got) == 1
     assert list(bus.retained()) == [(GATE, state, wire.encode(GATE, state))]
 
@@ -154,7 +154,7 @@ def test_requests_come_in_from_outside_with_the_daemons_time_of_receipt():
         bus = Bus(clock)
         box = bus.subscribe(REQ_CONTROL, fifo(1))
         taps: list[int] = []
-        bus.tap(lambda _t, m, _d: taps.append(m.received), [REQ_CONTROL])
+        bus.tap(lambda _t, m, *_: taps.append(m.received), [REQ_CONTROL])
         claim = ControlRequest(
             stamp=5, received=2**62, seq=1, source="a", role=Role.STATION, lease=0.5, nonce="", order=Order.ARM
         )

@@ -1,30 +1,27 @@
-import asyncio
-
 import pytest
 
 from monstertruck_runtime.clock import run_virtual
-from monstertruck_schemas.topics import EVENT, ODOMETRY, POSE, SCAN
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import EVENT, ODOMETRY, POSE, SCAN, Writer
+from monstertruckd.bus.local import Bus
 from monstertruckd.bus.outgoing import Outgoing
+from tests.bus_kit import odometry
 
 
-def call(job):
-    job()
-
-
-def sent(scenario, seconds=0.02, guard=call):
-    """Names and milliseconds of what was put."""
+def delivered(scenario, seconds=0.02):
+    """Topics and milliseconds: when they were sent, when delivered."""
     found = []
 
     async def main(clock):
-        outgoing = Outgoing(seconds, guard)
         begin = clock.now()
-
-        def send(topic):
-            outgoing.send(
-                topic, lambda data: found.append((data.decode(), (clock.now() - begin) // 10**6)), topic.name.encode()
-            )
-
-        await scenario(send, outgoing, clock)
+        outgoing = Outgoing(
+            seconds,
+            lambda topic, _, at: found.append(
+                (topic.name, round((at - begin) / 10**6), round((clock.now() - begin) / 10**6))
+            ),
+        )
+        await scenario(lambda topic: outgoing.send(topic, None, clock.now()), outgoing, clock)
 
     run_virtual(main)
     return found
@@ -39,7 +36,7 @@ def test_frequent_messages_wait_for_each_other():
         send(ODOMETRY)
         await clock.sleep(0.1)
 
-    assert sent(scenario) == [("state/odometry", 20), ("state/pose", 20), ("state/odometry", 55)]
+    assert delivered(scenario) == [("state/odometry", 0, 20), ("state/pose", 5, 20), ("state/odometry", 35, 55)]
 
 
 @pytest.mark.parametrize("rare", [SCAN, EVENT])
@@ -51,7 +48,7 @@ def test_a_rare_message_leaves_at_once_behind_what_waits(rare):
         send(POSE)
         await clock.sleep(0.1)
 
-    assert sent(scenario) == [("state/odometry", 5), (rare.name, 5), ("state/pose", 20)]
+    assert delivered(scenario) == [("state/odometry", 0, 5), (rare.name, 5, 5), ("state/pose", 5, 20)]
 
 
 def test_nothing_waits_if_it_is_told_so():
@@ -59,35 +56,71 @@ def test_nothing_waits_if_it_is_told_so():
         send(ODOMETRY)
         await clock.sleep(0.1)
 
-    assert sent(scenario, seconds=0.0) == [("state/odometry", 0)]
+    assert delivered(scenario, seconds=0.0) == [("state/odometry", 0, 0)]
 
 
-def test_what_waits_at_the_end_is_put():
-    async def scenario(send, outgoing, clock):
-        send(ODOMETRY)
-        outgoing.close()
-        await clock.sleep(0.1)
+def test_a_failure_loses_only_its_own_message():
+    found = []
 
-    assert sent(scenario) == [("state/odometry", 0)]
-
-
-def test_a_failure_of_the_timers_put_is_told():
-    told = []
-
-    def guard(job):
-        try:
-            job()
-        except OSError as error:
-            told.append(error)
-
-    def refuse(_):
-        raise OSError
+    def deliver(topic, _, __):
+        if topic is ODOMETRY:
+            raise OSError("full")
+        found.append(topic.name)
 
     async def main(clock):
-        outgoing = Outgoing(0.02, guard)
-        outgoing.send(ODOMETRY, refuse, b"")
-        await asyncio.sleep(0.1)
-        outgoing.close()
+        outgoing = Outgoing(0.02, deliver)
+        outgoing.send(ODOMETRY, None, 0)
+        outgoing.send(POSE, None, 0)
+        with pytest.raises(OSError, match="full"):
+            outgoing.flush()
+        await clock.sleep(0.1)
 
     run_virtual(main)
-    assert len(told) == 1
+    assert found == ["state/pose"]
+
+
+def test_readers_get_a_message_at_once_and_taps_in_rows():
+    async def main(clock):
+        bus = Bus(clock, 0.02)
+        got, read = [], []
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        bus.listen(ODOMETRY, lambda message: read.append(message.seq))
+        bus.tap(lambda topic, message, _, at: got.append((topic.name, message.seq, at)), [ODOMETRY, EVENT])
+        first = clock.now()
+        out.put(odometry(0))
+        await clock.sleep(0.001)
+        second = clock.now()
+        out.put(odometry(1))
+        assert (read, got) == ([0, 1], [])
+        await clock.sleep(0.03)
+        assert got == [("state/odometry", 0, first), ("state/odometry", 1, second)]
+
+    run_virtual(main)
+
+
+def test_a_tap_gets_what_was_published_before_its_end_and_nothing_from_before_its_begin():
+    async def main(clock):
+        bus = Bus(clock, 0.02)
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        early, late = [], []
+        tap = bus.tap(lambda _t, message, *_: early.append(message.seq), [ODOMETRY])
+        out.put(odometry(0))
+        bus.tap(lambda _t, message, *_: late.append(message.seq), [ODOMETRY])
+        out.put(odometry(1))
+        tap.close()
+        out.put(odometry(2))
+        await clock.sleep(0.1)
+        assert (early, late) == ([0, 1], [1, 2])
+
+    run_virtual(main)
+
+
+def test_an_event_is_not_held_back():
+    async def main(clock):
+        bus = Bus(clock, 0.02)
+        got = []
+        bus.tap(lambda _t, message, *_: got.append(type(message)), [EVENT])
+        bus.event_sink()(Reason.DISARMED, Severity.INFO, "gate")
+        assert got == [Event]
+
+    run_virtual(main)

@@ -60,7 +60,7 @@ async def eventually(condition, seconds: float = 3.0) -> None:
 async def test_state_leaves_with_the_recorders_bytes_and_its_encoding():
     async with running_robot() as robot:
         recorded: list[bytes] = []
-        robot.bus.tap(lambda _t, _m, data: recorded.append(data), [POSE])
+        robot.bus.tap(lambda _t, _m, data, _: recorded.append(data), [POSE])
         got: list[tuple[bytes, str]] = []
         with raw_session(robot.endpoint) as station:
             station.declare_subscriber(
