@@ -13,7 +13,7 @@ from navigation_parts import Options, Part
 from navigation_parts.deformation import CARS, drive, told
 from navigation_parts.deformation_world import unseen
 
-SEEDS = 12
+SEEDS = 8
 METHODS: dict[str, DeformConfig] = {"rsband": RsbandConfig(), "teb": TebConfig()}
 
 
