@@ -26,6 +26,8 @@ class Motion:
         self.front = 0.0
         self.rear = 0.0
         self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
+        self._unit = (0.0, 0.0), chassis.shaft_speeds(1.0, 0.0, 0.0)
+        self._shafts = (0.0, 0.0, 0.0), chassis.shaft_speeds(0.0, 0.0, 0.0)
 
     @property
     def servos(self) -> tuple[float, float]:
@@ -42,7 +44,10 @@ class Motion:
     @property
     def shaft_speeds(self) -> tuple[float, ...]:
         """What the driven shafts have to do for it, m/s over ground."""
-        return self._chassis.shaft_speeds(self.speed, self.front, self.rear)
+        wanted = self.speed, self.front, self.rear
+        if self._shafts[0] != wanted:
+            self._shafts = wanted, self._chassis.shaft_speeds(*wanted)
+        return self._shafts[1]
 
     def clipped_angles(self, request: DriveRequest) -> tuple[float, float, bool]:
         """Axle angles within the limits that keep the curvature asked for, and whether that changed them."""
@@ -55,7 +60,9 @@ class Motion:
     def cap(self, direction: float) -> float:
         """Greatest speed of the base at the present axle angles, m/s: the wheels must not exceed theirs."""
         wheels = self._config.speed if direction >= 0 else self._config.reverse_speed
-        return wheels / max(1.0, *map(abs, self._chassis.shaft_speeds(1.0, self.front, self.rear)))
+        if self._unit[0] != (self.front, self.rear):
+            self._unit = (self.front, self.rear), self._chassis.shaft_speeds(1.0, self.front, self.rear)
+        return wheels / max(1.0, *map(abs, self._unit[1]))
 
     def steer(self, front: float, rear: float, dt: float) -> None:
         """Turn both axles towards (front, rear) by one common share of the way, within the steering rate."""
