@@ -1,5 +1,6 @@
 """A Hybrid-A* search for a first way, which can be interrupted and gone on with. Compiled."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ MOST_NODES = 400_000
 """In one search."""
 
 
+MOST_POSES = 1 << 26
+"""Told apart in one search: a table of 256 MB, of which only what is visited takes memory."""
+
+
 @dataclass(frozen=True)
 class Level:
     """How finely poses are told apart."""
@@ -29,6 +34,17 @@ class Level:
     move: float
     """The same."""
     headings: int = 36
+
+    def fitting(self, field: FieldData, radius: float) -> "Level":
+        """This level, or on a map too large for it a coarser one.
+
+        Args:
+            field: the map.
+            radius: turning radius, m.
+        """
+        poses = field.occupied.size * (field.resolution / (self.cell * radius)) ** 2 * self.headings
+        factor = max(math.sqrt(poses / MOST_POSES), 1.0)
+        return Level(self.cell * factor, self.move * factor, self.headings)
 
 
 LEVELS = (Level(0.35, 0.55), Level(0.15, 0.25), Level(0.06, 0.1, 72))

@@ -276,6 +276,7 @@ class _Run:
         return None, Reason.GOAL_UNREACHABLE if fine.exhausted else Reason.ROUTE_TIMEOUT, "no drivable way found"
 
     def _hunt(self, go: togo.ToGo, level: Level, sight: float = np.inf) -> Hunt:
+        level = level.fitting(self.field, self.vehicle.radius)
         return Hunt(self.question, self.planner.car(level), go, level, sight)
 
     def _in_turns(self, fine: Hunt, coarse: Hunt) -> Array | None:

@@ -8,6 +8,7 @@ import pytest
 from monstertruck_planners.collision import DistanceField, Footprint
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.fit import fits
+from monstertruck_planners.route.hunt import LEVELS, MOST_POSES
 from monstertruck_planners.route.hybrid import HybridPlanner, narrower
 from monstertruck_planners.route.replan import Waypoint, plan_through, replan
 from monstertruck_schemas.reasons import Reason
@@ -109,3 +110,12 @@ def test_footprints_of_another_shape_fit_too():
     assert fits(field, long.body(), 0.0, 1.0, 1.0)
     cells[:, 28:] = True
     assert not fits(DistanceField(cells, 0.05).data(), long.body(), 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_table_of_a_search_stays_small_on_any_map(level):
+    small, large = (DistanceField(np.zeros((n, n), bool), 0.1).data() for n in (100, 1500))
+    assert level.fitting(small, 0.378) == level
+    fitted = level.fitting(large, 0.378)
+    assert (150.0 / (fitted.cell * 0.378)) ** 2 * fitted.headings < 1.01 * MOST_POSES
+    assert fitted.move / fitted.cell == pytest.approx(level.move / level.cell)
