@@ -49,9 +49,9 @@ def replay(
 
 
 def _check(log: Path, config: Path | None, tolerance: float | None, *, json_output: bool) -> None:
-    from monstertruckd.replay_check import check_log
+    from monstertruckd.replay_check import check_log, parts_of
 
-    with progress("check", log.stat().st_size if log.is_file() else None) as done:
+    with progress("check", sum(part.stat().st_size for part in parts_of(log)) if log.is_file() else None) as done:
         result = check_log(log, config, tolerance, done)
     if json_output:
         print_json(result.figures())
@@ -62,7 +62,8 @@ def _check(log: Path, config: Path | None, tolerance: float | None, *, json_outp
 
 def _show(result: "Check") -> None:
     whose = "the log's own configuration" if result.config is None else str(result.config)
-    print(f"{result.log}  {result.duration:.1f} s with {whose}")
+    parts = f" (a run of {len(result.parts)} parts)" if len(result.parts) > 1 else ""
+    print(f"{result.log}{parts}  {result.duration:.1f} s with {whose}")
     print_table(
         ("topic", "compared", "equal", "missing", "extra", "greatest difference"),
         [
@@ -115,7 +116,7 @@ def _verdict(result: "Check") -> str:
     from monstertruck_schemas.reasons import Reason
 
     if result.reason is Reason.LOG_DAMAGED:
-        return f"{result.log}: {result.damage}; `monstertruckd log recover` keeps what is sound"
+        return f"{result.log}: {result.damage}"
     if result.reason is Reason.REPLAY_DIFFERS:
         return f"{result.log}: {Reason.REPLAY_DIFFERS.text}"
     return ""

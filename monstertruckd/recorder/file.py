@@ -17,7 +17,9 @@ from monstertruckd import __version__
 from monstertruckd.logs.channels import Channels
 from monstertruckd.recorder.config import Compression
 
-_NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
+NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
+"""Of a log: run and part."""
+
 _COMPRESSION: Final = {
     Compression.NONE: CompressionType.NONE,
     Compression.LZ4: CompressionType.LZ4,
@@ -168,7 +170,7 @@ class LogFolder:
         directory.mkdir(parents=True, exist_ok=True)
         self._run = (
             max(
-                (int(name[1]) for name in (_NAME.fullmatch(path.name) for path in directory.iterdir()) if name),
+                (int(name[1]) for name in (NAME.fullmatch(path.name) for path in directory.iterdir()) if name),
                 default=0,
             )
             + 1
@@ -190,6 +192,6 @@ class LogFolder:
         """Size of every log but ``current``, oldest first."""
         found = {}
         for path in sorted(self.directory.iterdir()):
-            if _NAME.fullmatch(path.name) and path != current:
+            if NAME.fullmatch(path.name) and path != current:
                 found[path] = path.stat().st_size
         return found

@@ -2,5 +2,6 @@
 
 from monstertruckd.replay_check.check import check_log
 from monstertruckd.replay_check.result import Check
+from monstertruckd.replay_check.run_log import parts_of
 
-__all__ = ["Check", "check_log"]
+__all__ = ["Check", "check_log", "parts_of"]

@@ -18,12 +18,13 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.bus.local import TapCallback
 from monstertruckd.config.load import load_truck
-from monstertruckd.logs import LogMessage, open_log
+from monstertruckd.logs import LogMessage
 from monstertruckd.replay_check.chain import WORKER, Chain, early_ticks, outputs_of
 from monstertruckd.replay_check.comparison import TopicComparison
 from monstertruckd.replay_check.pace import PacedClock
 from monstertruckd.replay_check.recorded import Survey, preamble, recorded_config, survey
 from monstertruckd.replay_check.result import Check, Unreadable
+from monstertruckd.replay_check.run_log import RunLog
 
 RESTS_ON_WORKER: Final = frozenset(
     topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
@@ -42,18 +43,18 @@ def check_log(
     """Compute the outputs of ``log`` again and compare them.
 
     Args:
-        log: file to read.
+        log: file to read; of a run in several parts any one stands for all.
         config: another configuration to compute with; None = the log's own.
         tolerance: greatest difference that agrees, in SI units, instead of the ones above.
-        progress: told the bytes of the log read so far.
+        progress: told the bytes of the run read so far.
 
     Raises:
         NotFoundError: no such log, configuration or saved map.
-        InputError: the log holds no configuration, no sensors, no outputs, or begins in the middle of a run.
+        InputError: the log holds no configuration, no sensors, no outputs, or has no first part.
         ConfigError: a configuration is refused.
         WorkerError: the estimation worker failed.
     """
-    reader = open_log(log)
+    reader = RunLog(log)
     found = survey(reader)
     attachments, metadata = preamble(reader)
     own = recorded_config(log, attachments)
@@ -92,6 +93,7 @@ def check_log(
     end = max((found.newest[name].log_time for name in compared & found.newest.keys()), default=found.end)
     return Check(
         log,
+        reader.parts,
         config,
         (found.end - found.start) / SECOND,
         end,

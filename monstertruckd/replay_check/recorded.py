@@ -15,7 +15,8 @@ from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.logs import LogMessage, LogReader
+from monstertruckd.logs import LogMessage
+from monstertruckd.replay_check.run_log import RunLog
 
 CONFIG: Final = "config.json"
 SIMULATION: Final = "sim"
@@ -45,7 +46,7 @@ class Survey:
         return {name: gap for name, span in spans.items() if (gap := span - self.counts[name]) > 0}
 
 
-def survey(log: LogReader) -> Survey:
+def survey(log: RunLog) -> Survey:
     """Read the log once.
 
     Raises:
@@ -77,7 +78,7 @@ def _note_ready(entry: LogMessage, ready: dict[str, int]) -> None:
             ready.setdefault(event.source, entry.log_time)
 
 
-def preamble(log: LogReader) -> tuple[dict[str, bytes], dict[str, str]]:
+def preamble(log: RunLog) -> tuple[dict[str, bytes], dict[str, str]]:
     """Attachments by name, and what the log says of its run."""
     attachments: dict[str, bytes] = {}
     run: dict[str, str] = {}

@@ -24,6 +24,8 @@ class Check:
     """What came out."""
 
     log: Path
+    parts: tuple[Path, ...]
+    """The files of its run."""
     config: Path | None
     """The other configuration; None = the log's own."""
     duration: float
@@ -67,6 +69,7 @@ class Check:
         """Everything as plain values for JSON: what is not finite becomes null."""
         return {
             "log": str(self.log),
+            "parts": [str(part) for part in self.parts],
             "config": None if self.config is None else str(self.config),
             "reason": self.reason,
             "agrees": self.agrees,
