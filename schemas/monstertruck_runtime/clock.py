@@ -15,14 +15,21 @@ import selectors
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Coroutine
-from typing import Any, Protocol, TypeVar, TypeVarTuple
+from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 SECOND = 1_000_000_000
 """Nanoseconds of a second."""
+
+MANY_TIMERS: Final = 100
+"""From so many on, cancelled timers are cleared away."""
+
+LONGEST_JUMP: Final = 86_400.0
+"""Seconds that a virtual loop waits at a time, as asyncio's own."""
 
 
 class Clock(Protocol):
@@ -83,109 +90,114 @@ class WallClock(_LoopClock):
 class VirtualLoop(asyncio.SelectorEventLoop):
     """Event loop whose time jumps to the next timer when nothing is ready.
 
-    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run.
+    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run. The
+    kernel is asked only when another thread has woken the loop, when files beside its own wake-up pipe are watched, or
+    when there is no timer to jump to.
 
     Args:
         start: first instant, ns.
         rate: greatest speed relative to real time; ``None`` runs as fast as it can.
     """
 
-    _scheduled: list[asyncio.TimerHandle]
+    _ready: deque[asyncio.Handle]
+    _stopping: bool
+    _clock_resolution: float
+    _timer_cancelled_count: int
 
     def __init__(self, start: int = 0, rate: float | None = None) -> None:
-        self._now = start
+        self.instant = start
+        """Virtual nanoseconds."""
         self._real_start = time.monotonic_ns()
         self._start = start
         self._rate = rate
+        self._timers: list[tuple[float, int, asyncio.TimerHandle]] = []
+        """Heap of (when in s, number in the order of setting, handle)."""
         self._timers_set = 0
-        self.woken = threading.Event()
+        self._woken = threading.Event()
         """Another thread has something for the loop."""
-        super().__init__(_JumpingSelector(self))
+        self._watcher = _CountingSelector()
+        super().__init__(self._watcher)
 
     def time(self) -> float:
         """Virtual seconds."""
-        return self._now / SECOND
-
-    def now(self) -> int:
-        """Virtual nanoseconds."""
-        return self._now
+        return self.instant / SECOND
 
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.TimerHandle:
         """As in asyncio, but first set, first fired."""
-        timer = _OrderedTimer(when, callback, args, self, context)
-        timer.order = self._timers_set
+        timer = asyncio.TimerHandle(when, callback, args, self, context)
+        heapq.heappush(self._timers, (when, self._timers_set, timer))
         self._timers_set += 1
-        heapq.heappush(self._scheduled, timer)
-        timer._scheduled = True  # noqa: SLF001  # the loop's own mark
+        timer._scheduled = True  # type: ignore[attr-defined]  # noqa: SLF001  # the loop's own mark: it counts those cancelled
         return timer
 
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """As in asyncio; also tells the selector, which otherwise never asks the kernel."""
+        """As in asyncio; also notes that the kernel has to be asked."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
-        self.woken.set()
+        self._woken.set()
         return handle
 
+    def _run_once(self) -> None:
+        """One turn, in asyncio's order: events, timers, then all that is ready now."""
+        timers, ready = self._timers, self._ready
+        self._drop_cancelled()
+        idle = not ready and not self._stopping
+        events: list[tuple[selectors.SelectorKey, int]] = []
+        if self._watcher.count > 1 or self._woken.is_set() or (idle and not timers):
+            self._woken.clear()
+            events = self._watcher.select(None if idle and not timers else 0)
+            self._process_events(events)  # type: ignore[attr-defined]
+        if idle and timers and not events and (wait := timers[0][0] - self.time()) > 0:
+            self.jump(min(wait, LONGEST_JUMP))
+        end = self.time() + self._clock_resolution
+        while timers and timers[0][0] < end:
+            timer = heapq.heappop(timers)[2]
+            timer._scheduled = False  # type: ignore[attr-defined]  # noqa: SLF001
+            ready.append(timer)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:  # noqa: SLF001
+                handle._run()  # noqa: SLF001
+
+    def _drop_cancelled(self) -> None:
+        """Forget cancelled timers that are next, or all once they are the majority of many."""
+        timers = self._timers
+        if len(timers) > MANY_TIMERS and self._timer_cancelled_count > len(timers) / 2:
+            timers[:] = [entry for entry in timers if not entry[2].cancelled()]
+            heapq.heapify(timers)
+            self._timer_cancelled_count = 0
+        while timers and timers[0][2]._cancelled:  # noqa: SLF001
+            heapq.heappop(timers)
+            self._timer_cancelled_count -= 1
+
     def jump(self, seconds: float) -> None:
-        """Advance by ``seconds``; called by the selector when nothing is ready.
+        """Advance by ``seconds``.
 
         One nanosecond is added because the loop compares timers in float seconds.
         """
-        self._now += round(seconds * SECOND) + 1
+        self.instant += round(seconds * SECOND) + 1
         if self._rate is not None:
-            due = self._real_start + int((self._now - self._start) / self._rate)
+            due = self._real_start + int((self.instant - self._start) / self._rate)
             time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
 
 
-class _OrderedTimer(asyncio.TimerHandle):
-    """Timer that yields to those of the same instant that were set before it."""
+class _CountingSelector(selectors.DefaultSelector):
+    """Knows how many files are watched."""
 
-    __slots__ = ("order",)
-    order: int
-    _when: float
-    _scheduled: bool
-
-    def __lt__(self, other: "_OrderedTimer") -> bool:  # type: ignore[override]  # a heap of these alone; it is hot
-        mine, theirs = self._when, other._when
-        return mine < theirs or (mine == theirs and self.order < other.order)
-
-
-class _JumpingSelector(selectors.DefaultSelector):
-    """Never waits for a timer: if nothing came, the loop jumps.
-
-    With nothing but the loop's own wake-up pipe registered, the kernel is asked only when a thread has woken the
-    loop, or when there is no timer to jump to: asking at every turn would cost an eighth of a run.
-    """
-
-    def __init__(self, loop: VirtualLoop) -> None:
-        super().__init__()
-        self._loop = loop
-        self._files = 0
+    count = 0
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
         key = super().register(fileobj, events, data)
-        self._files += 1
+        self.count += 1
         return key
 
     def unregister(self, fileobj: Any) -> selectors.SelectorKey:
         key = super().unregister(fileobj)
-        self._files -= 1
+        self.count -= 1
         return key
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        events: list[tuple[selectors.SelectorKey, int]] = []
-        if timeout is None:
-            self._loop.woken.clear()
-            return super().select(None)
-        if self._files > 1 or self._loop.woken.is_set():
-            self._loop.woken.clear()
-            events = super().select(0)
-        if not events and timeout > 0:
-            self._loop.jump(timeout)
-        return events
 
 
 class VirtualClock(_LoopClock):
@@ -197,7 +209,7 @@ class VirtualClock(_LoopClock):
 
     def now(self) -> int:
         """Virtual nanoseconds."""
-        return self._loop.now()
+        return self._loop.instant
 
     def real_offset(self) -> int:
         """The offset given at construction, and the steps since."""
