@@ -11,7 +11,7 @@ from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Odom
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.stabiliser import StabiliserService
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_runtime.clock import Clock
@@ -47,11 +47,15 @@ class Body:
 
     chassis: Chassis
     footprint: Footprint
+    points: ScanPoints
+    """Of the newest scan."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> Self:
         """Of a configured robot."""
-        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width))
+        lidar = config.devices.lidar
+        points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
+        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points)
 
 
 def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
@@ -164,7 +168,6 @@ def _build_tracker(
     places: Places,
 ) -> Service:  # fmt: skip
     lidar, placement = config.devices.lidar, config.placement.tracker
-    mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
     inputs: dict[str, Subscription[Any]] = {
         "pose": bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
         "path": bus.subscribe(topics.PATH, latest()),
@@ -177,7 +180,12 @@ def _build_tracker(
     told, events = bus.publisher(topics.TRACKER, Writer.PLANNER), bus.event_sink()
     if placement != "loop":
         setup = TrackSetup(
-            tracker, body.chassis.bicycle, body.footprint, mount, scan="scan" in inputs, attitude="attitude" in inputs
+            tracker,
+            body.chassis.bicycle,
+            body.footprint,
+            body.points.mount,
+            scan="scan" in inputs,
+            attitude="attitude" in inputs,
         )
         actor = places.actor(placement, "tracking", TARGET, latency=0.0, deadline=STEP_DEADLINE)
         return PlacedTracker(setup, clock, actor, inputs=inputs, drive=wishes, tracker=told, events=events)
@@ -186,7 +194,7 @@ def _build_tracker(
         clock,
         steering=body.chassis.bicycle,
         footprint=body.footprint,
-        lidar=mount,
+        points=body.points,
         pose=inputs["pose"],
         path=inputs["path"],
         gate=inputs["gate"],

@@ -269,12 +269,11 @@ class Daemon:
         config, bus = self.config, self.bus
         latch = self._build_latch()
         nonce = secrets.token_hex(8) if self._seed is None else self._rng.bytes(8).hex()
-        lidar = config.devices.lidar
         gate = Gate(
             config.gate,
             chassis=self._body.chassis,
             footprint=self._body.footprint,
-            lidar=lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0),
+            points=self._body.points,
             nonce=nonce,
             latched=latch.engaged(),
         )

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
@@ -57,7 +57,7 @@ class Gate:
         config: limits.
         chassis: what the body can do, and how its motors and servos do it.
         footprint: the truck's outline.
-        lidar: pose (x, y, yaw) of the lidar in base.
+        points: of scans, in base.
         nonce: of this run; requests must carry it.
         latched: whether the emergency stop was latched when the daemon last ran.
 
@@ -71,7 +71,7 @@ class Gate:
         *,
         chassis: Chassis,
         footprint: Footprint,
-        lidar: tuple[float, float, float],
+        points: ScanPoints,
         nonce: str,
         latched: bool = False,
     ) -> None:
@@ -86,7 +86,7 @@ class Gate:
         self._sources = Sources(nonce, config)
         self._watch = Watch(config, chassis)
         self._outages = Outages()
-        self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, lidar)
+        self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, points)
         self._motion = Motion(config, chassis)
         self._pursuit = Pursuit(config, self._motion, self._obstacles, self._watch)
         # Other bodies are turned by their wheel speeds, or not at all, and have no lone servo supply to lose.

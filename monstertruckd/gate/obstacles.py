@@ -1,11 +1,13 @@
 """How fast the truck may go before it meets what the newest scan shows."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, first_contact, scan_points, swept_poses
+from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.gate.config import GateConfig
@@ -16,7 +18,11 @@ POSES = 20
 ANGLE_STEP = 0.005
 """Axle angles are rounded to this before the sweep, rad: 2 mm at its end, and hardly a sweep is done twice."""
 
+SWEEPS = 256
+"""Sweeps remembered."""
+
 Arcs = tuple[tuple[float, float], ...]
+Array = NDArray[np.float64]
 
 
 class ObstacleGuard:
@@ -28,7 +34,7 @@ class ObstacleGuard:
         config: limits.
         steering: the truck's geometry.
         footprint: its outline.
-        lidar: pose (x, y, yaw) of the lidar in base.
+        points: of scans, in base.
     """
 
     def __init__(
@@ -36,26 +42,26 @@ class ObstacleGuard:
         config: GateConfig,
         steering: FourWheelSteering,
         footprint: Footprint,
-        lidar: tuple[float, float, float],
+        points: ScanPoints,
     ) -> None:
         self._config = config
         self._steering = steering
         self._footprint = footprint
-        self._lidar = lidar
+        self._scan_points = points
         self._points = np.empty((0, 2))
         self._stamp = 0
         self._checked: tuple[float, tuple[tuple[int, int], ...]] | None = None
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._way(config.speed, delay, config.obstacle.deceleration)
+        self._near = self._reach + footprint.circumscribed_radius + config.obstacle.beside
         self._distances = np.linspace(0.0, self._reach, POSES)
+        self._sweep = lru_cache(SWEEPS)(self._swept)
 
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
-        points = scan_points(scan, self._lidar)
-        reach = self._reach + self._footprint.circumscribed_radius + self._config.obstacle.beside
-        near = np.hypot(points[:, 0], points[:, 1]) < reach
-        self._points = points[near]
+        points = self._scan_points.of(scan)
+        self._points = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
         self._stamp = scan.stamp
         self._checked = None
 
@@ -69,12 +75,16 @@ class ObstacleGuard:
         rounded = tuple((round(front / ANGLE_STEP), round(rear / ANGLE_STEP)) for front, rear in arcs)
         if self._checked != (direction, rounded):
             self._checked = (direction, rounded)
-            ways = (self._free_way(direction, f * ANGLE_STEP, r * ANGLE_STEP) for f, r in {*rounded})
+            ways = (self._free_way(direction, *arc) for arc in {*rounded})
             self._free = min(ways) if len(self._points) else math.inf
         return self._free
 
-    def _free_way(self, direction: float, front: float, rear: float) -> float:
-        poses = swept_poses(self._steering, front, rear, direction * self._distances)
+    def _swept(self, direction: float, front: int, rear: int) -> Array:
+        """Poses along the way with axle angles in steps of ``ANGLE_STEP``."""
+        return swept_poses(self._steering, front * ANGLE_STEP, rear * ANGLE_STEP, direction * self._distances)
+
+    def _free_way(self, direction: float, front: int, rear: int) -> float:
+        poses = self._sweep(direction, front, rear)
         contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.beside)
         return math.inf if contact is None else float(self._distances[contact - 1])
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.manage.exchange import Pose
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.service import TrackerService
@@ -134,7 +134,7 @@ class TrackingWorker:
             _NO_CLOCK,
             steering=setup.steering,
             footprint=setup.footprint,
-            lidar=setup.lidar,
+            points=ScanPoints(setup.lidar),
             pose=self._slots["pose"],
             path=self._slots["path"],
             gate=self._slots["gate"],

@@ -146,9 +146,10 @@ def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Arr
 
 def _beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, Array]:
     """How far every point lies beyond the footprint's ends and sides, each of shape (m, n), m."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = np.column_stack((c, s)) @ points.T - (c * poses[:, 0] + s * poses[:, 1])[:, None]
-    y = np.column_stack((-s, c)) @ points.T - (c * poses[:, 1] - s * poses[:, 0])[:, None]
+    at_x, at_y, yaw = poses.T
+    c, s = np.cos(yaw), np.sin(yaw)
+    x = np.column_stack((c, s)) @ points.T - (c * at_x + s * at_y)[:, None]
+    y = np.column_stack((-s, c)) @ points.T - (c * at_y - s * at_x)[:, None]
     return np.abs(x - footprint.offset) - footprint.half_length, np.abs(y) - footprint.half_width
 
 
@@ -248,10 +249,31 @@ def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:
     Returns:
         Shape (n, 2), m.
     """
-    valid = (scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)
+    valid = ((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]
     ranges = scan.ranges[valid]
-    bearing = mount[2] + scan.start_angle + scan.angle_increment * np.flatnonzero(valid)
-    return np.column_stack((mount[0] + ranges * np.cos(bearing), mount[1] + ranges * np.sin(bearing)))
+    bearing = mount[2] + scan.start_angle + scan.angle_increment * valid
+    points = np.empty((len(valid), 2))
+    points[:, 0] = mount[0] + ranges * np.cos(bearing)
+    points[:, 1] = mount[1] + ranges * np.sin(bearing)
+    return points
+
+
+class ScanPoints:
+    """``scan_points`` of the newest scan, computed once for all who ask; not to be written to.
+
+    Args:
+        mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
+    """
+
+    def __init__(self, mount: tuple[float, float, float]) -> None:
+        self.mount = mount
+        self._newest: tuple[LaserScan, Array] | None = None
+
+    def of(self, scan: LaserScan) -> Array:
+        """Shape (n, 2), m."""
+        if self._newest is None or self._newest[0] is not scan:
+            self._newest = scan, scan_points(scan, self.mount)
+        return self._newest[1]
 
 
 class DistanceField:

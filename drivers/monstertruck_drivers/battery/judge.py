@@ -24,6 +24,9 @@ CELL_VOLTS: Final = (
 )  # fmt: skip
 """Resting voltage of a lithium-polymer cell at 0, 5 .. 100 % (table in common circulation, of no one maker)."""
 
+_CELL_VOLTS: Final = np.array(CELL_VOLTS)
+_CHARGES: Final = np.linspace(0.0, 1.0, len(CELL_VOLTS))
+
 
 def charge_of(cell_volts: float) -> float:
     """Share of the capacity left at a resting cell voltage, 0..1.
@@ -31,7 +34,7 @@ def charge_of(cell_volts: float) -> float:
     Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a
     divider for six cells: no better than 0.1 either way.
     """
-    return float(np.interp(cell_volts, CELL_VOLTS, np.linspace(0.0, 1.0, len(CELL_VOLTS))))
+    return float(np.interp(cell_volts, _CELL_VOLTS, _CHARGES))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, clearance_to_points, points_near, scan_points
+from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
 from monstertruck_planners.track.api import Command, TruckState
 from monstertruck_planners.track.catalog import build_tracker
 from monstertruck_planners.track.config import TrackerConfig
@@ -51,7 +51,7 @@ class TrackerService:
         clock: time.
         steering: the truck's geometry.
         footprint: its outline.
-        lidar: pose (x, y, yaw) of the lidar in base.
+        points: of scans, in base.
         pose: pose of base in the paths' frame.
         path: what to follow.
         gate: state of the gate, with the nonce.
@@ -71,7 +71,7 @@ class TrackerService:
         *,
         steering: FourWheelSteering,
         footprint: Footprint,
-        lidar: tuple[float, float, float],
+        points: ScanPoints,
         pose: Subscription[Odometry],
         path: Subscription[Path],
         gate: Subscription[GateState],
@@ -85,7 +85,8 @@ class TrackerService:
         self._clock = clock
         self._law = build_tracker(config, steering)
         self._footprint = footprint
-        self._lidar = lidar
+        self._points = points
+        self._near = footprint.circumscribed_radius + config.slow_clearance
         self._pose = pose
         self._path = path
         self._gate = gate
@@ -191,8 +192,7 @@ class TrackerService:
         c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
         dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
         poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
-        reach = self._footprint.circumscribed_radius + self._config.slow_clearance
-        near = points_near(scan_points(scan, self._lidar), poses, reach)
+        near = points_near(self._points.of(scan), poses, self._near)
         return float(clearance_to_points(self._footprint, poses, near).min())
 
     def _feel(self, now: int) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from monstertruck_kinematics.chassis import build_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
@@ -38,7 +38,7 @@ def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, **config):
         GateConfig(**config),
         chassis=chassis,
         footprint=Footprint(),
-        lidar=(0.14, 0.0, 0.0),
+        points=ScanPoints((0.14, 0.0, 0.0)),
         nonce=nonce,
         latched=latched,
     )

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from monstertruck_kinematics.truck import AxlePolynomials, SteeringPolynomials
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_schemas.cmd import DriveAction
@@ -376,7 +376,7 @@ def test_the_linkage_must_reach_the_limit():
             GateConfig(),
             chassis=replace(CHASSIS, linkage=SteeringPolynomials(short, short)),
             footprint=Footprint(),
-            lidar=(0.14, 0.0, 0.0),
+            points=ScanPoints((0.14, 0.0, 0.0)),
             nonce="n",
         )
 

@@ -6,7 +6,7 @@ import pytest
 
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.line import Line
 from monstertruck_planners.track.pure_pursuit import PurePursuit
@@ -48,7 +48,7 @@ class Bench:
             clock,
             steering=FourWheelSteering(),
             footprint=Footprint(),
-            lidar=(0.14, 0.0, 0.0),
+            points=ScanPoints((0.14, 0.0, 0.0)),
             pose=self.pose_in,
             path=self.path_in,
             gate=self.gate_in,
