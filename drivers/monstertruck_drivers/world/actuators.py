@@ -39,14 +39,15 @@ class Shaft:
         before = self.rpm
         if self._target is None:
             self.demand_rpm = 0.0
-            self.rpm = _towards(self.rpm, 0.0, self._config.coast_rpm_s * dt)
+            rpm = _towards(before, 0.0, self._config.coast_rpm_s * dt)
         else:
-            self.demand_rpm = _towards(self.demand_rpm, self._target, self._acceleration * dt)
-            self.rpm = self.demand_rpm + (self.rpm - self.demand_rpm) * exp(-dt / self._config.lag)
-            if abs(self.rpm) < 0.5 and self.demand_rpm == 0.0:
-                self.rpm = 0.0
-        self.turns += (before + self.rpm) / 2 * dt / 60
-        self.slope = (self.rpm - before) / dt
+            demand = self.demand_rpm = _towards(self.demand_rpm, self._target, self._acceleration * dt)
+            rpm = demand + (before - demand) * exp(-dt / self._config.lag)
+            if demand == 0.0 and abs(rpm) < 0.5:
+                rpm = 0.0
+        self.rpm = rpm
+        self.turns += (before + rpm) / 2 * dt / 60
+        self.slope = (rpm - before) / dt
 
 
 class Servo:
@@ -61,6 +62,8 @@ class Servo:
         self._left_stop = min(SERVO_LIMIT, radians(config.left_stop_deg))
         self._right_stop = -min(SERVO_LIMIT, radians(config.right_stop_deg))
         self._held_us: float | None = None
+        self._target = 0.0
+        """Angle of the held pulse, rad."""
         self.angle = 0.0
         """Of the arm, rad."""
 
@@ -72,15 +75,15 @@ class Servo:
         measured = floor(pulse_us / self._config.resolution_us + 0.5) * self._config.resolution_us
         if self._held_us is None or abs(measured - self._held_us) > self._config.dead_band_us:
             self._held_us = measured
+            target = radians((measured - self._config.centre_us) / self._config.us_per_degree)
+            self._target = min(max(target, self._right_stop), self._left_stop)
 
     def step(self, dt: float) -> None:
         """Turn towards the held pulse for dt seconds."""
-        if self._held_us is None:
-            return
-        target = radians((self._held_us - self._config.centre_us) / self._config.us_per_degree)
-        target = min(max(target, self._right_stop), self._left_stop)
-        self.angle = _towards(self.angle, target, self._config.rate * dt)
+        if self._held_us is not None:
+            self.angle = _towards(self.angle, self._target, self._config.rate * dt)
 
 
 def _towards(value: float, target: float, step: float) -> float:
-    return target if abs(target - value) <= step else value + copysign(step, target - value)
+    left = target - value
+    return target if abs(left) <= step else value + copysign(step, left)

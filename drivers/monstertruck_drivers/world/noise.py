@@ -50,13 +50,15 @@ class SlowNoise:
         self._white = WhiteNoise(seed, stream, size)
         self._period = period_ns
         self._slot = -1
-        self._ends: tuple[list[float], list[float]] = ([], [])
+        self._lines: list[tuple[float, float]] = []
+        """Value at the slot's beginning and change over it, one a channel."""
 
     def at(self, elapsed_ns: int) -> list[float]:
         """Values at a time since the world's start, one a channel."""
         slot, rest = divmod(elapsed_ns, self._period)
         if slot != self._slot:
-            self._ends = self._white.at(slot), self._white.at(slot + 1)
+            ends = self._white.at(slot), self._white.at(slot + 1)
+            self._lines = [(before, after - before) for before, after in zip(*ends, strict=True)]
             self._slot = slot
         part = rest / self._period
-        return [before + (after - before) * part for before, after in zip(*self._ends, strict=True)]
+        return [before + change * part for before, change in self._lines]

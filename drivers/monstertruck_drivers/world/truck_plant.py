@@ -92,6 +92,12 @@ class TruckPlant:
         self.battery = Battery(battery)
         self._chassis = config.chassis()
         count = len(self._chassis.shafts)
+        self._mass = config.mass / count
+        """Share of every driven shaft, kg."""
+        self._weight = self._mass * GRAVITY
+        self._rolling = config.rolling_resistance * self._weight
+        self._gearing = config.motor.ratio * config.motor.efficiency
+        self._quiet = [0.0] * (2 + count)
         self.shafts = tuple(Shaft(config.motor) for _ in range(count))
         self.currents = [0.0] * count
         self.pulses: PulseSource | None = None
@@ -189,13 +195,12 @@ class TruckPlant:
 
     def _step(self, dt: float) -> None:
         self._steer(dt)
+        resistance, constant, watts = self.config.motor.winding_resistance, self.config.motor.torque_constant, 0.0
         for i, shaft in enumerate(self.shafts):
             shaft.step(dt)
-            self._drive(i, dt)
+            current = self._drive(i, shaft, dt)
+            watts += current**2 * resistance + abs(current * constant * shaft.rpm * RPM)
         self._move(dt)
-        motor, watts = self.config.motor, 0.0
-        for shaft, current in zip(self.shafts, self.currents, strict=True):
-            watts += current**2 * motor.winding_resistance + abs(current * motor.torque_constant * shaft.rpm * RPM)
         self.battery.step(dt, watts)
 
     def _steer(self, dt: float) -> None:
@@ -207,44 +212,45 @@ class TruckPlant:
         self._rear.step(dt)
         self._steering.follow(self._front.angle, self._rear.angle)
 
-    def _drive(self, i: int, dt: float) -> None:
-        """Wheels follow their motor as fast as the clutch can pull mass, slope and rolling resistance."""
-        config, motor, shaft, speed = self.config, self.config.motor, self.shafts[i], self._wheel_speeds[i]
+    def _drive(self, i: int, shaft: Shaft, dt: float) -> float:
+        """Wheels follow their motor as fast as the clutch can pull mass, slope and rolling resistance; its current."""
+        motor, speed = self.config.motor, self._wheel_speeds[i]
         wanted = self._chassis.drivetrain.speed(shaft.rpm * RPM)
-        mass = config.mass / len(self.shafts)
-        weight = mass * GRAVITY
-        rolling = config.rolling_resistance * weight * min(max(speed / 0.01, -1.0), 1.0)
-        resistance = rolling - weight * sin(self._attitude[0])
+        rolling = self._rolling * min(max(speed / 0.01, -1.0), 1.0)
+        resistance = rolling - self._weight * sin(self._attitude[0])
         followed = (wanted - speed) * (1.0 - exp(-dt / motor.drivetrain_lag))
-        pull = mass * followed / dt + resistance
+        pull = self._mass * followed / dt + resistance
         if self._stuck_at is not None and speed == 0.0 and wanted != 0.0:
             pull = copysign(2 * motor.clutch_force, wanted)  # wound up until the clutch gives
-        self._slipping[i] = abs(pull) > motor.clutch_force
-        if self._slipping[i]:
+        slipping = self._slipping[i] = abs(pull) > motor.clutch_force
+        if slipping:
             pull = copysign(motor.clutch_force, pull)
-            change = (pull - resistance) * dt / mass
+            change = (pull - resistance) * dt / self._mass
             followed = copysign(min(abs(change), abs(followed)), followed) if change * followed > 0 else change
         self._wheel_speeds[i] = speed + followed
         self._pulls[i] = pull
-        inertia = motor.rotor_inertia * shaft.slope * RPM
-        load = pull * config.wheel_radius / (motor.ratio * motor.efficiency)
-        idle = copysign(motor.idle_current, shaft.rpm) if shaft.rpm else 0.0
-        self.currents[i] = idle + (load + inertia) / motor.torque_constant if shaft.powered else 0.0
+        current = 0.0
+        if shaft.powered:
+            inertia = motor.rotor_inertia * shaft.slope * RPM
+            load = pull * self.config.wheel_radius / self._gearing
+            idle = copysign(motor.idle_current, shaft.rpm) if shaft.rpm else 0.0
+            current = idle + (load + inertia) / motor.torque_constant
+        self.currents[i] = current
+        return current
 
     def _move(self, dt: float) -> None:
-        config = self.config
-        noise = self._noise.at(self._elapsed) if self._noise else [0.0] * (2 + len(self.shafts))
-        front_noise, rear_noise, *slip_noises = noise
-        vx, _, wz = self._twist
-        lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * copysign(1.0, self._wheel_speeds[0])
-        if self._tyres is not None:
-            lateral = 0.0
-        front = self._steering.front - config.front_slip_angle * lateral + config.slip_angle_noise * front_noise
-        rear = self._steering.rear - config.rear_slip_angle * lateral + config.slip_angle_noise * rear_noise
+        config, steering, wheels = self.config, self._steering, self._wheel_speeds
+        front_noise, rear_noise, *slip_noises = self._noise.at(self._elapsed) if self._noise else self._quiet
+        lateral = 0.0
+        if self._tyres is None:
+            vx, _, wz = self._twist
+            lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * copysign(1.0, wheels[0])
+        front = steering.front - config.front_slip_angle * lateral + config.slip_angle_noise * front_noise
+        rear = steering.rear - config.rear_slip_angle * lateral + config.slip_angle_noise * rear_noise
         pace = []
-        for wheel, pull, slip_noise in zip(self._wheel_speeds, self._pulls, slip_noises, strict=True):
+        for wheel, pull, slip_noise in zip(wheels, self._pulls, slip_noises, strict=True):
             slip = config.slip_per_newton * pull * copysign(1.0, wheel) + config.slip_noise * slip_noise
-            pace.append(wheel * self._steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0]))
+            pace.append(wheel * steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0]))
         twist = self._chassis.twist(tuple(pace), front, rear)
         if self._tyres is not None:
             speed = copysign(hypot(twist[0], twist[1]), twist[0])

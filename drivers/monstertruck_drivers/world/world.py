@@ -49,6 +49,7 @@ class World:
         self._profile = place.profile
         self._tilt: TiltConfig = config.tilt
         self._truck = config.truck
+        self._half_diagonal = hypot(config.truck.length, config.truck.width) / 2
         self._obstacles: tuple[Obstacle, ...] = ()
         self._discs, self._segments = discs_and_segments(())
         self._free: Pose | None = None
@@ -138,7 +139,7 @@ class World:
 
     def _way(self, a: Pose, b: Pose) -> float:
         """No point of the footprint is further from its place at the other pose than this, m."""
-        return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * hypot(self._truck.length, self._truck.width) / 2
+        return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
     def _depth(self, pose: Pose, room: float = 0.0) -> float:
         """How deep the footprint, grown by ``room`` all around, reaches into things, m."""
