@@ -39,13 +39,8 @@ class Leases(Schema):
 
     def of(self, role: Role) -> float:
         """Cap of a driving role, s."""
-        caps = {
-            Role.GAMEPAD: self.gamepad,
-            Role.KEYBOARD: self.keyboard,
-            Role.STATION: self.station,
-            Role.TRACKER: self.tracker,
-        }
-        return caps[role]
+        cap: float = getattr(self, role.value)
+        return cap
 
 
 class TiltLimits(Schema):

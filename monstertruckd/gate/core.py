@@ -278,7 +278,7 @@ class Gate:
         blocks = self._blocks(judgement, now)
         self._report(now, blocks, judgement.values, always=self.mode is GateMode.DRIVING)
         self._advance(now, blocks)
-        limits = dict(judgement.limits)
+        limits = judgement.limits
         if self._states.holder is not None:
             self._pursuit.follow(now, dt, self._states.holder.request, limits)
             if self._pursuit.blocked and Reason.OBSTACLE_STOP not in self._known and not self._watch.at_rest(now):

@@ -195,6 +195,8 @@ class Sources:
             holder: key of the one driving already.
         """
         able = [source for source in self.live(now) if not source.held and source.rank >= self._floor]
+        if len(able) == 1:
+            return able[0]
         return max(able, key=lambda source: (source.rank, source.setting_off, source.key == holder), default=None)
 
     def standing(self, source: Source, now: int, holder: Key | None) -> Reason:

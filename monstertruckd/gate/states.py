@@ -11,6 +11,9 @@ from monstertruckd.gate.sources import Key, Source
 
 ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 
+MEANS: Final = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
+"""What a state itself means for driving."""
+
 
 class States:
     """Disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
@@ -41,8 +44,7 @@ class States:
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """What the state itself means for driving."""
-        own = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
-        return own.get(self.mode, self._stopped_by)
+        return MEANS.get(self.mode, self._stopped_by)
 
     @property
     def holder_key(self) -> Key | None:

@@ -88,7 +88,10 @@ class Watch:
         self._failed: tuple[str, ...] = ()
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
+        self._critical = _critical(config, steered=chassis.linkage is not None)
         self._tilt = _Tilt(config.tilt)
+        self._speed: tuple[int, float | None] | None = None
+        """Instant (ns) and speed of the newest look, while the samples are those of then."""
         self.axles = (0.0, 0.0)
         """Axle angles by the newest steering feedback, rad."""
 
@@ -108,6 +111,7 @@ class Watch:
         """Take feedback of a driven shaft."""
         if self._good(feedback, Reason.DRIVE_STALE):
             self.drives[shaft] = feedback
+            self._speed = None
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take steering feedback; what the servo controller does not vouch for is no good sample."""
@@ -131,6 +135,7 @@ class Watch:
         for row in table.services:
             if row.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(row.name)) is not None:
                 self._lost[stale] = max(row.since, self._lost.get(stale, -1))
+                self._speed = None
         self._failed = tuple(
             row.name
             for row in table.services
@@ -160,16 +165,28 @@ class Watch:
 
     def speed(self, now: int) -> float | None:
         """Measured speed of the fastest wheel over ground, m/s; None without fresh feedback of every shaft."""
-        drives = self._fresh_drives(now)
-        if not drives:
-            return None
-        return self._chassis.travel(tuple(self._chassis.drivetrain.speed(drive.velocity) for drive in drives))
+        if self._speed is None or self._speed[0] != now:
+            drives = self._fresh_drives(now)
+            rolling = tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in drives])
+            self._speed = now, self._chassis.travel(rolling) if rolling else None
+        return self._speed[1]
 
-    def _fresh_drives(self, now: int) -> tuple[DriveFeedback, ...]:
+    def _fresh_drives(self, now: int) -> list[DriveFeedback]:
         """Feedback of all shafts; none of it unless all of it counts."""
-        drives = tuple(drive for drive in self.drives if drive is not None)
-        fresh = all(self._fresh(drive, self._config.drive, now, Reason.DRIVE_STALE) for drive in self.drives)
-        return drives if fresh else ()
+        limit = self._config.drive
+        drives = [d for d in self.drives if d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE)]
+        return drives if len(drives) == len(self.drives) else []
+
+    def _all_fresh(self, now: int) -> dict[Reason, bool]:
+        """Which sensors still count, by the reason their silence gives."""
+        config = self._config
+        return {
+            Reason.DRIVE_STALE: bool(self._fresh_drives(now)),
+            Reason.STEERING_STALE: self.steering_fresh(now),
+            Reason.SCAN_STALE: self.scan_fresh(now),
+            Reason.ATTITUDE_STALE: self._fresh(self.attitude, config.attitude, now, Reason.ATTITUDE_STALE),
+            Reason.BATTERY_STALE: self._fresh(self.battery, config.battery, now, Reason.BATTERY_STALE),
+        }
 
     def at_rest(self, now: int, since: int = 0) -> bool:
         """Whether the truck is known to stand still, by a sample not older than ``since``.
@@ -191,31 +208,23 @@ class Watch:
         for drive in self.drives:
             if drive is not None and drive.mode is DriveMode.FAULT:
                 values["drive_fault_code"] = drive.fault_code
-        if "drive_fault_code" in values:
+        if values:
             blocks.append(Reason.DRIVE_FAULT)
         if self._failed:
             blocks.append(Reason.SERVICE_FAILED)
-        steered = self._chassis.linkage is not None
-        for message, limit, reason in (
-            *((drive, config.drive, Reason.DRIVE_STALE) for drive in self.drives),
-            *(((self.steering, config.steering, Reason.STEERING_STALE),) if steered else ()),
-            (self.scan, config.scan, Reason.SCAN_STALE),
-            (self.attitude, config.attitude, Reason.ATTITUDE_STALE),
-            (self.battery, config.battery, Reason.BATTERY_STALE),
-        ):
-            if limit.critical and not self._fresh(message, limit, now, reason):
-                blocks.append(reason)
-        if self._fresh(self.attitude, config.attitude, now, Reason.ATTITUDE_STALE):
+        fresh = self._all_fresh(now)
+        blocks += [reason for reason in self._critical if not fresh[reason]]
+        if fresh[Reason.ATTITUDE_STALE]:
             values["tilt"] = self._tilt.angle
             if self._tilt.stop:
                 blocks.append(Reason.TILT_STOP)
             elif self._tilt.slow:
                 limits[Reason.TILT_SLOW] = config.tilt.slow_speed
-        self._judge_battery(now, blocks, limits, values)
-        return Judgement(tuple(dict.fromkeys(blocks)), limits, values)
+        self._judge_battery(fresh[Reason.BATTERY_STALE], blocks, limits, values)
+        return Judgement(tuple(blocks), limits, values)
 
     def _judge_battery(
-        self, now: int, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
+        self, fresh: bool, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
     ) -> None:
         battery = self.battery
         if battery is None:
@@ -226,9 +235,7 @@ class Watch:
             blocks.append(Reason.BATTERY_CRITICAL)
         elif battery.level is BatteryLevel.LOW:
             limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
-        if not self._config.battery.critical and not self._fresh(
-            battery, self._config.battery, now, Reason.BATTERY_STALE
-        ):
+        if not fresh and not self._config.battery.critical:
             limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
 
     def silence(self, stale: Reason, now: int) -> Silence:
@@ -261,6 +268,18 @@ class Watch:
     def failed(self) -> tuple[str, ...]:
         """Names of the services whose failure stops the truck."""
         return self._failed
+
+
+def _critical(config: GateConfig, *, steered: bool) -> tuple[Reason, ...]:
+    """Whose silence stops the truck, worst first."""
+    limits = {
+        Reason.DRIVE_STALE: config.drive,
+        Reason.STEERING_STALE: config.steering,
+        Reason.SCAN_STALE: config.scan,
+        Reason.ATTITUDE_STALE: config.attitude,
+        Reason.BATTERY_STALE: config.battery,
+    }
+    return tuple(r for r, limit in limits.items() if limit.critical and (steered or r is not Reason.STEERING_STALE))
 
 
 class _Tilt:
