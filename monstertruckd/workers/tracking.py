@@ -75,6 +75,9 @@ class _Slot(Generic[M]):
     async def next(self) -> M:
         raise RuntimeError("a step does not wait")
 
+    async def next_within(self, seconds: float) -> M | None:
+        raise RuntimeError(f"a step does not wait {seconds} s")
+
 
 class _Out(Generic[M]):
     """A publisher that keeps what it is given; sequence numbers are the caller's."""

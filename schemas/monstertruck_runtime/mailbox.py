@@ -47,7 +47,7 @@ class Mailbox(Generic[M]):
         self._on_close = on_close
         self._latest: M | None = None
         self._drops = 0
-        self._reader: asyncio.Future[None] | None = None
+        self._reader: asyncio.Future[bool] | None = None
         self._closed = False
 
     @property
@@ -86,6 +86,18 @@ class Mailbox(Generic[M]):
             raise RuntimeError(msg)
         return self._unread.popleft()
 
+    async def next_within(self, seconds: float) -> M | None:
+        """As ``next``, or None if nothing comes within ``seconds``.
+
+        A timer costs much less than a deadline, which has to cancel its task.
+        """
+        loop = asyncio.get_running_loop()
+        due = loop.time() + max(seconds, 0.0)
+        while not self._unread and not self._closed:
+            if not await self._news(loop, due):
+                return None
+        return await self.next()
+
     def drain(self) -> list[M]:
         """Everything unread, oldest first, without waiting."""
         unread = list(self._unread)
@@ -103,20 +115,29 @@ class Mailbox(Generic[M]):
 
     async def _arrival(self) -> bool:
         """Wait until a message is unread; False if the mailbox is closed."""
+        loop = asyncio.get_running_loop()
         while not self._unread and not self._closed:
-            if self._reader is not None:
-                msg = "a subscription has one reader; subscribe again for another"
-                raise RuntimeError(msg)
-            self._reader = asyncio.get_running_loop().create_future()
-            try:
-                await self._reader
-            finally:
-                self._reader = None
+            await self._news(loop)
         return not self._closed
 
+    async def _news(self, loop: asyncio.AbstractEventLoop, due: float | None = None) -> bool:
+        """Wait for the next message or the end; False if ``due``, loop time, came first."""
+        if self._reader is not None:
+            msg = "a subscription has one reader; subscribe again for another"
+            raise RuntimeError(msg)
+        reader: asyncio.Future[bool] = loop.create_future()
+        self._reader = reader
+        alarm = None if due is None else loop.call_at(due, _answer, reader, False)
+        try:
+            return await reader
+        finally:
+            self._reader = None
+            if alarm is not None:
+                alarm.cancel()
+
     def _wake(self) -> None:
-        if self._reader is not None and not self._reader.done():
-            self._reader.set_result(None)
+        if self._reader is not None:
+            _answer(self._reader, True)
 
     def __aiter__(self) -> Self:
         return self
@@ -133,3 +154,8 @@ class Mailbox(Generic[M]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _answer(reader: asyncio.Future[bool], news: bool) -> None:
+    if not reader.done():
+        reader.set_result(news)

@@ -43,6 +43,10 @@ class Subscription(Protocol[M_co]):
         """Wait for a message not returned by ``next`` yet."""
         ...
 
+    async def next_within(self, seconds: float) -> M_co | None:
+        """The same, or None if nothing comes in that time."""
+        ...
+
 
 class EventSink(Protocol):
     """Where a service reports what happened."""

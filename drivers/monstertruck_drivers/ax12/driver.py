@@ -1,6 +1,5 @@
 """Stabiliser driver: joint goals out; angles, loads, heat and alarms of both servos in."""
 
-import contextlib
 from typing import Final
 
 from monstertruck_drivers.ax12 import protocol as p
@@ -107,12 +106,9 @@ class Ax12Driver:
 
     async def _follow(self, session: Session, until: int) -> None:
         """Pass goals on as they come."""
-        with contextlib.suppress(TimeoutError):
-            async with self._clock.deadline((until - self._clock.now()) / SECOND):
-                while True:
-                    command = await self._commands.next()
-                    if self._clock.now() - command.stamp <= self._config.command_timeout * SECOND:
-                        await self._aim(session, command)
+        while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:
+            if self._clock.now() - command.stamp <= self._config.command_timeout * SECOND:
+                await self._aim(session, command)
 
     async def _aim(self, session: Session, command: StabiliserCommand) -> None:
         angles = ((self._pitch, command.pitch), (self._roll, command.roll))

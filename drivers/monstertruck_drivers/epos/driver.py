@@ -228,10 +228,7 @@ class _Session:
     async def _idle(self, until: int) -> None:
         """Wait for the next cycle; a command to stop is obeyed at once."""
         while (left := until - self._clock.now()) > 0:
-            try:
-                async with self._clock.deadline(left / SECOND):
-                    await self._driver.commands.next()
-            except TimeoutError:
+            if await self._driver.commands.next_within(left / SECOND) is None:
                 return
             await self._act()
 

@@ -19,7 +19,7 @@ from monstertruck_drivers.hokuyo_urg.identity import (
 )
 from monstertruck_drivers.hokuyo_urg.protocol import Outcome, Reply, ScipParser, classify, decode_counter, request
 from monstertruck_drivers.link import Link
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceFaultError,
@@ -81,10 +81,10 @@ class ScipSession:
             DeviceTimeoutError: none was complete within ``seconds``.
             DeviceLostError: the link went down.
         """
+        end = self._clock.now() + round(seconds * SECOND)
         try:
-            async with self._clock.deadline(seconds):
-                while not self._replies:
-                    await self._receive()
+            while not self._replies:
+                await self._receive(max(end - self._clock.now(), 0) / SECOND)
         except TimeoutError as error:
             raise DeviceTimeoutError(f"{self._link.name}: no reply within {seconds:.2f} s") from error
         return self._replies.popleft()
@@ -169,8 +169,8 @@ class ScipSession:
 
     # Parts
 
-    async def _receive(self) -> None:
-        data = await self._link.read()
+    async def _receive(self, within: float | None = None) -> None:
+        data = await self._link.read(within)
         self.arrival = self._clock.now()
         self._heard = True
         self._replies += self.parser.feed(data)

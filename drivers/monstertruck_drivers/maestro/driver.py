@@ -121,14 +121,11 @@ class MaestroDriver:
 
     async def _follow(self, session: Session, until: int) -> None:
         """Pass commands on as they come."""
-        with contextlib.suppress(TimeoutError):
-            async with self._clock.deadline((until - self._clock.now()) / SECOND):
-                while True:
-                    command = await self._commands.next()
-                    if self._is_fresh(command):
-                        self._command = command
-                        self._fresh = True
-                        session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
+        while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:
+            if self._is_fresh(command):
+                self._command = command
+                self._fresh = True
+                session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
 
     def _is_fresh(self, command: SteeringCommand) -> bool:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND

@@ -47,8 +47,7 @@ class Session:
         self._link.discard()
         self._link.write(b"".join(requests))
         try:
-            async with self._clock.deadline(self._timeout):
-                return words(await self._link.exactly(2 * len(requests)))
+            return words(await self._link.exactly(2 * len(requests), self._timeout))
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {self._timeout} s") from None
 

@@ -100,8 +100,7 @@ class Os4000Driver:
         limit, heard = self._clock.now() + patience, session.bytes_heard
         while True:
             try:
-                async with self._clock.deadline((limit - self._clock.now()) / SECOND):
-                    sentences = await session.receive()
+                sentences = await session.receive(max(limit - self._clock.now(), 0) / SECOND)
             except TimeoutError:
                 if session.bytes_heard == heard:
                     raise DeviceTimeoutError(f"{self._port.name}: silent for {self._config.patience} s") from None

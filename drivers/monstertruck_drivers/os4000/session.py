@@ -33,13 +33,17 @@ class Session:
         self._link = link
         self._clock = clock
 
-    async def receive(self) -> list[Sentence]:
+    async def receive(self, within: float | None = None) -> list[Sentence]:
         """Sentences that became complete with the next bytes.
+
+        Args:
+            within: seconds to wait for the bytes; None = for ever.
 
         Raises:
             DeviceLostError: unplugged.
+            TimeoutError: nothing came in time.
         """
-        data = await self._link.read()
+        data = await self._link.read(within)
         self.bytes_heard += len(data)
         return self.parser.feed(data)
 

@@ -47,6 +47,25 @@ async def test_draining_takes_what_is_unread_without_waiting():
     assert (await box.next()).seq == 9
 
 
+def test_a_wait_with_a_limit_ends_with_a_message_or_at_its_time():
+    async def main(clock: VirtualClock) -> list[tuple[int | None, int]]:
+        box: Mailbox[Message] = Mailbox(fifo(3))
+        start, found = clock.now(), []
+        for seq, due in ((0, 0.25), (1, 0.5)):
+            asyncio.get_running_loop().call_later(due, box.put, message(seq))
+        for limit in (0.1, 1.0, -1.0, 1.0):
+            got = await box.next_within(limit)
+            found.append((None if got is None else got.seq, round((clock.now() - start) / 1e7)))
+        box.put(message(2))
+        assert await box.next_within(-1.0) == message(2)
+        asyncio.get_running_loop().call_later(0.1, box.close)
+        with pytest.raises(RuntimeError, match="closed"):
+            await box.next_within(1.0)
+        return found
+
+    assert run_virtual(main) == [(None, 10), (0, 25), (None, 25), (1, 50)]
+
+
 def test_a_fifo_needs_room():
     with pytest.raises(ValueError, match="at least one"):
         fifo(0)
