@@ -63,7 +63,7 @@ FARTHEST: Final = 0.3
 """The fine fit ends this near to the coarse one, m."""
 CONTRADICTION: Final = 0.15
 """Share of the points looked through by scans of the other side, from which a place is another one."""
-PART_SCORE: Final = 0.15
+PART_SCORE: Final = 0.1
 """Mean likelihood of surroundings of which only a part was seen before,"""
 PART_OVERLAP: Final = 0.7
 """share of their points in view of the place that must fit,"""
@@ -89,6 +89,10 @@ BASELINE: Final = 1.0
 """Way between the first and the last of them, m."""
 CONSISTENT: Final = 11.3
 """Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
+NEAR: Final = 3.0
+"""Of two contradicting hits from places with so little way between them one is false, m,"""
+OUTVOTED: Final = 2
+"""and so many times as many must agree with the other."""
 VAGUE: Final = 1.0
 """Agreement proves nothing where the drift between the hits is greater, m."""
 FORGET: Final = 60
@@ -100,7 +104,7 @@ BROKEN: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class _Hit:
+class Hit:
     """The key scan ``target`` found near ``origin``."""
 
     origin: int
@@ -113,7 +117,7 @@ class LoopCloser:
     """Finds, checks and adds closures."""
 
     def __init__(self) -> None:
-        self._hits: list[_Hit] = []
+        self._hits: list[Hit] = []
         self._tried: dict[int, int] = {}
         self._fingerprints: list[Array] = []
         self.searches = 0
@@ -147,14 +151,15 @@ class LoopCloser:
         For the end of a run: what came after a place belongs to its surroundings then, too. True if a closure has moved
         the poses.
         """
-        closed = False
         self._hits.clear()
         self._tried.clear()
         count = len(keymap)
-        for at in np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist():
-            hit = self._seen_in_part(keymap, at)
-            closed |= hit is not None and self._believed(keymap, hit, sure=False)
-        self._hits.clear()
+        places = np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist()
+        hits = [hit for at in places if (hit := self._seen_in_part(keymap, at)) is not None]
+        closed = False
+        while group := agreed(keymap, hits):
+            closed |= self._added(keymap, group)
+            hits = [hit for hit in hits if not any(hit is one for one in group)]
         return closed
 
     def forget(self, kept: NDArray[np.bool_]) -> None:
@@ -163,7 +168,7 @@ class LoopCloser:
         self._tried.clear()
         self._fingerprints = [one for one, left in zip(self._fingerprints, kept.tolist(), strict=False) if left]
 
-    def _seen_in_part(self, keymap: KeyMap, at: int) -> _Hit | None:
+    def _seen_in_part(self, keymap: KeyMap, at: int) -> Hit | None:
         """Key scan ``at`` found near the likeliest place before it, if little else is possible."""
         covariances, far = keymap.drift(at)
         numbers = self._possible(keymap, at, covariances, far)
@@ -216,7 +221,7 @@ class LoopCloser:
         window: tuple[float, float],
         *,
         part: bool = False,
-    ) -> _Hit | None:
+    ) -> Hit | None:
         """Look for ``query``, the surroundings of key scan ``at``, or a part of it, in those of ``candidate``."""
         self.searches += 1
         window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
@@ -251,14 +256,14 @@ class LoopCloser:
         turn = np.eye(3)
         turn[:2, :2] = rotation(keymap.poses[origin, 2])
         covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
-        return _Hit(origin, at, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
+        return Hit(origin, at, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
 
-    def _believed(self, keymap: KeyMap, hit: _Hit, *, sure: bool) -> bool:
+    def _believed(self, keymap: KeyMap, hit: Hit, *, sure: bool) -> bool:
         """Add ``hit`` and what agrees with it to the graph if that is enough, and if the graph bears it."""
-        agreeing, against = self._compared(keymap, hit)
+        agreeing, against = _compared(keymap, hit, self._hits)
         witnesses = [hit, *agreeing]
         self._hits.append(hit)
-        enough = len(witnesses) >= WITNESSES * (1 + against) and _way(keymap, witnesses) >= BASELINE
+        enough = len(witnesses) >= WITNESSES * (1 + len(against)) and _way(keymap, witnesses) >= BASELINE
         if not sure and not enough:
             return False
         if not self._added(keymap, witnesses):
@@ -267,31 +272,7 @@ class LoopCloser:
         self._hits = [other for other in self._hits if id(other) not in used]
         return True
 
-    def _compared(self, keymap: KeyMap, hit: _Hit) -> tuple[list[_Hit], int]:
-        """Earlier hits that form a consistent loop with ``hit``, and the number of those that contradict it."""
-        if not self._hits:
-            return [], 0
-        at_target, _ = keymap.drift(hit.target)
-        at_origin, _ = keymap.drift(hit.origin)
-        agreeing, against = [], 0
-        for other in self._hits:
-            if other.target == hit.target:
-                continue
-            # Origin to target to the other's target to its origin, against the graph's own way from origin to origin.
-            step = between(keymap.poses[hit.target], keymap.poses[other.target])
-            there = compose(compose(hit.measured, step), inverse(other.measured))
-            off = between(between(keymap.poses[hit.origin], keymap.poses[other.origin]), there)
-            drifts = at_target[other.target] + at_origin[other.origin]
-            place, turn = deviations(drifts + np.linalg.inv(hit.information) + np.linalg.inv(other.information))
-            if not place <= VAGUE:
-                continue
-            if (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT:
-                agreeing.append(other)
-            else:
-                against += 1
-        return agreeing, against
-
-    def _added(self, keymap: KeyMap, hits: list[_Hit]) -> bool:
+    def _added(self, keymap: KeyMap, hits: list[Hit]) -> bool:
         """Add the hits and optimise; take them back if they do not hold or break what held."""
         before, count = keymap.poses, len(keymap.edges)
         edges = keymap.edges.edges()
@@ -310,6 +291,42 @@ class LoopCloser:
             return False
         keymap.poses = poses
         return True
+
+
+def _compared(keymap: KeyMap, hit: Hit, others: list[Hit]) -> tuple[list[Hit], list[Hit]]:
+    """Which of ``others`` form a consistent loop with ``hit``, and which contradict it; of neither nothing is known."""
+    agreeing: list[Hit] = []
+    against: list[Hit] = []
+    others = [other for other in others if other.target != hit.target]
+    if not others:
+        return agreeing, against
+    at_target, _ = keymap.drift(hit.target)
+    at_origin, _ = keymap.drift(hit.origin)
+    for other in others:
+        # Origin to target to the other's target to its origin, against the graph's own way from origin to origin.
+        step = between(keymap.poses[hit.target], keymap.poses[other.target])
+        there = compose(compose(hit.measured, step), inverse(other.measured))
+        off = between(between(keymap.poses[hit.origin], keymap.poses[other.origin]), there)
+        drifts = at_target[other.target] + at_origin[other.origin]
+        place, turn = deviations(drifts + np.linalg.inv(hit.information) + np.linalg.inv(other.information))
+        if place <= VAGUE:
+            agrees = (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT
+            (agreeing if agrees else against).append(other)
+    return agreeing, against
+
+
+def agreed(keymap: KeyMap, hits: list[Hit]) -> list[Hit]:
+    """The most of ``hits`` that agree with one of them; none if they are too few, or as many contradict near by."""
+    best: list[Hit] = []
+    for hit in hits:
+        agreeing, against = _compared(keymap, hit, hits)
+        # From places far from each other both may be right, and the drift more than the graph thinks.
+        rivals = [other for other in against if _way(keymap, [hit, other]) < NEAR]
+        group = [hit, *agreeing]
+        enough = len(group) >= max(WITNESSES, OUTVOTED * len(rivals)) and _way(keymap, group) >= BASELINE
+        if enough and len(group) > len(best):
+            best = group
+    return best
 
 
 def _window(covariance: Array) -> tuple[float, float]:
@@ -344,7 +361,7 @@ def _distance(keymap: KeyMap, place: int) -> Array:
     return np.asarray(np.hypot(off[:, 0], off[:, 1]))
 
 
-def _way(keymap: KeyMap, hits: list[_Hit]) -> float:
+def _way(keymap: KeyMap, hits: list[Hit]) -> float:
     """Way between the places the hits were made from, m."""
     first, last = min(hit.target for hit in hits), max(hit.target for hit in hits)
     steps = np.diff(keymap.poses[first : last + 1, :2], axis=0)

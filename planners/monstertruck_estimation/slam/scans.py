@@ -27,6 +27,8 @@ SLANTED: Final = 3.0
 """Two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant."""
 SLIDE: Final = 5.0
 """Standard deviation along a line, m: none of what a scan knows."""
+GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of it, less their whole part, are an even mixture of early and late beams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +222,11 @@ def _cells(points, cell):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 
 def spread(points: Array, cell: float) -> NDArray[np.intp]:
-    """Indices, rising, of the first point in every square of ``cell`` m."""
-    _, first = np.unique(_cells(points, cell), return_index=True)
-    return np.sort(first)
+    """Indices, rising, of one point in every square of ``cell`` m.
+
+    Which one must not hang on where its noise took it: the first in beam order would be the one that noise took over
+    the edge ahead of the others, and every wall would be turned a little.
+    """
+    order = np.argsort(np.arange(len(points)) * GOLDEN % 1.0, kind="stable")
+    _, first = np.unique(_cells(points[order], cell), return_index=True)
+    return np.sort(order[first])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.closure import LoopCloser
+from monstertruck_estimation.slam.closure import Hit, LoopCloser, agreed
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keymap import KeyMap
 from monstertruck_estimation.slam.se2 import between, compose
@@ -69,3 +69,40 @@ def test_walls_hide_what_is_behind_them():
     pose = np.array((1.0, 2.0, math.pi / 2))
     seen = in_view([viewer], pose[None], compose(pose, np.column_stack((points, np.zeros(4))))[:, :2])
     assert seen.tolist() == [True, True, False, False]
+
+
+def line_of_keys(count=40):
+    """Key scans 0.3 m apart on a line, related by wheels."""
+    keymap = KeyMap(MapperConfig())
+    for k in range(count):
+        keymap.add(scan(hall(POSTS), (0.0, 0.0, 0.0)), k, (0.3 * k, 0.0, 0.0))
+        if k:
+            keymap.relate_by_odometry(np.array((0.3, 0.0, 0.0)), np.diag((0.02**2, 0.02**2, 0.004**2)))
+    return keymap
+
+
+def found(keymap, target, off):
+    """Key scan ``target`` found beside the first one, ``off`` metres to the left of where the graph has it."""
+    place = between(keymap.poses[0], compose(np.array((0.0, off, 0.0)), keymap.poses[target]))
+    return Hit(0, target, place, np.diag((1e3, 1e3, 1e4)))
+
+
+def test_hits_that_agree_are_believed_if_they_are_enough_and_far_enough_apart():
+    keymap = line_of_keys()
+    hits = [found(keymap, k, 0.5) for k in (20, 22, 24)]
+    assert agreed(keymap, hits) == hits
+    assert not agreed(keymap, hits[:2])
+    assert not agreed(keymap, [found(keymap, k, 0.5) for k in (20, 21, 22)])
+
+
+def test_hits_from_the_same_place_that_contradict_must_be_outvoted():
+    keymap = line_of_keys()
+    hits = [found(keymap, k, 0.5) for k in (20, 22, 24)]
+    assert not agreed(keymap, [*hits, found(keymap, 21, -1.0), found(keymap, 23, -1.0)])
+    assert agreed(keymap, [*hits, found(keymap, 26, 0.5), found(keymap, 21, -1.0), found(keymap, 23, -1.0)])
+
+
+def test_hits_from_elsewhere_may_contradict():
+    keymap = line_of_keys()
+    hits = [found(keymap, k, 0.5) for k in (20, 22, 24)]
+    assert agreed(keymap, [*hits, *(found(keymap, k, -1.0) for k in (37, 38))]) == hits

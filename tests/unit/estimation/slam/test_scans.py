@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare, spread
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges
 
 FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
@@ -68,3 +68,14 @@ def test_thinning_keeps_one_point_per_square_and_no_more_than_asked():
     cells = np.floor(thinned.points / 0.2)
     assert len(np.unique(cells, axis=0)) == len(thinned)
     assert len(scan.thinned(0.01, 50)) == 50
+
+
+@pytest.mark.parametrize("slope", [-0.3, 0.3])
+def test_the_points_that_are_kept_of_a_wall_lie_on_it_on_average(slope):
+    rng = np.random.default_rng(3)
+    along = np.arange(0.0, 40.0, 0.01)
+    off = rng.normal(0.0, 0.012, len(along))
+    wall = np.array((math.cos(slope), math.sin(slope)))
+    points = along[:, None] * wall + off[:, None] * (-wall[1], wall[0])
+    kept = spread(points, 0.04)
+    assert np.mean(off[kept]) == pytest.approx(0.0, abs=3 * 0.012 / math.sqrt(len(kept)))
