@@ -101,7 +101,8 @@ class _Stepped(TrackerService):
 
     def step(self, now: int) -> None:
         """One control step."""
-        self._step(now)
+        for _ in self._parts(now):
+            pass
 
 
 class TrackingWorker:

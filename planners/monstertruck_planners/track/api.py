@@ -48,6 +48,10 @@ class Tracker(Protocol):
         """Forget: the requests were not obeyed."""
         ...
 
+    def prepare(self, line: Line, progress: Progress) -> bool:
+        """Compute what ``control`` needs of a line's present run, once; whether that had to be done."""
+        ...
+
     def control(self, state: TruckState, line: Line, progress: Progress, t: float) -> Command:
         """One control step.
 

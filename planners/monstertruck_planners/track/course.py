@@ -68,12 +68,14 @@ class Course:
         tangent, curvature = _bends(run, self._s)
         heading = tangent if run.direction > 0 else tangent + math.pi
         self.given = bool(run.steering)
-        changes = [i for i in range(1, len(run.steering)) if run.steering[i] != run.steering[i - 1]]
-        self._changes = run.vertices[changes]
-        modes = self._modes(self._s) if self.given else [steering]
+        names: list[Steering] = sorted(set(run.steering)) if self.given else [steering]
+        number = {mode: i for i, mode in enumerate(names)}
+        modes = np.array([number[mode] for mode in run.steering] if self.given else [0])
+        self._changes = run.vertices[np.flatnonzero(np.diff(modes)) + 1]
+        modes = modes[self._step_at(self._s)] if self.given else np.zeros(count, np.intp)
         yaw, turn = heading.copy(), run.direction * curvature
-        for mode in sorted(set(modes)):
-            where = np.array([m == mode for m in modes]) if self.given else np.ones(count, dtype=np.bool_)
+        for mode in names:
+            where = modes == number[mode]
             if self.given and mode in ("crab", "hybrid"):
                 own = np.interp(self._s, run.vertices, run.yaws)
                 yaw[where] = own[where]
@@ -126,9 +128,13 @@ class Course:
         return float(self._changes[i]) if i < len(self._changes) else self._run.end
 
     def _modes(self, s: Array) -> list[Steering]:
+        return [self._run.steering[i] for i in self._step_at(s).tolist()]
+
+    def _step_at(self, s: Array) -> NDArray[np.intp]:
+        """Index of the run's step at each of the places."""
         run = self._run
         index = np.searchsorted(run.vertices, np.remainder(s, run.length) if run.end > run.length else s, side="right")
-        return [run.steering[i] for i in np.clip(index - 1, 0, len(run.steering) - 1).tolist()]
+        return np.clip(index - 1, 0, len(run.steering) - 1)
 
     def _lagged(self, heading: Array, curvature: Array, a: float) -> tuple[Array, Array]:
         """Yaw and turn of a body that does not slip sideways at its point ``a``."""

@@ -98,6 +98,15 @@ class Law(ABC, Generic[C]):
     def steer(self, here: Here) -> Angles:
         """Wanted angles of front and rear axle, rad, not yet limited."""
 
+    def prepare(self, line: Line, progress: Progress) -> bool:
+        """See ``Tracker``."""
+        run = line.runs[progress.run]
+        known = self._courses.get(id(run))
+        if known is not None and known[0] is run:
+            return False
+        self.course(run)
+        return True
+
     def control(self, state: TruckState, line: Line, progress: Progress, t: float) -> Command:
         """See ``Tracker``."""
         self.axles.advance(t)

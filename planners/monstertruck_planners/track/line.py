@@ -295,15 +295,17 @@ def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
 
 def _stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
     """Whether the truck has to come to rest between each two steps."""
-    stops = np.diff(directions) != 0.0
-    if len(set(steering)) > 1 and len(stops):
-        stops = stops | np.array([_must_stand(a, b) for a, b in pairwise(steering)], np.bool_)
-    return np.asarray(stops)
+    stops: NDArray[np.bool_] = np.diff(directions) != 0.0
+    if len(stops):
+        for i, (before, after) in enumerate(pairwise(steering)):
+            if before != after and _must_stand(before, after):
+                stops[i] = True
+    return stops
 
 
 def _must_stand(before: Steering, after: Steering) -> bool:
-    """Whether the axles turn so far between two ways of steering that the truck has to stand meanwhile."""
-    return before != after and "crab" in (before, after) and "hybrid" not in (before, after)
+    """Whether the axles turn so far between two different ways of steering that the truck has to stand meanwhile."""
+    return "crab" in (before, after) and "hybrid" not in (before, after)
 
 
 def _reach(points: Array, beyond: float) -> int:

@@ -1,6 +1,8 @@
 """The tracker as a service: poses and a path in, wishes to the gate out."""
 
+import asyncio
 import math
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -30,6 +32,9 @@ ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 
 LOOKS: Final = 8
 """Poses ahead whose clearance counts."""
+
+LONG: Final = 3 * 500
+"""Numbers of a path (x, y, yaw) from which on it is taken in within several turns of the loop."""
 
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
@@ -115,15 +120,20 @@ class TrackerService:
         schedule = Schedule(self._clock, self._config.rate)
         while True:
             await schedule.next()
-            self._step(self._clock.now())
+            for _ in self._parts(self._clock.now()):
+                await asyncio.sleep(0)
 
-    def _step(self, now: int) -> None:
+    def _parts(self, now: int) -> Iterator[None]:
+        """A control step, in parts between which the loop may turn: a long path takes its time when it comes."""
         pose, path, gate = self._pose.latest, self._path.latest, self._gate.latest
         if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
             return  # silent: its lease runs out
-        self._choose_line(path, pose, armed=gate.mode in ACTIVE)
+        if self._choose_line(path, pose, armed=gate.mode in ACTIVE) and len(path.poses) > LONG:
+            yield
         if self._line is None:
             return
+        if self._law.prepare(self._line, self._progress) and len(path.poses) > LONG:
+            yield
         at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
         state = TruckState(at, pose.twist.vx, self._clearance(pose, now), *self._feel(now))
         try:
@@ -139,8 +149,8 @@ class TrackerService:
                 self._ask(command, gate, now)
         self._tell(command, self._line, now)
 
-    def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> None:
-        """Take a new path, or start the present one over: until armed it may still begin anywhere."""
+    def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
+        """Take a new path, or start the present one over: until armed it may still begin anywhere; whether it did."""
         idle, self._active = not self._active, armed
         if armed and idle:
             self._law.reset()
@@ -151,7 +161,7 @@ class TrackerService:
         if path is self._followed:
             again = idle and (armed or self._moved(here))
             if self._line is None or not again or not self._to_begin():
-                return
+                return False
         else:
             self._told = Reason.DRIVING
         self._followed, self._line, self._outcome, self._begun = path, None, Reason.DRIVING, here
@@ -163,6 +173,7 @@ class TrackerService:
             self._progress = self._line.start
         except InputError as error:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
+        return True
 
     def _to_begin(self) -> bool:
         """Whether the path has ended or not yet begun."""

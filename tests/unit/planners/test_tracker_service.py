@@ -118,6 +118,21 @@ async def until_ended(bench, seconds=60.0):
         await bench.clock.sleep(0.1)
 
 
+@pytest.mark.parametrize(("step", "turns"), [(0.05, 0), (0.003, 2)])
+def test_a_long_path_is_taken_in_within_several_turns_of_the_loop(step, turns):
+    async def scenario(bench):
+        bench.path_in.latest = path(circle(1.0, step=step), closed=True)
+        told = len(bench.told)
+        parts = bench.service._parts(bench.clock.now())
+        for _ in range(turns):
+            next(parts)
+            assert len(bench.told) == told
+        assert list(parts) == []
+        assert len(bench.told) == told + 1
+
+    on_bench(scenario, path(circle(1.0)))
+
+
 def test_a_lap_from_arming_to_the_goal():
     async def scenario(bench):
         assert bench.asked == []
