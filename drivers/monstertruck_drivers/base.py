@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Protocol, SupportsIndex
+from typing import Final, NamedTuple, Protocol, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,7 @@ class RangeSource(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class MotorReading:
+class MotorReading(NamedTuple):
     """A motor shaft at one instant, in the controller's own sign."""
 
     turns: float

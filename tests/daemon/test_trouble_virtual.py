@@ -1,6 +1,5 @@
 """What goes wrong with the estimation is told by the whole daemon: a corridor, slipping wheels, iron at the compass."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +91,7 @@ def troubled() -> dict:
                 reading = read(now)
                 spun = (read(min(now, end)).turns if now <= end else at["spun"]) - begun
                 at["spun"] = begun + spun
-                return replace(reading, turns=reading.turns + 2 * spun)
+                return reading._replace(turns=reading.turns + 2 * spun)
 
             motor.reading = slipping
             await clock.sleep(5.0)

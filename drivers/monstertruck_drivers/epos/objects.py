@@ -6,9 +6,9 @@ Standard library only, like ``protocol``.
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One object: its address, width in bits, sign and access (``ro``, ``wo``, ``rw``)."""
+    """One object: its address, width in bits, sign and access (``ro``, ``wo``, ``rw``); there is one of each."""
 
     name: str
     index: int

@@ -1,7 +1,7 @@
 """Decisions of the drive service without its bytes: what a command asks for, what a state means, where the shaft is."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, State
@@ -14,8 +14,7 @@ OVERSPEED = 1.5
 """Times the greatest speed: a shaft cannot have moved faster, so its counter was reset."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(NamedTuple):
     """What the controller shall do: a power state, and the target of ENABLED."""
 
     goal: State

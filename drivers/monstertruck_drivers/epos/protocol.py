@@ -18,6 +18,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import NamedTuple
 
 from monstertruck_drivers.epos.objects import CONTROLWORD, Entry
 
@@ -57,8 +58,7 @@ class NmtCommand(IntEnum):
     RESET_COMMUNICATION = 130
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """Opcode and its data words (1 to 63 unsigned 16-bit numbers)."""
 
     opcode: int

@@ -384,9 +384,10 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
         least: mm; what is below is an error code (``DMIN``).
 
     Returns:
-        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,).
+        Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,), read-only as messages have them.
     """
     valid = values >= least
     ranges = np.where(valid, values / 1000.0, np.inf)
     codes = np.where(valid, VALID_BEAM, np.minimum(values, VALID_BEAM - 1)).astype(np.uint8)
+    ranges.flags.writeable = codes.flags.writeable = False
     return ranges, codes

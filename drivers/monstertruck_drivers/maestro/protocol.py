@@ -5,7 +5,7 @@ Source: Maestro user's guide, sections 5.c (protocols), 5.d (CRC), 5.e (commands
 
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Final
+from typing import Final, NamedTuple
 
 POLOLU_START: Final = 0xAA
 MINI_SSC_START: Final = 0xFF
@@ -139,8 +139,7 @@ class Encoder:
         return self.command(Code.GET_ERRORS)
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """One complete, correct command as the device sees it."""
 
     code: Code

@@ -162,7 +162,6 @@ def build(sentence: Sentence, *, mask: Fields | None = None) -> bytes:
         sentence: values; those that are None are left out.
         mask: print only these fields.
     """
-    wanted = sentence.fields if mask is None else sentence.fields & mask
     one, two, three = "{}{:.1f}", "{}{:.2f}", "{}{:.3f}"
     columns = (
         (Fields.HEADING, one, "C", sentence.heading),
@@ -177,7 +176,7 @@ def build(sentence: Sentence, *, mask: Fields | None = None) -> bytes:
     )
     body = ""
     for bit, layout, tag, value in columns:
-        if bit not in wanted:
+        if value is None or (mask is not None and bit not in mask):
             continue
         if isinstance(value, tuple):
             body += "".join(layout.format(tag + axis, part) for axis, part in zip("xyz", value, strict=True))
