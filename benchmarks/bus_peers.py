@@ -35,6 +35,8 @@ from monstertruckd.demo.wall import connect
 BEAMS = 682
 RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)
 CODES = np.full(BEAMS, VALID_BEAM, np.uint8)
+for _array in (RANGES, CODES):
+    _array.flags.writeable = False
 PATIENCE = 5.0
 OTHER = {"ping": "echo", "echo": "ping"}
 
@@ -125,7 +127,7 @@ async def raw(
 
 async def pings(put: Callable[[int], None], receive: Callable[[], Awaitable[object]]) -> None:
     """Serve the commands on standard input."""
-    await asyncio.sleep(1.0)  # until the other end has subscribed
+    await asyncio.sleep(3.0)  # until the other end has subscribed
     print("ready", flush=True)
     while words := (await asyncio.to_thread(sys.stdin.readline)).split():
         count, rate = int(words[0]), float(words[1])

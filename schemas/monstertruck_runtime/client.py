@@ -8,6 +8,7 @@ import os
 import re
 import socket
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -127,7 +128,7 @@ class TruckClient:
         """
         mailbox: Mailbox[M] = Mailbox(delivery, self._unsubscribe)
         hop: ThreadHop[bytes] = ThreadHop(
-            lambda data: _deliver(topic, data, mailbox), max(_HOP_DEPTH, delivery.depth), mailbox.lose
+            partial(_deliver, topic, mailbox), max(_HOP_DEPTH, delivery.depth), mailbox.lose
         )
 
         def receive(sample: zenoh.Sample) -> None:
@@ -358,7 +359,7 @@ class TruckClient:
         return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}")
 
 
-def _deliver(topic: Topic[M], data: bytes, mailbox: Mailbox[M]) -> None:
+def _deliver(topic: Topic[M], mailbox: Mailbox[M], data: bytes) -> None:
     try:
         message = wire.decode(topic, data)
     except InputError as error:

@@ -25,6 +25,8 @@ FIXED32: Final = 5
 _FIXED: Final = {FIXED64: 8, FIXED32: 4}
 _DOUBLE: Final = struct.Struct("<d")
 _MASK64: Final = 2**64 - 1
+_FIVE: Final = struct.Struct("<Q")
+_CONTINUED: Final = [0, *(int.from_bytes(b"\x80" * count, "little") for count in range(5))]
 _SHORT: Final = [bytes((value,)) for value in range(0x80)]
 
 
@@ -189,6 +191,10 @@ def varint(value: int) -> bytes:
         return _SHORT[value]
     if 0 <= value < 0x4000:
         return bytes((value & 0x7F | 0x80, value >> 7))
+    if 0 <= value < 0x8_0000_0000:
+        groups = value & 0x7F | value << 1 & 0x7F00 | value << 2 & 0x7F_0000 | value << 3 & 0x7F00_0000
+        count = (value.bit_length() + 6) // 7
+        return _FIVE.pack(groups | value << 4 & 0x7F_0000_0000 | _CONTINUED[count])[:count]
     value &= _MASK64
     out = bytearray()
     while value > 0x7F:

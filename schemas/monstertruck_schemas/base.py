@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationInfo, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
 
 
 class Schema(BaseModel):
@@ -44,14 +44,24 @@ def assembled(model: type[S], values: dict[str, Any]) -> S:
         values: of every field, in their order; arrays read-only.
     """
     record = object.__new__(model)
-    for name, value in (
-        ("__dict__", values),
-        ("__pydantic_fields_set__", set(values)),
-        ("__pydantic_extra__", None),
-        ("__pydantic_private__", None),
-    ):
-        object.__setattr__(record, name, value)
+    _set_values(record, values)
+    _set_given(record, set(values))
+    _set_extra(record, None)
+    _set_private(record, None)
     return record
+
+
+# A record refuses to be written to; its own descriptors are the shortest way round that.
+_set_values, _set_given, _set_extra, _set_private = (
+    vars(BaseModel)[slot].__set__
+    for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")
+)
+
+
+def array_bytes(array: NDArray[Any]) -> bytes:
+    """Bytes of a message's array; those it was made from, where they are the same."""
+    base: object = array.base
+    return base if type(base) is bytes and len(base) == array.nbytes else array.tobytes()
 
 
 def _equal(a: object, b: object) -> bool:
@@ -60,12 +70,12 @@ def _equal(a: object, b: object) -> bool:
     return bool(a == b)
 
 
-def _frozen_array(dtype: type[np.generic]) -> BeforeValidator:
+def _frozen_array(dtype: type[np.generic]) -> PlainValidator:
     exact = np.dtype(dtype)
 
     def freeze(value: Any, info: ValidationInfo) -> NDArray[Any]:
-        if type(value) is np.ndarray and value.dtype is exact and value.ndim == 1 and not value.flags.writeable:
-            return value
+        if type(value) is np.ndarray and value.dtype is exact and value.ndim == 1:
+            return np.frombuffer(value.tobytes(), exact) if value.flags.writeable else value
         # What came in from outside is looked at first: numpy takes its time over strings and nested lists.
         if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
             msg = "expected a list of numbers"
@@ -77,12 +87,9 @@ def _frozen_array(dtype: type[np.generic]) -> BeforeValidator:
         if array.ndim != 1:
             msg = f"expected one dimension, got {array.ndim}"
             raise ValueError(msg)
-        if array.flags.writeable:
-            array = array.copy() if isinstance(value, np.ndarray) else array
-            array.flags.writeable = False
-        return array
+        return np.frombuffer(array.tobytes(), exact) if array.flags.writeable else array
 
-    return BeforeValidator(freeze)
+    return PlainValidator(freeze)
 
 
 def _array_type(dtype: type[np.generic], json_item: str) -> Any:
