@@ -1,6 +1,6 @@
 """What one tick of the gate decides."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
@@ -10,8 +10,7 @@ from monstertruckd.gate.events import GateEvent
 from monstertruckd.gate.stops import Trip
 
 
-@dataclass(frozen=True, slots=True)
-class GateOutput:
+class GateOutput(NamedTuple):
     """Commands and state of one tick: the fields of DriveCommand, SteeringCommand and GateState; events and stops."""
 
     action: DriveAction

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_runtime.clock import SECOND
@@ -45,8 +45,7 @@ STALE_SENSORS: Final = {
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(NamedTuple):
     """Verdict of one tick."""
 
     blocks: tuple[Reason, ...]

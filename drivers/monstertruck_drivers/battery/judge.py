@@ -3,8 +3,7 @@
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -37,8 +36,7 @@ def charge_of(cell_volts: float) -> float:
     return float(np.interp(cell_volts, _CELL_VOLTS, _CHARGES))
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """What is known of the battery after a sample."""
 
     level: BatteryLevel

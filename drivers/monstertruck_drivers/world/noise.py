@@ -25,15 +25,15 @@ class WhiteNoise:
     def __init__(self, seed: int, stream: int, size: int = 1) -> None:
         self._seed, self._stream, self._size = seed, stream, size
         self._block = -1
-        self._rows: list[list[float]] = []
+        self._values: list[float] = []
 
     def at(self, index: int) -> list[float]:
         """Values of an index (0 or more), one a channel."""
         block, row = divmod(index, _BLOCK)
         if block != self._block:
-            drawn = generator(self._seed, self._stream, block).standard_normal((_BLOCK, self._size))
-            self._block, self._rows = block, drawn.tolist()
-        return self._rows[row]
+            drawn = generator(self._seed, self._stream, block).standard_normal(_BLOCK * self._size)
+            self._block, self._values = block, drawn.tolist()
+        return self._values[row * self._size : (row + 1) * self._size]
 
 
 class SlowNoise:

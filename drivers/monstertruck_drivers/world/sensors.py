@@ -39,7 +39,8 @@ class SimulatedLidar:
     def __init__(self, plant: TruckPlant, cast: Caster, config: LidarConfig, seed: int | None) -> None:
         self.joints: JointSource | None = None
         self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
-        self._valid = (np.arange(STEPS) >= config.first_step) & (np.arange(STEPS) <= config.last_step)
+        self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
+        """Steps that never measure."""
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
         """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
@@ -49,9 +50,10 @@ class SimulatedLidar:
         """
         self._plant.advance(time_ns)
         times = time_ns + _BEAM_DELAYS
-        x, y, yaw, pitch, roll = self._plant.poses(times)
+        poses = self._plant.poses(times)
+        x, y, yaw, pitch, roll = poses
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
-        if self.joints is None and max(np.abs(pitch).max(), np.abs(roll).max()) < _LEVEL:
+        if self.joints is None and np.abs(poses[3:]).max() < _LEVEL:
             ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range)
         else:
             beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
@@ -76,13 +78,13 @@ class SimulatedLidar:
 
     def _measure(self, ranges: NDArray[np.float64], time_ns: int) -> NDArray[np.int32]:
         config = self._config
-        lost = ~self._valid
+        lost = self._lost
         if self._seed is not None:
             noise = generator(self._seed, LIDAR, self._plant.slot(time_ns, SWEEP_NS // 2))
             sigma = np.maximum(0.01, 0.01 * ranges) / config.accuracy_sigmas
             sigma[np.isinf(sigma)] = 0.0
             ranges = ranges + sigma * noise.standard_normal(STEPS)
-            lost = lost | (noise.random(STEPS) < config.dropout)
+            lost = self._lost | (noise.random(STEPS) < config.dropout)
         seen = ranges <= config.max_range
         millimetres: NDArray[np.int32] = np.rint(np.where(seen, ranges, 0.0) * 1000).astype(np.int32)
         millimetres[seen & (ranges < config.min_range)] = TOO_NEAR

@@ -7,8 +7,8 @@ ends early at the instant somebody asks for; the grid itself never shifts.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import copysign, cos, exp, hypot, pi, sin
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,7 @@ Tilt = Callable[[int, float, float, float], tuple[float, float]]
 """Pitch (nose down positive) and roll (right side down positive), rad, at (elapsed ns, x, y, yaw)."""
 
 
-@dataclass(frozen=True, slots=True)
-class TruthState:
+class TruthState(NamedTuple):
     """What is really the case; SI units and radians, map frame, geometric centre."""
 
     time_ns: int
@@ -187,8 +186,12 @@ class TruckPlant:
             for part in (0.5, 1.0):
                 pose = integrate(self._pose, *self._twist, ahead * part)
                 trail.append((self._elapsed * 1e-9 + ahead * part, *pose, *self._attitude))
-        rows = np.array(trail).T
-        return np.stack([np.interp(seconds, rows[0], row) for row in rows[1:]])
+        found = np.zeros((5, len(seconds)))
+        level = not any(pitch or roll for *_, pitch, roll in trail)
+        at, *rows = np.array(trail).T
+        for i, row in enumerate(rows[:3] if level else rows):
+            found[i] = np.interp(seconds, at, row)
+        return found
 
     def _remember(self) -> None:
         self._trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude))

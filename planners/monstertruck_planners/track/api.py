@@ -1,15 +1,13 @@
 """What goes into a tracker and what comes out."""
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from monstertruck_planners.track.line import Line, Progress
 from monstertruck_schemas.reasons import Reason
 
 
-@dataclass(frozen=True, slots=True)
-class TruckState:
+class TruckState(NamedTuple):
     """What a tracker knows of the truck."""
 
     pose: tuple[float, float, float]
@@ -24,8 +22,7 @@ class TruckState:
     """Standard deviation of the tilt over the last seconds, rad."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """What to do now, and how the tracking goes."""
 
     speed: float

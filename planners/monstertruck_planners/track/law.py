@@ -6,8 +6,7 @@ rest at the end, and starts to roll when the wheels have turned. No bearing deci
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +34,7 @@ TURNED: Final = 0.03
 """Axles this near to what is asked count as turned, rad."""
 
 
-@dataclass(frozen=True, slots=True)
-class Here:
+class Here(NamedTuple):
     """Where the truck will be when what is asked now begins to act."""
 
     pose: Pose

@@ -47,8 +47,7 @@ class Progress:
     """Metres from the run's beginning."""
 
 
-@dataclass(frozen=True, slots=True)
-class Foot:
+class Foot(NamedTuple):
     """Point of a run nearest to the truck."""
 
     s: float
