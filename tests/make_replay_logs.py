@@ -1,6 +1,6 @@
 """``python -m tests.make_replay_logs``: short recorded runs that ``replay --check`` has to give again bit for bit.
 
-Whole daemons on the virtual clock, of a fixed seed. To be made anew when the estimation, the tracker or the
+Whole daemons on the virtual clock, of a fixed seed. To be made anew when the estimation, a planner or the
 configuration changes on purpose, so that the recorded outputs or the attached configuration are no longer theirs.
 """
 
@@ -12,46 +12,113 @@ from typing import Any
 import numpy as np
 import yaml
 
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.plan import GoalPhase
+from monstertruck_schemas.req import GoalRequest, Order, Role
+from monstertruckd.config.validate import load_config
 from monstertruckd.config.yaml_tree import load_tree
 from monstertruckd.demo.fast import run_fast_demo
+from monstertruckd.demo.operator import LocalOperator
+from monstertruckd.demo.wall import write_overlay
 from monstertruckd.logs import info
+from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.sim.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "tests" / "data" / "replay"
 RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8), "fusion": ("fusion.yaml", 0.6)}
 """Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and two that map."""
+GOALS = ((0.2, -1.7), (0.42, -1.72))
+"""Places (x, y) that the run ``goals`` drives to: asked for by topic, and by remote call."""
+PLANNER = {
+    "route": {"kind": "hybrid", "effort": 3000, "unknown": "free"},
+    "deform": {"kind": "rsband"},
+    "local": {"clearance": 0.6},
+    "latency": 0.2,
+}
+"""Of that run: so much clearance is wanted that every route is deformed."""
 
 
-def short_config(source: Path, folder: Path, length: float) -> Path:
-    """``source`` with all it includes, its path straight and short, without what fills a log: pictures, every beam."""
-    config: dict[str, Any] = load_tree(source).data | {"version": 1}
+def short_config(source: Path, folder: Path, **changes: Any) -> Path:
+    """``source`` with all it includes and ``changes``, without what fills a log: pictures, every beam."""
+    config: dict[str, Any] = load_tree(source).data | {"version": 1} | changes
     config.pop("include", None)
-    config["path"] = {"file": "path.csv"}
     config["recorder"] = {"compression": "zstd"}
     config["map"] = None
     config["devices"]["camera"] = None
     config["devices"]["lidar"].setdefault("driver", {})["cluster"] = 3
-    rows = [f"{x:.4f},-1.7000,0.00000,1" for x in np.arange(0.0, length + 1e-9, 0.05)]
-    (folder / "path.csv").write_text("\n".join(["x,y,yaw,direction", *rows]) + "\n")
     target = folder / "truck.yaml"
     target.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     return target
 
 
+def drive_path(source: str, length: float, folder: Path) -> None:
+    """A straight path of ``length`` metres."""
+    rows = [f"{x:.4f},-1.7000,0.00000,1" for x in np.arange(0.0, length + 1e-9, 0.05)]
+    (folder / "path.csv").write_text("\n".join(["x,y,yaw,direction", *rows]) + "\n")
+    config = short_config(ROOT / "configs" / source, folder, path={"file": "path.csv"})
+    run_fast_demo(config, folder / "run", seed=1)
+
+
+def drive_to_goals(folder: Path) -> None:
+    """Two goals on a growing map."""
+    config = short_config(ROOT / "configs" / "slam.yaml", folder, path=None, planner=PLANNER, tracker={"kind": "lqr"})
+    overlay = write_overlay(config, folder / "run", "tcp/127.0.0.1:0", seed=1)
+    truck, tree = load_config(overlay, SimulatedTruckConfig)
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(truck, clock, tree)
+        async with rig.running():
+            operator = LocalOperator(rig.bus, clock)
+            states = rig.bus.subscribe(topics.GOAL, fifo(256))
+            await clock.sleep(0.73)
+            for number, (x, y) in enumerate(GOALS, start=1):
+                gate, now = rig.bus.newest(topics.GATE), clock.now()
+                assert gate is not None
+                request = GoalRequest(
+                    stamp=now,
+                    received=now,
+                    seq=number,
+                    frame="map",
+                    source="tester",
+                    role=Role.STATION,
+                    lease=1.0,
+                    nonce=gate.nonce,
+                    gate_stamp=gate.stamp,
+                    goal=Pose2D(x=x, y=y, yaw=0.0),
+                )
+                if number == 1:
+                    rig.bus.inject(topics.REQ_GOAL, request)
+                    await operator.order(Order.ARM)
+                else:
+                    await rig.daemon.rpc.call("goal", request.model_dump(mode="json"))
+                async with clock.deadline(20.0):
+                    while (state := await states.next()).number < number or state.phase is not GoalPhase.IDLE:
+                        pass
+            await clock.sleep(0.13)
+
+    run_virtual(main)
+
+
 def record(name: str, target: Path) -> None:
     """Drive the run ``name`` and leave its log at ``target``."""
-    source, length = RUNS[name]
     with tempfile.TemporaryDirectory(prefix="replay-") as scratch:
-        config = short_config(ROOT / "configs" / source, Path(scratch), length)
-        summary = run_fast_demo(config, Path(scratch) / "run", seed=1)
-        (log,) = (file for file in summary.files if file.suffix == ".mcap")
+        folder = Path(scratch)
+        if name == "goals":
+            drive_to_goals(folder)
+        else:
+            drive_path(*RUNS[name], folder)
+        (log,) = (folder / "run" / "logs").glob("*.mcap")
         shutil.copy(log, target)
 
 
 def main() -> None:
     """Write all logs."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in RUNS:
+    for name in (*RUNS, "goals"):
         log = FOLDER / f"{name}.mcap"
         record(name, log)
         summary = info(log)

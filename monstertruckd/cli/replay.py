@@ -86,6 +86,8 @@ def _show(result: "Check") -> None:
         print(f"first difference: {first.topic} number {first.sequence} at {first.at:.2f} s: {fields}")
     for message in result.unreadable:
         remark(f"{message.topic} number {message.sequence} at {message.at:.2f} s was left out: {message.error}")
+    if result.left_out is not None:
+        remark(f"goals and tracker are left out: {result.left_out}")
     for topic, count in result.lost.items():
         remark(f"{count} messages of {topic} never reached the log")
 

@@ -3,7 +3,8 @@
 Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
 for bit. So are those of the estimation worker and what rests on them in a log of the virtual clock. On the wall clock
 the log shows when the worker's results counted, but not which of two inputs of one instant it had read: there what
-rests on them may differ by ``WORKER_TOLERANCE``, and its own messages are shown, not judged.
+rests on them may differ by ``WORKER_TOLERANCE``, and its own messages are shown, not judged. So are paths to goals,
+whose search ended by time there, not by work, and reports on goals: most results of their workers show nowhere.
 """
 
 import asyncio
@@ -18,8 +19,9 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.bus.local import TapCallback
 from monstertruckd.config.load import load_truck
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage
-from monstertruckd.replay_check.chain import WORKER, Chain, early_ticks, outputs_of
+from monstertruckd.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.replay_check.comparison import TopicComparison
 from monstertruckd.replay_check.pace import PacedClock
 from monstertruckd.replay_check.recorded import Survey, preamble, recorded_config, survey
@@ -30,6 +32,9 @@ RESTS_ON_WORKER: Final = frozenset(
     topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
 )
 """Outputs a worker has a say in where the robot maps or localises."""
+RESTS_ON_GOALS: Final = frozenset({topics.TRACKER.name, topics.PLAN_DRIVE.name})
+"""The same where it drives to goals; of the wall clock several stamps of one tick are known as one."""
+GOALS: Final = frozenset({topics.PATH.name, topics.GOAL.name})
 WORKER_TOLERANCE: Final = 0.02
 """Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""
 
@@ -59,16 +64,19 @@ def check_log(
     attachments, metadata = preamble(reader)
     own = recorded_config(log, attachments)
     used = own if config is None else load_truck(config)[0]
+    left_out = why_no_goals(own, used, found.goals)
+    if left_out is not None:
+        own, used = without_goals(own), without_goals(used)
     compared = outputs_of(own) | outputs_of(used)
     _refuse_the_middle(log, found, compared)
     virtual = int(metadata.get("real_offset_ns", 0)) == 0
-    exact = virtual or (own.slam is None and used.slam is None)
+    loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
     rows = {
         topic.name: TopicComparison(
             topic,
-            _tolerance(topic.name, tolerance, exact=exact),
+            tolerance if tolerance is not None else WORKER_TOLERANCE * (topic.name in loose),
             found.start,
-            judged=exact or topic.name not in WORKER,
+            judged=topic.name not in shown,
         )
         for topic in topics.TOPICS
         if topic.name in compared
@@ -76,8 +84,8 @@ def check_log(
     unreadable: list[Unreadable] = []
 
     async def main(clock: PacedClock) -> None:
-        chain = Chain(used, clock, early_ticks(own, found), found)
-        tap = chain.bus.tap(_into(rows), (row.topic for row in rows.values()))
+        chain = Chain(used, clock, unseen_ticks(own, found), found)
+        tap = chain.bus.tap(_into(rows, chain), (row.topic for row in rows.values()))
         async with chain.running():
             relevant = (entry for entry in reader if entry.topic in rows or chain.takes(entry.topic))
             for bunch in _bunches(relevant, chain.ticks):
@@ -101,6 +109,7 @@ def check_log(
         tuple(unreadable),
         found.lost(),
         found.damage,
+        left_out,
     )
 
 
@@ -146,17 +155,21 @@ async def _feed(
         await chain.take(BY_NAME[entry.topic], message, entry.log_time)
 
 
-def _into(rows: Mapping[str, TopicComparison]) -> TapCallback:
-    def take(topic: Topic[Message], _: Message, payload: bytes, at: int) -> None:
-        rows[topic.name].recomputed(at, payload)
+def _into(rows: Mapping[str, TopicComparison], chain: Chain) -> TapCallback:
+    def take(topic: Topic[Message], message: Message, payload: bytes, at: int) -> None:
+        rows[topic.name].recomputed(at, chain.as_computed(topic, message, payload))
 
     return take
 
 
-def _tolerance(topic: str, wanted: float | None, *, exact: bool) -> float:
-    if wanted is not None:
-        return wanted
-    return WORKER_TOLERANCE if topic in RESTS_ON_WORKER and not exact else 0.0
+def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
+    """On the wall clock: topics that may differ a little, and topics that are not judged."""
+    loose, shown = frozenset[str](), frozenset[str]()
+    if any(config.slam is not None for config in configs):
+        loose, shown = RESTS_ON_WORKER, shown | frozenset(WORKER)
+    if any(config.planner is not None for config in configs):
+        loose, shown = loose | RESTS_ON_GOALS, shown | GOALS
+    return loose, shown
 
 
 def _refuse_the_middle(log: Path, found: Survey, compared: Collection[str]) -> None:

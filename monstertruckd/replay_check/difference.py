@@ -10,6 +10,7 @@ import numpy as np
 
 from monstertruck_estimation.transforms import conjugate, multiply, wrap_angle
 from monstertruck_schemas.base import Message, Pose2D, Schema
+from monstertruck_schemas.plan import Path
 from monstertruck_schemas.state import Grid, Transform
 
 HEADER: Final = frozenset({"stamp", "received", "seq"})
@@ -46,10 +47,8 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
         case Pose2D(), Pose2D():
             yield Difference(Kind.LENGTH, name, math.hypot(b.x - a.x, b.y - a.y))
             yield Difference(Kind.ANGLE, f"{name}.yaw", abs(wrap_angle(b.yaw - a.yaw)))
-        case Transform(), Transform():
-            yield from _transform(name, a, b)
-        case Grid(), Grid():
-            yield from _grid(a, b)
+        case (Transform(), Transform()) | (Grid(), Grid()) | (Path(), Path()):
+            yield from _figure(name, a, b)
         case Schema(), Schema() if type(a) is type(b):
             for field in type(a).model_fields:
                 if field not in HEADER:
@@ -65,6 +64,16 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
             yield _number(name, a, b)
         case _:
             yield _text(name, a, b)
+
+
+def _figure(name: str, a: Any, b: Any) -> Iterator[Difference]:
+    """Of what is more than its fields."""
+    if isinstance(a, Transform):
+        yield from _transform(name, a, b)
+    elif isinstance(a, Grid):
+        yield from _grid(a, b)
+    else:
+        yield from _path(a, b)
 
 
 def _number(name: str, a: float, b: float) -> Difference:
@@ -91,6 +100,22 @@ def _transform(name: str, a: Transform, b: Transform) -> Iterator[Difference]:
     x, y, z, w = multiply(conjugate(a.rotation), b.rotation)
     turned = 0.0 if a.rotation == b.rotation else 2 * math.atan2(math.hypot(x, y, z), abs(w))
     yield Difference(Kind.ANGLE, f"{a.child}.rotation", turned)
+
+
+def _path(a: Path, b: Path) -> Iterator[Difference]:
+    """How far the two lead apart: Hausdorff distance of their poses, and the angle between the nearest ones."""
+    if not len(a.poses) or not len(b.poses):
+        yield _text("poses", len(a.poses), len(b.poses))
+        return
+    one, other = (np.reshape(path.poses, (-1, 3)) for path in (a, b))
+    apart = np.hypot(*(one[:, None, :2] - other[None, :, :2]).transpose(2, 0, 1))
+    near, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    turned = np.concatenate((one[:, 2] - other[near, 2], other[:, 2] - one[back, 2]))
+    yield Difference(Kind.LENGTH, "poses", float(max(apart.min(axis=1).max(), apart.min(axis=0).max())))
+    yield Difference(Kind.ANGLE, "poses.yaw", max(abs(wrap_angle(angle)) for angle in turned.tolist()))
+    ways = (path.directions[np.flatnonzero(np.diff(path.directions, prepend=0.0))].tolist() for path in (a, b))
+    yield _text("directions", *ways)
+    yield _text("name", (a.name, a.closed), (b.name, b.closed))
 
 
 def _grid(a: Grid, b: Grid) -> Iterator[Difference]:

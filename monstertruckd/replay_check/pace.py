@@ -8,12 +8,14 @@ has come to that output, and its time is then that output's stamp.
 
 import asyncio
 from collections import deque
-from contextvars import ContextVar
-from typing import Final
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 from monstertruck_runtime.clock import ReplayClock, VirtualClock
 
-_PACE: Final[ContextVar["Pace | None"]] = ContextVar("pace", default=None)
+_PACES: Final[WeakKeyDictionary[asyncio.Task[Any], "Pace"]] = WeakKeyDictionary()
 
 
 class Pace:
@@ -25,8 +27,26 @@ class Pace:
         self._held: asyncio.Future[None] | None = None
 
     def adopt(self) -> None:
-        """The running task and what it starts tick by this."""
-        _PACE.set(self)
+        """The running task ticks by this; tasks that it starts do not."""
+        task = asyncio.current_task()
+        assert task is not None
+        _PACES[task] = self
+
+    @staticmethod
+    def current() -> "Pace | None":
+        """Of the running task."""
+        task = asyncio.current_task()
+        return None if task is None else _PACES.get(task)
+
+    @contextmanager
+    def borrowed(self, instant: int) -> Iterator[None]:
+        """For the running task it is ``instant``, ns, while the context lasts."""
+        self.instant = instant
+        self.adopt()
+        yield
+        task = asyncio.current_task()
+        assert task is not None
+        del _PACES[task]
 
     async def hold(self) -> None:
         """Called by the service's clock: wait for the next tick."""
@@ -82,12 +102,12 @@ class PacedClock(ReplayClock):
 
     def now(self) -> int:
         """Nanoseconds of the log's daemon time."""
-        pace = _PACE.get()
+        pace = Pace.current()
         return super().now() if pace is None or pace.instant is None else pace.instant
 
     async def sleep_until(self, instant: int) -> None:
         """Wait until ``instant``, or for the next tick."""
-        pace = _PACE.get()
+        pace = Pace.current()
         if pace is None:
             await super().sleep_until(instant)
         else:

@@ -16,6 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage
+from monstertruckd.replay_check.goals import GoalRecord
 from monstertruckd.replay_check.run_log import RunLog
 
 CONFIG: Final = "config.json"
@@ -38,6 +39,7 @@ class Survey:
     counts: dict[str, int] = field(default_factory=dict)
     ready: dict[str, int] = field(default_factory=dict)
     """When each service was first ready, log time, ns."""
+    goals: GoalRecord = field(default_factory=GoalRecord)
     damage: str | None = None
 
     def lost(self) -> dict[str, int]:
@@ -62,6 +64,7 @@ def survey(log: RunLog) -> Survey:
         found.counts[entry.topic] = found.counts.get(entry.topic, 0) + 1
         if entry.topic == EVENT.name:
             _note_ready(entry, found.ready)
+        found.goals.note(entry)
     why = f" ({log.damage})" if log.damage else ""
     if found is None:
         raise InputError(f"{log.path}: holds no messages{why}")

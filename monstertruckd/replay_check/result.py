@@ -37,6 +37,8 @@ class Check:
     lost: dict[str, int]
     """Messages that never reached the log, by topic."""
     damage: str | None
+    left_out: str | None = None
+    """Why planner and tracker were not computed; None = they were, or there are none."""
 
     @property
     def compared(self) -> int:
@@ -81,6 +83,7 @@ class Check:
             "unreadable": [asdict(message) for message in self.unreadable],
             "lost": self.lost,
             "damage": self.damage,
+            "left_out": self.left_out,
         }
 
     def _row(self, row: TopicComparison) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from monstertruckd.logs.reader import MAGIC
 from monstertruckd.recorder.file import Entry, LogFile
 
 REPLAY = Path(__file__).resolve().parents[2] / "data" / "replay"
-LEVEL, SLAM, FUSION = (REPLAY / f"{name}.mcap" for name in ("level", "slam", "fusion"))
+LEVEL, SLAM, FUSION, GOALS = (REPLAY / f"{name}.mcap" for name in ("level", "slam", "fusion", "goals"))
 
 Change = Callable[[LogMessage], LogMessage | None]
 

@@ -7,7 +7,7 @@ import pytest
 
 from monstertruck_estimation.transforms import planar
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.plan import StabiliserCommand, TrackerState
+from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid, Transforms
 from monstertruckd.replay_check.difference import Difference, Kind, differences
@@ -82,3 +82,20 @@ def test_grids_by_their_mean_cell():
 
     assert found(grid([0, 0, 0, 100]), grid([0, 0, 0, 0])) == {(Kind.NUMBER, "cells"): 0.25}
     assert found(grid([0, 0]), grid([0, 0, 0, 0])) == {(Kind.TEXT, "size"): math.inf}
+
+
+def test_paths_by_how_far_they_lead_apart():
+    def path(poses, directions, name="goal-1.1"):
+        values = np.array(poses, np.float64)
+        return Path(**HEADER, frame="map", poses=values.ravel(), directions=np.array(directions, np.float64), name=name)
+
+    before = path([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [1, 1, 1])
+    longer = path([(0, 0, 0), (1, 0.04, 0), (1.5, 0.02, 0.1), (2, 0, 0)], [1, 1, 1, 1])
+    assert found(before, before) == {}
+    assert found(before, longer) == {
+        (Kind.LENGTH, "poses"): pytest.approx(math.hypot(0.5, 0.02)),
+        (Kind.ANGLE, "poses.yaw"): pytest.approx(0.1),
+    }
+    cusp = path([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [1, 1, -1], "goal-1.2")
+    assert found(before, cusp) == {(Kind.TEXT, "directions"): math.inf, (Kind.TEXT, "name"): math.inf}
+    assert found(before, path([], [])) == {(Kind.TEXT, "poses"): math.inf}

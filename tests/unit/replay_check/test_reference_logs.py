@@ -10,7 +10,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.logs import open_log
 from monstertruckd.replay_check import check_log
 from monstertruckd.replay_check.difference import Kind
-from tests.unit.replay_check.log_surgery import FUSION, LEVEL, SLAM, attachments_of, changed, chunks, digit, flip
+from tests.unit.replay_check.log_surgery import FUSION, GOALS, LEVEL, SLAM, attachments_of, changed, chunks, digit, flip
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -24,8 +24,9 @@ ANOTHER_COMPUTER = 1e-6
         (LEVEL, {topics.SCAN, topics.PLAN_STABILISER, topics.ODOMETRY, topics.POSE, topics.TRACKER}),
         (SLAM, {topics.SLAM, topics.MAP, topics.MAP_TILES, topics.POSE, topics.TRANSFORMS, topics.PLAN_DRIVE}),
         (FUSION, {topics.ODOMETRY, topics.FUSION, topics.SCAN_MOTION, topics.POSE}),
+        (GOALS, {topics.GOAL, topics.PATH, topics.TRACKER, topics.PLAN_DRIVE, topics.MAP, topics.POSE}),
     ],
-    ids=["level", "slam", "fusion"],
+    ids=["level", "slam", "fusion", "goals"],
 )
 def test_a_stored_run_comes_again(log, computed):
     check = check_log(log, tolerance=ANOTHER_COMPUTER)
