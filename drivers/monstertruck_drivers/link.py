@@ -78,20 +78,21 @@ class Link:
         self._require_up()
         self._transmit(data)
 
-    async def read(self, within: float | None = None) -> bytes:
-        """Everything received so far, at least one byte.
+    async def read(self, within: float | None = None, least: int = 1) -> bytes:
+        """Everything received so far.
 
         Args:
             within: seconds to wait for it; None = for ever.
+            least: bytes worth waking for.
 
         Raises:
-            DeviceLostError: the link is down and its buffer is empty.
-            TimeoutError: nothing came in time.
+            DeviceLostError: the link is down and its buffer holds less.
+            TimeoutError: not as much came in time.
         """
-        if not self._buffer:
+        if len(self._buffer) < least:
             due = _due(within)
-            while not self._buffer:
-                await self._more(due)
+            while len(self._buffer) < least:
+                await self._more(due, least)
         data = bytes(self._buffer)
         self._buffer.clear()
         return data
@@ -110,7 +111,7 @@ class Link:
         if len(self._buffer) < count:
             due = _due(within)
             while len(self._buffer) < count:
-                await self._more(due)
+                await self._more(due, count)
         data = bytes(self._buffer[:count])
         del self._buffer[:count]
         return data
@@ -183,10 +184,10 @@ class Link:
         """Tell nobody any more."""
         self._waiting = self._due = None
 
-    async def _more(self, due: float | None = None) -> None:
-        """Wait until something comes."""
+    async def _more(self, due: float | None = None, count: int = 1) -> None:
+        """Wait until so many bytes are there, or no more will come."""
         self._require_up()
-        waiter = _Sleeper()
+        waiter = _Sleeper(lambda: len(self._buffer) >= count or self.is_lost)
         self.begin_wait(waiter, due)
         try:
             await waiter.woken
@@ -229,13 +230,18 @@ class Waiting(Protocol):
 
 
 class _Sleeper:
-    """A coroutine that waits."""
+    """A coroutine that waits.
 
-    def __init__(self) -> None:
+    Args:
+        enough: whether what has come is worth waking for.
+    """
+
+    def __init__(self, enough: Callable[[], bool]) -> None:
+        self._enough = enough
         self.woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def news(self) -> None:
-        if not self.woken.done():
+        if not self.woken.done() and self._enough():
             self.woken.set_result(None)
 
     def late(self) -> None:

@@ -70,6 +70,12 @@ class PacketParser:
         self._buffer = bytearray()
         self._header: tuple[Kind, int, int, int] | None = None
 
+    @property
+    def missing(self) -> int:
+        """Bytes without which no further packet can become complete, at least 1."""
+        whole = HEADER_SIZE if self._header is None else self._header[3]
+        return max(whole - len(self._buffer), 1)
+
     def feed(self, data: bytes) -> list[Packet]:
         """Everything that became complete, in order."""
         self._buffer += data

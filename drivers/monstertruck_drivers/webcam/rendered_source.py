@@ -3,7 +3,7 @@
 from types import TracebackType
 from typing import Final, Self
 
-from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port
 from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser, decode_mode
 from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, Mode, device_error
 from monstertruck_runtime.clock import Clock
@@ -11,6 +11,8 @@ from monstertruck_runtime.errors import DeviceTimeoutError
 
 ANSWER_TIMEOUT: Final = 2.0
 """Seconds until an emulated camera must grant or refuse."""
+MOST: Final = BUFFER_LIMIT // 2
+"""Bytes of a picture taken at a time: the link keeps no more than its buffer holds."""
 
 
 class RenderedSource:
@@ -65,7 +67,7 @@ class RenderedStream:
         """Wait for a picture, see ``FrameStream``."""
         picture: Packet | None = None
         while picture is None:
-            for packet in self._parser.feed(await self._link.read()):
+            for packet in self._parser.feed(await self._link.read(least=min(self._parser.missing, MOST))):
                 if packet.kind is Kind.PICTURE:
                     picture = packet
         return Frame(picture.stamp, picture.number, picture.payload)

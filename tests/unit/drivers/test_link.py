@@ -42,6 +42,23 @@ async def test_a_reader_wakes_when_enough_bytes_came():
         assert await waiting == b"abcd"
 
 
+async def test_a_read_may_wait_for_more_than_a_byte():
+    port = await plugged()
+    link = await port.open()
+    reading = asyncio.create_task(link.read(least=3))
+    for _ in range(2):
+        port.device.write(b"a")
+        await asyncio.sleep(0)
+    assert not reading.done()
+    port.device.write(b"bc")
+    assert await reading == b"aabc"
+    port.device.write(b"d")
+    port.unplug()
+    with pytest.raises(DeviceLostError):
+        await link.read(least=2)
+    assert await link.read() == b"d"
+
+
 def test_each_wait_has_its_own_time_limit():
     async def main(clock: VirtualClock) -> list[float]:
         port = await plugged()

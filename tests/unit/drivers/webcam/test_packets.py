@@ -22,7 +22,13 @@ packets = st.builds(
 def test_packets_survive_any_cut(sent: list[Packet], cut: int):
     data = b"".join(packet.encode() for packet in sent)
     parser = PacketParser()
-    got = [packet for at in range(0, len(data), cut) for packet in parser.feed(data[at : at + cut])]
+    got = []
+    for at in range(0, len(data), cut):
+        piece, missing = data[at : at + cut], parser.missing
+        new = parser.feed(piece)
+        assert missing >= 1
+        assert not new or len(piece) >= missing
+        got += new
     assert got == sent
 
 
