@@ -12,7 +12,6 @@ import asyncio
 import contextvars
 import heapq
 import selectors
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
@@ -113,7 +112,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._timers: list[tuple[float, int, asyncio.TimerHandle]] = []
         """Heap of (when in s, number in the order of setting, handle)."""
         self._timers_set = 0
-        self._woken = threading.Event()
+        self._woken = False
         """Another thread has something for the loop."""
         self._watcher = _CountingSelector()
         super().__init__(self._watcher)
@@ -137,7 +136,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.Handle:
         """As in asyncio; also notes that the kernel has to be asked."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
-        self._woken.set()
+        self._woken = True
         return handle
 
     def _run_once(self) -> None:
@@ -146,13 +145,13 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._drop_cancelled()
         idle = not ready and not self._stopping
         events: list[tuple[selectors.SelectorKey, int]] = []
-        if self._watcher.count > 1 or self._woken.is_set() or (idle and not timers):
-            self._woken.clear()
+        if self._woken or self._watcher.count > 1 or (idle and not timers):
+            self._woken = False
             events = self._watcher.select(None if idle and not timers else 0)
             self._process_events(events)  # type: ignore[attr-defined]
         if idle and timers and not events and (wait := timers[0][0] - self.time()) > 0:
             self.jump(min(wait, LONGEST_JUMP))
-        end = self.time() + self._clock_resolution
+        end = self.instant / SECOND + self._clock_resolution
         while timers and timers[0][0] < end:
             timer = heapq.heappop(timers)[2]
             timer._scheduled = False  # type: ignore[attr-defined]  # noqa: SLF001

@@ -185,9 +185,9 @@ class Firmware:
         entry = self._find(index, sub)
         if entry.access == "wo" or entry.width > 32:
             raise AccessRefusedError(od.READ_OF_WRITE_ONLY if entry.access == "wo" else od.LENGTH_MISMATCH)
-        self.advance()
+        reading = self.advance()
         low, high = entry.limits
-        return entry.encode(min(max(self._measured(entry), low), high))
+        return entry.encode(min(max(self._measured(entry, reading), low), high))
 
     def read_long(self, index: int, sub: int) -> bytes:
         """Bytes of an object for a segmented read.
@@ -223,11 +223,11 @@ class Firmware:
             raise AccessRefusedError(od.NO_SUBINDEX if known else od.NO_OBJECT)
         return entry
 
-    def _measured(self, entry: Entry) -> int:
+    def _measured(self, entry: Entry, reading: MotorReading) -> int:
         if entry in od.ERROR_HISTORY:
             return self._history[entry.sub - 1] if entry.sub <= len(self._history) else 0
         live = self._live.get(entry)
-        return self._values[entry] if live is None else live(self._motor.reading(self._now()))
+        return self._values[entry] if live is None else live(reading)
 
     def _position(self, reading: MotorReading) -> int:
         counts = math.floor((reading.turns - self._origin) * self._values[od.ENCODER_PULSES] * od.COUNTS_PER_PULSE)
@@ -320,9 +320,9 @@ class Firmware:
         self._set(State.FAULT_REACTION_ENABLED if running else State.FAULT_REACTION_DISABLED)
         self._pending = (self._now() + int(REACTION_TIME * SECOND), State.FAULT)
 
-    def advance(self) -> None:
-        """Let time-driven things happen: filters, supply faults, states that pass."""
-        now = self._now()
+    def advance(self) -> MotorReading:
+        """Let time-driven things happen: filters, supply faults, states that pass; the motor as it is then."""
+        now, state = self._now(), self.state
         reading = self._motor.reading(now)
         then, turns = self._seen
         if now > then:
@@ -337,6 +337,7 @@ class Firmware:
             self.fail(min(fresh))
         if self._pending is not None and now >= self._pending[0]:
             self._set(self._pending[1])
+        return reading if self.state is state else self._motor.reading(now)
 
     def _supply_faults(self, volts: float) -> set[int]:
         if volts < UNDER_VOLTAGE_BELOW:

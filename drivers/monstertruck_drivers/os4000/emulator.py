@@ -18,6 +18,7 @@ from monstertruck_drivers.os4000.protocol import (
     Fields,
     Key,
     Sentence,
+    Vector,
     build,
     frame,
 )
@@ -321,8 +322,8 @@ class Os4000Emulator:
             return frame(f"HCHDT,{heading:.1f},T")
         if form == 8:
             return b"%.1f,%.1f,%.1f\r\n" % (heading, pitch, roll)
-        x, y, z = np.add(reading.field, 0.3 * self._rng.standard_normal(3)).tolist()
-        ax, ay, az = np.add(reading.acceleration, 0.001 * self._rng.standard_normal(3)).tolist()
+        x, y, z = self._noisy(reading.field, 0.3)
+        ax, ay, az = self._noisy(reading.acceleration, 0.001)
         sentence = Sentence(
             heading=heading,
             pitch=pitch,
@@ -335,6 +336,10 @@ class Os4000Emulator:
         )
         line = build(sentence, mask=Fields(self.settings.fields))
         return _replace_field(line, *self._spoiled) if self._spoiled is not None else line
+
+    def _noisy(self, vector: Vector, sigma: float) -> Vector:
+        dx, dy, dz = self._rng.standard_normal(3).tolist()
+        return vector[0] + sigma * dx, vector[1] + sigma * dy, vector[2] + sigma * dz
 
 
 def _prompt(command: Key) -> bytes:
