@@ -2,11 +2,15 @@
 
     python benchmarks/bus.py [--rounds N]
 
-Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them: the
-product (message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh,
-asyncio), the same without asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``),
-rospy's ``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100
-round trips a second. The codec is measured alone, in processor time. The last line is JSON.
+Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them, and every
+round starts them anew, for where the system puts a process weighs as much as what it does. They are: the product
+(message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio), the
+same without asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``), rospy's
+``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100 round
+trips a second. The codec is measured alone, in processor time. The last line is JSON.
+
+rospy has the system's Python; all of the product's ends run in it too where it is of our version (``--own-python``: in
+ours), so that programs are compared, not builds of Python.
 """
 
 import argparse
@@ -17,6 +21,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import sysconfig
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -39,7 +44,7 @@ GOALS = {
     "p50_over_rospy": 1.3,
     "cpu_over_rospy": 1.3,
 }
-BURST, PACED, RATE = 400, 150, 100.0
+TURNS, BURST, PACED, RATE = 8, 60, 150, 100.0
 
 
 class Pair:
@@ -48,10 +53,13 @@ class Pair:
     def __init__(self, ping: subprocess.Popen[bytes], echo: subprocess.Popen[bytes]) -> None:
         self._ping = ping
         self._clocks = [_process_clock(process.pid) for process in (ping, echo)]
-        assert self._answer() == b"ready\n"
+        self._ready = False
 
     def round_trips(self, count: int, rate: float) -> tuple[np.ndarray, float]:
         """Times in us and processor seconds of both processes per 1000 messages."""
+        if not self._ready:
+            assert self._answer() == b"ready\n"
+            self._ready = True
         before = self._used()
         assert self._ping.stdin is not None
         self._ping.stdin.write(b"%d %f\n" % (count, rate))
@@ -124,6 +132,19 @@ def has_rospy() -> bool:
     return subprocess.run(check, capture_output=True, check=False).returncode == 0
 
 
+def go_on_beside_rospy() -> None:
+    """Start this program again in rospy's interpreter, with our packages, if it has our version."""
+    if Path(sys.executable).resolve() == SYSTEM_PYTHON.resolve() or not has_rospy():
+        return
+    version = "import sys; print(*sys.version_info[:2])"
+    answer = subprocess.run([str(SYSTEM_PYTHON), "-c", version], capture_output=True, check=False, text=True)
+    if answer.stdout.split() == [str(number) for number in sys.version_info[:2]]:
+        library = Path(sysconfig.get_path("stdlib")).parent
+        packages = [path for path in sys.path[1:] if "-packages" in path or library not in Path(path).parents]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(packages)}
+        os.execve(SYSTEM_PYTHON, [str(SYSTEM_PYTHON), *sys.argv], environment)
+
+
 def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
     """Processor us of encoding one scan and of decoding it: median of short bursts, which take turns."""
     message = scan(1234, time.monotonic_ns())
@@ -142,24 +163,25 @@ def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
 
 def compare(rounds: int) -> dict[str, float]:
     """Medians over the rounds; ratios are those of one round."""
-    with ExitStack() as stack:
-        pairs = {kind: stack.enter_context(zenoh_pair(kind)) for kind in ("typed", "raw", "thread")}
-        if has_rospy():
-            pairs["rospy"] = stack.enter_context(rospy_pair())
-        p50 = {kind: np.empty(rounds) for kind in pairs}
-        p99, cpu = ({kind: np.empty(rounds) for kind in pairs} for _ in range(2))
-        for pair in pairs.values():
-            pair.round_trips(BURST, 0)
-        for number in range(rounds):
+    kinds = ("typed", "raw", "thread", *(("rospy",) if has_rospy() else ()))
+    p50, p99, cpu = ({kind: np.empty(rounds) for kind in kinds} for _ in range(3))
+    for number in range(rounds):
+        with ExitStack() as stack:
+            pairs = {kind: stack.enter_context(rospy_pair() if kind == "rospy" else zenoh_pair(kind)) for kind in kinds}
+            times: dict[str, list[np.ndarray]] = {kind: [] for kind in kinds}
+            for turn in range(1 + TURNS):
+                for kind, pair in pairs.items():
+                    burst, _ = pair.round_trips(BURST, 0)
+                    if turn:
+                        times[kind].append(burst)
             for kind, pair in pairs.items():
-                times, _ = pair.round_trips(BURST, 0)
-                p50[kind][number], p99[kind][number] = np.percentile(times, (50, 99))
+                p50[kind][number], p99[kind][number] = np.percentile(times[kind], (50, 99))
                 cpu[kind][number] = pair.round_trips(PACED, RATE)[1]
     figures = {}
-    for kind in pairs:
+    for kind in kinds:
         figures |= {f"{kind}_p50_us": _median(p50[kind]), f"{kind}_p99_us": _median(p99[kind])}
         figures[f"{kind}_cpu_s_per_1000"] = _median(cpu[kind])
-    for kind in pairs.keys() - {"typed"}:
+    for kind in kinds[1:]:
         figures |= {
             f"p50_over_{kind}": _median(p50["typed"] / p50[kind]),
             f"cpu_over_{kind}": _median(cpu["typed"] / cpu[kind]),
@@ -175,7 +197,12 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=10)
-    figures = compare(parser.parse_args().rounds)
+    parser.add_argument("--own-python", action="store_true")
+    arguments = parser.parse_args()
+    if not arguments.own_python:
+        go_on_beside_rospy()
+    print(f"interpreter: {sys.executable}, {sys.version}")
+    figures = compare(arguments.rounds)
     figures["encode_us"], figures["decode_us"] = codec()
     figures["codec_us"] = figures["encode_us"] + figures["decode_us"]
     for name, value in figures.items():
