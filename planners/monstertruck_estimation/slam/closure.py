@@ -89,10 +89,8 @@ BASELINE: Final = 1.0
 """Way between the first and the last of them, m."""
 CONSISTENT: Final = 11.3
 """Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
-NEAR: Final = 3.0
-"""Of two contradicting hits from places with so little way between them one is false, m,"""
-OUTVOTED: Final = 2
-"""and so many times as many must agree with the other."""
+STRETCH: Final = 3.0
+"""Way on either side of a hit within which the drift is small, so that of two contradicting hits one is false, m."""
 VAGUE: Final = 1.0
 """Agreement proves nothing where the drift between the hits is greater, m."""
 FORGET: Final = 60
@@ -316,14 +314,17 @@ def _compared(keymap: KeyMap, hit: Hit, others: list[Hit]) -> tuple[list[Hit], l
 
 
 def agreed(keymap: KeyMap, hits: list[Hit]) -> list[Hit]:
-    """The most of ``hits`` that agree with one of them; none if they are too few, or as many contradict near by."""
+    """The most of ``hits`` from one stretch of the way that agree with one of them.
+
+    None if they are not at least ``WITNESSES`` more than those of the same stretch that contradict it. What is further
+    away on the way says nothing: both may be right, and the drift more than the graph thinks.
+    """
     best: list[Hit] = []
     for hit in hits:
-        agreeing, against = _compared(keymap, hit, hits)
-        # From places far from each other both may be right, and the drift more than the graph thinks.
-        rivals = [other for other in against if _way(keymap, [hit, other]) < NEAR]
+        near = [other for other in hits if _way(keymap, [hit, other]) < STRETCH]
+        agreeing, against = _compared(keymap, hit, near)
         group = [hit, *agreeing]
-        enough = len(group) >= max(WITNESSES, OUTVOTED * len(rivals)) and _way(keymap, group) >= BASELINE
+        enough = len(group) >= len(against) + WITNESSES and _way(keymap, group) >= BASELINE
         if enough and len(group) > len(best):
             best = group
     return best

@@ -95,14 +95,17 @@ def test_hits_that_agree_are_believed_if_they_are_enough_and_far_enough_apart():
     assert not agreed(keymap, [found(keymap, k, 0.5) for k in (20, 21, 22)])
 
 
-def test_hits_from_the_same_place_that_contradict_must_be_outvoted():
+def test_hits_from_the_same_stretch_that_contradict_must_be_outvoted():
     keymap = line_of_keys()
-    hits = [found(keymap, k, 0.5) for k in (20, 22, 24)]
-    assert not agreed(keymap, [*hits, found(keymap, 21, -1.0), found(keymap, 23, -1.0)])
-    assert agreed(keymap, [*hits, found(keymap, 26, 0.5), found(keymap, 21, -1.0), found(keymap, 23, -1.0)])
+    hits = [found(keymap, k, 0.5) for k in (18, 20, 22, 24)]
+    false = [found(keymap, k, -1.0) for k in (21, 23)]
+    assert not agreed(keymap, [*hits, *false])
+    more = [*hits, found(keymap, 19, 0.5)]
+    assert set(map(id, agreed(keymap, [*more, *false]))) == set(map(id, more))
 
 
-def test_hits_from_elsewhere_may_contradict():
+def test_hits_from_elsewhere_neither_contradict_nor_agree():
     keymap = line_of_keys()
     hits = [found(keymap, k, 0.5) for k in (20, 22, 24)]
     assert agreed(keymap, [*hits, *(found(keymap, k, -1.0) for k in (37, 38))]) == hits
+    assert agreed(keymap, [*hits, *(found(keymap, k, 0.5) for k in (37, 38))]) == hits
