@@ -16,7 +16,7 @@ from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Plan
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_schemas.plan import Path, Steering
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.replay_check.goals import TOGETHER, GoalRecord
+from monstertruckd.replay_check.goals import DEFORMED, PLANNED, TOGETHER, GoalRecord
 from monstertruckd.replay_check.pace import PacedClock
 from monstertruckd.workers.placement import Actor, LoopActor, Placement, Places
 from monstertruckd.workers.remote import RemoteDesk
@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 
 BEFORE: Final = SECOND // 1000
 """A route is there this long before the tick that takes it, ns."""
-PLANNED: Final = r"goal-\d+\.\d+"
-DEFORMED: Final = r"goal-\d+-(deformed|held-up)\.\d+"
 NOTHING: Final = PlanAnswer(Reason.OK, "", np.empty((0, 3)), np.empty(0))
 
 

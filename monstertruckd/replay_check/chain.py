@@ -30,7 +30,7 @@ from monstertruckd.goals.service import GoalService
 from monstertruckd.logs import LogMessage
 from monstertruckd.paths import PathService
 from monstertruckd.replay_check.answers import Book, ReplayedPlaces
-from monstertruckd.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill
+from monstertruckd.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill, is_deformed
 from monstertruckd.replay_check.pace import Pace, PacedClock, RecordedTurns
 from monstertruckd.replay_check.recorded import Survey
 from monstertruckd.workers.agenda import use_agenda
@@ -158,6 +158,7 @@ class Chain:
         self._goal_record, self._book = log.goals, Book()
         self._calls = {} if config.planner is None else log.goals.calls(period_of(config.planner))
         self._goal_ticks = [] if config.planner is None else log.goals.ticks(period_of(config.planner))
+        self._called = [one.state.stamp for one in log.goals.told if one.sequence in self._calls]
         self._asked: Counter[str] = Counter()
         """Newest number of a request for goals, by source."""
         self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None
@@ -214,7 +215,7 @@ class Chain:
         for output in outputs:
             if (call := self._calls.get(output.sequence)) is not None and output.topic == topics.GOAL.name:
                 await self._call(call, output.stamp)
-            elif (service := self._writer_of(output)) in self._paces:
+            elif (service := self._writer_of(output)) in self._paces and not self._is_start(output):
                 await self._paces[service].release(self._turn_of(service, output))
         await asyncio.sleep(0)
         for output in outputs:
@@ -244,9 +245,10 @@ class Chain:
         """Whether scans get the tilt of their plane here."""
         return isinstance(self._scans, TiltStamper)
 
-    def ticks(self, topic: str) -> bool:
+    def ticks(self, output: LogMessage) -> bool:
         """Whether a recorded message shows when a service had its turn."""
-        return SERVICES.get(topic) in self._paces or (self._goals is not None and topic == topics.PATH.name)
+        called = output.topic == topics.PATH.name and _near(self._called, output.stamp) is not None
+        return called or self._writer_of(output) in self._paces
 
     def takes(self, topic: str) -> bool:
         """Whether a recorded message is an input."""
@@ -261,22 +263,20 @@ class Chain:
 
     def _writer_of(self, output: LogMessage) -> str:
         """Service that had its turn when ``output`` was written; of what waits for no turn its topic."""
-        if output.topic == topics.PATH.name and self._tick_near(output.stamp) is not None:
-            return GoalService.name
+        if output.topic == topics.PATH.name and _near(self._goal_ticks, output.stamp) is not None:
+            return output.topic if is_deformed(output) else GoalService.name
         if output.topic == topics.PLAN_DRIVE.name and self._goals is not None and asks_standstill(output):
             return GoalService.name
         return SERVICES.get(output.topic, output.topic)
 
+    def _is_start(self, output: LogMessage) -> bool:
+        """Whether it is the goal service's first report, which it gives before its first tick."""
+        return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
+
     def _turn_of(self, service: str, output: LogMessage) -> int:
         """When that turn was, ns: what one of the goal service tells on the wall clock has several stamps."""
-        near = self._tick_near(output.stamp) if service == GoalService.name else None
+        near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
         return output.stamp if near is None else near
-
-    def _tick_near(self, stamp: int) -> int | None:
-        """The tick of the goal service that a stamp is of."""
-        at = bisect_left(self._goal_ticks, stamp - TOGETHER)
-        near = at < len(self._goal_ticks) and self._goal_ticks[at] <= stamp + TOGETHER
-        return self._goal_ticks[at] if near else None
 
     async def _call(self, call: Call, instant: int) -> None:
         """Somebody asked the goal service, at ``instant``, ns; whoever had a turn before goes first."""
@@ -331,6 +331,12 @@ class Chain:
         elif (ready := self._ready.get(service.name)) is not None:
             await self._clock.reach(ready)
         await service.run(_nothing)
+
+
+def _near(instants: Sequence[int], stamp: int) -> int | None:
+    """The instant, of some in their order, that a stamp belongs to, ns."""
+    at = bisect_left(instants, stamp - TOGETHER)
+    return instants[at] if at < len(instants) and instants[at] <= stamp + TOGETHER else None
 
 
 def _nothing() -> None:

@@ -113,11 +113,11 @@ def check_log(
     )
 
 
-def _bunches(log: Iterable[LogMessage], ticks: Callable[[str], bool]) -> Iterator[list[LogMessage]]:
+def _bunches(log: Iterable[LogMessage], ticks: Callable[[LogMessage], bool]) -> Iterator[list[LogMessage]]:
     """Messages one by one; but outputs that show ticks together, as long as nothing else was recorded in between."""
     bunch: list[LogMessage] = []
     for entry in log:
-        ticking = ticks(entry.topic)
+        ticking = ticks(entry)
         if bunch and not ticking:
             yield bunch
             bunch = []

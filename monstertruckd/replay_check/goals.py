@@ -27,6 +27,8 @@ ASKED: Final = frozenset({topics.REQ_GOAL.name, topics.REQ_GOAL_CONTROL.name})
 CANCELLED_BY: Final = "cancelled by "
 
 LEASE: Final = 1.0
+PLANNED: Final = r"goal-\d+\.\d+"
+DEFORMED: Final = r"goal-\d+-(deformed|held-up)\.\d+"
 TOGETHER: Final = SECOND // 50
 """What a tick tells has stamps this near to each other, ns."""
 
@@ -161,6 +163,12 @@ def asks_standstill(entry: LogMessage) -> bool:
     """Whether a wish to the gate is the goal service's, not the tracker's."""
     wish = entry.decode()
     return isinstance(wish, DriveRequest) and wish.source == SOURCE
+
+
+def is_deformed(entry: LogMessage) -> bool:
+    """Whether a path came of deformation, not of a tick of the goal service."""
+    path = entry.decode()
+    return isinstance(path, Path) and re.fullmatch(DEFORMED, path.name) is not None
 
 
 def _answered(before: GoalState, after: GoalState) -> bool:

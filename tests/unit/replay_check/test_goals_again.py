@@ -13,7 +13,7 @@ from monstertruckd.cli.main import app
 from monstertruckd.logs import open_log
 from monstertruckd.replay_check import check_log
 from monstertruckd.replay_check.difference import Kind
-from tests.unit.replay_check.log_surgery import GOALS, attachments_of, changed, digit, flip
+from tests.unit.replay_check.log_surgery import BY_NAME, GOALS, attachments_of, changed, digit, flip, write
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -110,6 +110,30 @@ def test_another_deformation_shows_where_it_begins(tmp_path):
     assert not check.agrees
     assert rows[topics.POSE].equal == rows[topics.POSE].compared
     assert rows[topics.PATH].first.sequence > 0  # the routes are the same, but nothing comes into their way
+
+
+def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
+    def late(one):
+        message = one.decode() if one.topic in {"plan/goal", "plan/drive"} else None
+        if message is None or (one.topic == "plan/drive" and message.source != "goals"):
+            return one
+        by = 200_000 if one.topic == "plan/goal" else 250_000
+        later = {"stamp": message.stamp + by, "received": message.received + by}
+        payload = wire.encode(BY_NAME[one.topic], message.model_copy(update=later))
+        return replace(one, log_time=one.log_time + 300_000, stamp=later["stamp"], payload=payload)
+
+    messages = [late(one) for one in open_log(GOALS)]
+    log = write(tmp_path / "wall.mcap", messages, attachments_of(GOALS), real_offset_ns="7")
+    check = check_log(log)
+    rows = rows_of(check)
+    assert check.reason is Reason.OK
+    assert not rows[topics.GOAL].judged
+    assert rows[topics.TRACKER].tolerance == rows[topics.PLAN_DRIVE].tolerance == 0.02
+    for topic in (topics.GOAL, topics.PATH, topics.TRACKER):
+        row = rows[topic]
+        assert row.compared > 0
+        assert row.missing == row.surplus(check.end) == 0
+    assert not rows[topics.PATH].greatest  # stamps alone
 
 
 def test_a_lost_call_ends_in_other_reports_not_in_a_hang(tmp_path):
