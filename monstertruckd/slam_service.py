@@ -4,6 +4,7 @@ import asyncio
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -206,15 +207,8 @@ class SlamService:
     def _inputs(self, scan: LaserScan) -> ScanInput:
         odom, twist = self._motion(scan.stamp, scan.stamp + round(scan.time_increment * len(scan.ranges) * SECOND))
         height = self._mount.z if self._mount.z > 0 else None
-        return ScanInput(
-            stamp=scan.stamp,
-            ranges=scan.ranges,
-            start_angle=scan.start_angle,
-            angle_increment=scan.angle_increment,
-            range_min=scan.range_min,
-            range_max=scan.range_max,
-            time_increment=scan.time_increment,
-            mount=self._mount.planar,
+        return replace(
+            ScanInput.of(scan, self._mount.planar),
             odom=odom,
             twist=twist,
             slopes=self._slopes(scan),

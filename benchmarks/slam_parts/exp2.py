@@ -178,16 +178,7 @@ def dithered(scans: list[LaserScan], mount: float, seed: int) -> tuple[dict[str,
     ]
     estimator = MappingEstimator(mapper_config(SlamConfig()), GridConfig())
     for scan in others:
-        inputs = ScanInput(
-            stamp=scan.stamp,
-            ranges=scan.ranges,
-            start_angle=scan.start_angle,
-            angle_increment=scan.angle_increment,
-            range_min=scan.range_min,
-            range_max=scan.range_max,
-            time_increment=scan.time_increment,
-            mount=(mount, 0.0, 0.0),
-        )
+        inputs = ScanInput.of(scan, (mount, 0.0, 0.0))
         estimator.step(prepared(inputs, estimator.mapper.config.longest, estimator.twist), inputs)
     estimator.finish()
     stamps, poses = estimator.mapper.trajectory()

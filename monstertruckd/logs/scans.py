@@ -89,16 +89,7 @@ def _mcap(path: Path) -> Iterator[ScanInput]:
     poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
     for scan in scans:
         end = scan.stamp + scan.time_increment * len(scan.ranges) * SECOND
-        inputs = ScanInput(
-            stamp=scan.stamp,
-            ranges=scan.ranges,
-            start_angle=scan.start_angle,
-            angle_increment=scan.angle_increment,
-            range_min=scan.range_min,
-            range_max=scan.range_max,
-            time_increment=scan.time_increment,
-            mount=mount,
-        )
+        inputs = ScanInput.of(scan, mount)
         if len(stamps) and stamps[0] <= scan.stamp <= stamps[-1]:
             first, last = interpolate(stamps, poses, np.array((scan.stamp, end)))
             seconds = max((end - scan.stamp) / SECOND, 1e-3)

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_schemas.health import Standing
+from monstertruck_schemas.sensor import LaserScan
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -54,6 +55,20 @@ class ScanInput:
     """Of the sensor over the ground, m; None = not known, no ground is looked for."""
     ceiling: float | None = None
     """Of the ceiling over the ground, m."""
+
+    @classmethod
+    def of(cls, scan: LaserScan, mount: Vector) -> Self:
+        """What the scan itself says."""
+        return cls(
+            stamp=scan.stamp,
+            ranges=scan.ranges,
+            start_angle=scan.start_angle,
+            angle_increment=scan.angle_increment,
+            range_min=scan.range_min,
+            range_max=scan.range_max,
+            time_increment=scan.time_increment,
+            mount=mount,
+        )
 
 
 @dataclass(frozen=True, slots=True)
