@@ -21,7 +21,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import sysconfig
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,13 +29,13 @@ from typing import Any
 
 import numpy as np
 from bus_peers import scan
+from same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 
 from monstertruck_runtime import wire
 from monstertruck_schemas.topics import SCAN
 from monstertruckd.demo.wall import free_endpoint
 
 HERE = Path(__file__).resolve().parent
-SYSTEM_PYTHON = Path("/usr/bin/python3")
 GOALS = {
     "p50_over_raw": 1.3,
     "cpu_over_raw": 1.5,
@@ -126,23 +125,7 @@ def rospy_pair() -> Iterator[Pair]:
 
 def has_rospy() -> bool:
     """Whether the system's Python finds Debian's ROS 1."""
-    if shutil.which("rosmaster") is None:
-        return False
-    check = [str(SYSTEM_PYTHON), "-c", "import rospy, sensor_msgs.msg"]
-    return subprocess.run(check, capture_output=True, check=False).returncode == 0
-
-
-def go_on_beside_rospy() -> None:
-    """Start this program again in rospy's interpreter, with our packages, if it has our version."""
-    if Path(sys.executable).resolve() == SYSTEM_PYTHON.resolve() or not has_rospy():
-        return
-    version = "import sys; print(*sys.version_info[:2])"
-    answer = subprocess.run([str(SYSTEM_PYTHON), "-c", version], capture_output=True, check=False, text=True)
-    if answer.stdout.split() == [str(number) for number in sys.version_info[:2]]:
-        library = Path(sysconfig.get_path("stdlib")).parent
-        packages = [path for path in sys.path[1:] if "-packages" in path or library not in Path(path).parents]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(packages)}
-        os.execve(SYSTEM_PYTHON, [str(SYSTEM_PYTHON), *sys.argv], environment)
+    return shutil.which("rosmaster") is not None and can_import("rospy", "sensor_msgs.msg")
 
 
 def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
@@ -199,9 +182,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--own-python", action="store_true")
     arguments = parser.parse_args()
-    if not arguments.own_python:
-        go_on_beside_rospy()
-    print(f"interpreter: {sys.executable}, {sys.version}")
+    if has_rospy() and not arguments.own_python:
+        go_on_in_the_systems_python()
     figures = compare(arguments.rounds)
     figures["encode_us"], figures["decode_us"] = codec()
     figures["codec_us"] = figures["encode_us"] + figures["decode_us"]
