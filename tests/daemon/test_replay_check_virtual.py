@@ -8,7 +8,7 @@ from tests.make_replay_logs import RUNS, record
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [*RUNS, "goals"])
 def test_a_fresh_run_comes_again(tmp_path, name):
     record(name, tmp_path / "run.mcap")
     check = check_log(tmp_path / "run.mcap")
