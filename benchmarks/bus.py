@@ -7,7 +7,8 @@ round starts them anew, for where the system puts a process weighs as much as wh
 (message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio), the
 same without asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``), rospy's
 ``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100 round
-trips a second. The codec is measured alone, in processor time. The last line is JSON.
+trips a second. The codec is measured alone, in processor time of many calls in a row, and for comparison once after a
+pause each. The last line is JSON.
 
 rospy has the system's Python; all of the product's ends run in it too where it is of our version (``--own-python``: in
 ours), so that programs are compared, not builds of Python.
@@ -144,6 +145,26 @@ def codec(repeats: int = 300, burst: int = 100) -> tuple[float, float]:
     return float(encode), float(decode)
 
 
+def from_cold_caches(repeats: int = 200) -> dict[str, float]:
+    """Us of making, encoding and decoding one scan, each a millisecond of sleep after another: medians."""
+    message = scan(1234, time.monotonic_ns())
+    data = wire.encode(SCAN, message)
+    jobs: dict[str, Callable[[], object]] = {
+        "cold_nothing_us": lambda: None,
+        "cold_make_us": lambda: scan(1234, message.stamp),
+        "cold_encode_us": lambda: wire.encode(SCAN, message),
+        "cold_decode_us": lambda: wire.decode(SCAN, data),
+    }
+    costs = np.empty((repeats, len(jobs)))
+    for row in costs:
+        for i, job in enumerate(jobs.values()):
+            time.sleep(0.001)
+            begin = time.perf_counter_ns()
+            job()
+            row[i] = (time.perf_counter_ns() - begin) / 1e3
+    return dict(zip(jobs, np.median(costs, axis=0).tolist(), strict=True))
+
+
 def compare(rounds: int) -> dict[str, float]:
     """Medians over the rounds; ratios are those of one round."""
     kinds = ("typed", "raw", "thread", *(("rospy",) if has_rospy() else ()))
@@ -187,6 +208,7 @@ def main() -> None:
     figures = compare(arguments.rounds)
     figures["encode_us"], figures["decode_us"] = codec()
     figures["codec_us"] = figures["encode_us"] + figures["decode_us"]
+    figures |= from_cold_caches()
     for name, value in figures.items():
         print(f"{name:24} {value:9.3f}")
     goals = {name: goal for name, goal in GOALS.items() if name in figures}
