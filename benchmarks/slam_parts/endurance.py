@@ -1,7 +1,8 @@
 """Two hours of driving round and round: does the mapper's memory stay bounded?
 
 A truck with drifting wheels follows one closed way through the rooms of the emulators' world, ten scans a second; every
-pass adds key scans until the most dispensable have to go. Resident memory of this process is taken once in ten minutes.
+pass adds key scans until the most dispensable have to go. The estimation worker runs in this process, whose resident
+memory is taken once in ten minutes.
 """
 
 import os
@@ -10,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from monstertruck_drivers.world.raycast import cast_rays, clearance
-from monstertruck_estimation.mapping.config import GridConfig
-from monstertruck_estimation.mapping.estimator import MappingEstimator, prepared
-from monstertruck_estimation.mapping.exchange import ScanInput
-from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.mapping.config import SlamConfig
+from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInput
 from monstertruck_estimation.slam.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import OCCUPIED, load_map
+from monstertruckd.workers.estimation import EstimationWorker
 from slam_parts.world_drives import ROOMS
 
 MAP = Path(__file__).resolve().parents[2] / "configs" / "worlds" / "rooms.yaml"
@@ -49,7 +49,8 @@ def run() -> tuple[dict[str, float], dict[str, float], bool]:
     """Figures, goals, and whether all are met."""
     world, poses, rng = load_map(MAP), way(), np.random.default_rng(1)
     clear, (left, low) = clearance(world.cells == OCCUPIED), world.origin[:2]
-    estimator = MappingEstimator(MapperConfig(), GridConfig())
+    worker = EstimationWorker()
+    worker.step(WorkerInput(start=Start(SlamConfig())))
     odom, memory, off = poses[0].copy(), [], []
     count = round(HOURS * 3600 / PERIOD)
     for k in range(count):
@@ -62,18 +63,18 @@ def run() -> tuple[dict[str, float], dict[str, float], bool]:
         scan = ScanInput(
             round(k * PERIOD * SECOND), ranges, ANGLES[0], ANGLES[1] - ANGLES[0], 0.02, RANGE, odom=tuple(odom)
         )
-        told = estimator.step(prepared(scan, 30.0), scan)
-        assert told is not None
-        off.append(np.hypot(*between(between(poses[0], pose), np.array(told.pose))[:2]))
+        told = worker.step(WorkerInput(scan=scan))
+        assert told.estimate is not None
+        off.append(np.hypot(*between(between(poses[0], pose), np.array(told.estimate.pose))[:2]))
         if (k + 1) % round(count / (6 * HOURS)) == 0:
             memory.append(resident())
-            keys, minute = estimator.counts["keys"], (k + 1) * PERIOD / 60
+            keys, minute = told.counts["keys"], (k + 1) * PERIOD / 60
             late = float(np.mean(off[-round(count / (6 * HOURS)) :]))
             print(f"minute {minute:3.0f}: {memory[-1]:.1f} MB, {keys} key scans, off by {late:.3f} m", flush=True)
     figures = {f"endurance_{10 * (n + 1)}min_mb": round(value, 1) for n, value in enumerate(memory)}
     figures |= {
         "endurance_growth_mb": round(max(memory[-4:]) - memory[-5], 1),
-        "endurance_keys": estimator.counts["keys"],
+        "endurance_keys": told.counts["keys"],
         "endurance_off_m": float(np.mean(off[-count // 2 :])),
     }
     return figures, GOALS, figures["endurance_growth_mb"] <= GOALS["endurance_growth_mb"]

@@ -12,7 +12,9 @@ from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInp
 from monstertruck_estimation.mapping.localise import LocalisingEstimator
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.frontend import FrontEnd
+from monstertruck_estimation.slam.mapper import Event
 from monstertruck_runtime.errors import InputError
+from monstertruckd.workers.memory import give_back
 
 FEWEST = 3
 """Points without which a scan is left out."""
@@ -49,6 +51,8 @@ class EstimationWorker:
                     refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
                 else:
                     made = estimator.step(scan, inputs.scan)
+                    if made is not None and Event.THINNED in made.events:
+                        give_back()
         if inputs.finish:
             estimator.finish()
         tiles, redrawn = estimator.changes() if inputs.tiles else ([], False)

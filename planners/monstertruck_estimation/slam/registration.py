@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.slam.scans import Scan
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+Index = NDArray[np.int32]
 
 CELL: Final = 0.3
 """Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
@@ -152,7 +152,7 @@ def _hashed(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
         size *= 2
     mask = size - 1
     bucket = np.empty(n, np.int64)
-    starts = np.zeros(size + 1, np.int64)
+    starts = np.zeros(size + 1, np.int32)
     for i in range(n):
         cx = np.int64(math.floor(points[i, 0] / CELL))
         cy = np.int64(math.floor(points[i, 1] / CELL))
@@ -161,7 +161,7 @@ def _hashed(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     for b in range(size):
         starts[b + 1] += starts[b]
     fill = starts[:-1].copy()
-    order = np.empty(n, np.int64)
+    order = np.empty(n, np.int32)
     for i in range(n):
         order[fill[bucket[i]]] = i
         fill[bucket[i]] += 1

@@ -14,9 +14,11 @@ from monstertruck_estimation.mapping.estimator import levelled
 from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_estimation.mapping.time_offset import find_offset
 from monstertruck_estimation.scan_tilt import plane_slopes, plane_tilt
+from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import Standing
+from monstertruckd.workers import estimation, memory
 from monstertruckd.workers.estimation import EstimationWorker
 
 ANGLES = np.linspace(-2.1, 2.1, 400)
@@ -72,6 +74,22 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert np.hypot(*(np.array(outputs.estimate.pose[:2]) - pose_at(i)[:2])) < 0.05
     assert worker.step(WorkerInput(save=folder)).saved == str(folder)
     return folder
+
+
+def test_the_worker_gives_memory_back_when_the_map_is_thinned(monkeypatch: pytest.MonkeyPatch):
+    given = []
+    monkeypatch.setattr(estimation, "give_back", lambda: given.append(True))
+    monkeypatch.setattr(estimation, "mapper_config", lambda _: MapperConfig(most_keys=10))
+    worker, rng = EstimationWorker(), np.random.default_rng(1)
+    worker.step(WorkerInput(start=Start(SlamConfig(), tuple(pose_at(0).tolist()))))
+    thinned = 0
+    for i in range(100):
+        estimate = worker.step(WorkerInput(scan=scan_at(i, rng))).estimate
+        assert estimate is not None
+        thinned += "thinned" in estimate.events
+        assert len(given) == thinned
+    assert thinned > 2
+    memory.give_back()
 
 
 def test_a_saved_map_reads_back(saved: Path):
