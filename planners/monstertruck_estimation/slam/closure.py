@@ -101,9 +101,9 @@ BROKEN: Final = 0.02
 """Share of the relations that a closure may strain before it is taken back."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Hit:
-    """The key scan ``target`` found near ``origin``."""
+    """The key scan ``target`` found near ``origin``; each is one of its own."""
 
     origin: int
     target: int
@@ -149,7 +149,6 @@ class LoopCloser:
         For the end of a run: what came after a place belongs to its surroundings then, too. True if a closure has moved
         the poses.
         """
-        self._hits.clear()
         self._tried.clear()
         count = len(keymap)
         places = np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist()
@@ -157,7 +156,7 @@ class LoopCloser:
         closed = False
         while group := agreed(keymap, hits):
             closed |= self._added(keymap, group)
-            hits = [hit for hit in hits if not any(hit is one for one in group)]
+            hits = [hit for hit in hits if hit not in group]
         return closed
 
     def forget(self, kept: NDArray[np.bool_]) -> None:
@@ -266,8 +265,7 @@ class LoopCloser:
             return False
         if not self._added(keymap, witnesses):
             return False
-        used = {id(witness) for witness in witnesses}
-        self._hits = [other for other in self._hits if id(other) not in used]
+        self._hits = [other for other in self._hits if other not in witnesses]
         return True
 
     def _added(self, keymap: KeyMap, hits: list[Hit]) -> bool:

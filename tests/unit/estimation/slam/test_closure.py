@@ -101,7 +101,7 @@ def test_hits_from_the_same_stretch_that_contradict_must_be_outvoted():
     false = [found(keymap, k, -1.0) for k in (21, 23)]
     assert not agreed(keymap, [*hits, *false])
     more = [*hits, found(keymap, 19, 0.5)]
-    assert set(map(id, agreed(keymap, [*more, *false]))) == set(map(id, more))
+    assert set(agreed(keymap, [*more, *false])) == set(more)
 
 
 def test_hits_from_elsewhere_neither_contradict_nor_agree():
