@@ -27,6 +27,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from same_python import go_on_in_the_systems_python
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
@@ -288,6 +289,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--with", dest="added", choices=ADDED, default=None)
     arguments = parser.parse_args()
+    go_on_in_the_systems_python()
     found = run_wall(lambda clock: compare(clock, arguments.rounds, arguments.seconds, arguments.added))
     for name, value in found.items():
         print(f"{name:30} {value:10.3f}")

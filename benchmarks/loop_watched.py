@@ -14,8 +14,11 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import uvloop
 
 from monstertruck_runtime.clock import SECOND, WallClock, run_wall
 from monstertruckd.gate.meter import TickMeter
@@ -24,26 +27,44 @@ NOTABLE = 0.5
 RATE = 50.0
 
 
-def watch_callbacks(report: dict[str, Any]) -> None:
-    """Measure every callback of every event loop in this thread."""
-    found: list[tuple[int, float, str]] = report["callbacks"]
-    run, clock = asyncio.Handle._run, time.thread_time  # noqa: SLF001  # where the loop calls its callbacks
+class WatchedLoop(uvloop.Loop):
+    """Event loop that measures its callbacks once ``watch`` is called."""
 
-    def measured(handle: asyncio.Handle) -> None:
-        begin = clock()
-        run(handle)
-        used = 1e3 * (clock() - begin)
-        if used >= NOTABLE:
-            found.append((time.monotonic_ns(), used, _name(handle)))
+    def __init__(self) -> None:
+        super().__init__()
+        self._call: Callable[..., None] = _call
 
-    asyncio.Handle._run = measured  # type: ignore[method-assign]  # noqa: SLF001
+    def add_reader(self, fd: Any, callback: Callable[..., Any], *args: Any) -> None:
+        """As ever, but what is added now is measured later."""
+        super().add_reader(fd, lambda: self._call(callback, *args))
+
+    def watch(self, report: dict[str, Any]) -> None:
+        """Measure every callback from now on."""
+        found: list[tuple[int, float, str]] = report["callbacks"]
+        clock = time.thread_time
+
+        def measured(callback: Callable[..., Any], *args: Any) -> None:
+            begin = clock()
+            callback(*args)
+            used = 1e3 * (clock() - begin)
+            if used >= NOTABLE:
+                found.append((time.monotonic_ns(), used, _name(callback)))
+
+        def through(method: Callable[..., Any], before: int) -> Callable[..., Any]:
+            """``method`` whose callback, behind so many other arguments, is measured."""
+            return lambda *args, **options: method(*args[:before], measured, *args[before:], **options)
+
+        self._call = measured
+        for name, before in (("call_soon", 0), ("call_soon_threadsafe", 0), ("call_later", 1), ("call_at", 1)):
+            setattr(self, name, through(getattr(self, name), before))
 
 
-def _name(handle: asyncio.Handle) -> str:
+def _call(callback: Callable[..., Any], *args: Any) -> None:
+    callback(*args)
+
+
+def _name(callback: Any) -> str:
     """The task's name and coroutine, or the function."""
-    callback: Any = handle._callback  # noqa: SLF001
-    if callback is None:
-        return "cancelled"
     task = getattr(callback, "__self__", None)
     if isinstance(task, asyncio.Task):
         return f"{task.get_name()}: {task.get_coro().__qualname__}"  # type: ignore[union-attr]
@@ -101,7 +122,9 @@ def main() -> None:
         target = Path(sys.argv[3])
         watch_ticks(report)
         watch_collector(report)
-        signal.signal(signal.SIGUSR1, lambda *_: watch_callbacks(report))
+        loop = WatchedLoop()
+        uvloop.new_event_loop = lambda: loop
+        signal.signal(signal.SIGUSR1, lambda *_: loop.watch(report))
         run_daemon(Path(sys.argv[2]), verbose=False)
     target.write_text(json.dumps(report))
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import faulthandler
-import gc
 import logging
 import os
 import signal
@@ -17,6 +16,7 @@ from monstertruckd.calibrate.apply import store_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.logging_queue import start_logging
+from monstertruckd.memory import settle
 
 log = logging.getLogger(__name__)
 
@@ -41,9 +41,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
         daemon = Daemon(config, clock, tree=tree, environment=os.environ)
         for topic in TOPICS:
             wire.schema(topic)  # built once, before the control tick would wait for it
-        # A full collection over everything loaded so far takes tens of milliseconds: take it out of the heap's view.
-        gc.collect()
-        gc.freeze()
+        settle()
         await daemon.run(stop)
 
     try:

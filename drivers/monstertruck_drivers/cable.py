@@ -1,6 +1,7 @@
 """The device's side of a cable, for emulators: its end of the bytes, what can be wrong on the way, a port in memory."""
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Protocol
@@ -25,8 +26,8 @@ class DeviceEnd:
         self.on_bytes: Callable[[bool, bytes], None] | None = None
         """Told of all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
         self._received = Link(name, lambda _: None, lambda: None)
-        self._out_free = 0.0
-        self._in_free = 0.0
+        self._out = _Way()
+        self._in = _Way()
         self._deliver: Callable[[bytes], None] | None = None
 
     def connect(self, deliver: Callable[[bytes], None] | None) -> None:
@@ -44,24 +45,20 @@ class DeviceEnd:
     def write(self, data: bytes, after: float = 0.0) -> None:
         """Send to the host ``after`` seconds, through baud pacing and line faults."""
         for chunk in self.faults.corrupt(data):
-            self._out_free = self._paced(self._out_free, len(chunk), partial(self._emit, chunk), after)
+            self._send(self._out, len(chunk), partial(self._emit, chunk), after)
 
     def take(self, data: bytes) -> None:
         """Bytes from the host enter the line."""
         data = self.faults.shorten(data)
-        self._in_free = self._paced(self._in_free, len(data), partial(self._accept, data))
+        self._send(self._in, len(data), partial(self._accept, data))
 
-    def _paced(self, free: float, count: int, act: Callable[[], None], after: float = 0.0) -> float:
-        """Act when ``count`` bytes are through; ``free`` is when those before them are, the result when these are."""
+    def _send(self, way: "_Way", count: int, arrive: Callable[[], None], after: float = 0.0) -> None:
+        """Let ``count`` bytes arrive when those before them and they themselves are through."""
         delay = self.faults.delay + after
-        loop = asyncio.get_running_loop()
-        if self.baud is None and delay <= 0 and free <= loop.time():
-            act()
-            return free
-        # Timers of one instant fire in any order, bytes may not: keep them 0.1 us apart.
-        done = max(free + 1e-7, loop.time() + delay) + (count * 10 / self.baud if self.baud else 0.0)
-        loop.call_at(done, act)
-        return done
+        if self.baud is None and delay <= 0 and way.is_free():
+            arrive()
+        else:
+            way.enter(delay, count * 10 / self.baud if self.baud else 0.0, arrive)
 
     def _emit(self, data: bytes) -> None:
         if self._deliver is not None and not self.faults.stalled:
@@ -74,6 +71,28 @@ class DeviceEnd:
             if self.on_bytes is not None:
                 self.on_bytes(True, data)
             self._received.feed(data)
+
+
+class _Way:
+    """One direction of the line. Timers may ring in any order; bytes arrive in that in which they were sent."""
+
+    def __init__(self) -> None:
+        self._free = 0.0
+        """Loop time at which all that was sent is through."""
+        self._sent: deque[Callable[[], None]] = deque()
+
+    def is_free(self) -> bool:
+        return not self._sent and self._free <= asyncio.get_running_loop().time()
+
+    def enter(self, delay: float, duration: float, arrive: Callable[[], None]) -> None:
+        loop = asyncio.get_running_loop()
+        # Apart by 0.1 us, lest two of them arrive in one turn of the virtual loop.
+        self._free = max(self._free + 1e-7, loop.time() + delay) + duration
+        self._sent.append(arrive)
+        loop.call_at(self._free, self._arrive)
+
+    def _arrive(self) -> None:
+        self._sent.popleft()()
 
 
 class LineFaults:

@@ -20,6 +20,8 @@ from monstertruck_runtime.errors import DeviceLostError, PortBusyError, Protocol
 
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
+TIMER_STEP = 0.001
+"""Seconds; the loop's timers ring at the nearest one."""
 
 
 class Link:
@@ -207,7 +209,7 @@ class Link:
         self._alarm = None
         if self._due is None or self._waiting is None:
             return
-        if loop.time() < self._due:
+        if self._due - loop.time() > TIMER_STEP / 2:
             self._set_alarm(loop, self._due)
         else:
             self._waiting.late()

@@ -1,7 +1,6 @@
 """The emulated robot as a process of its own: devices behind ptys, world truth kept for the judges."""
 
 import asyncio
-import gc
 import signal
 import sys
 from array import array
@@ -21,6 +20,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.truck import Monitors, PortConfig
 from monstertruckd.config.validate import load_config
+from monstertruckd.memory import settle
 from monstertruckd.sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
@@ -113,8 +113,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
     if robot.recorded is not None:
         tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
     waiting = asyncio.create_task(stop.wait())
-    gc.collect()
-    gc.freeze()
+    settle()
     _say("ready")
     await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
     for task in (waiting, *tasks):

@@ -14,7 +14,7 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.frontend import FrontEnd
 from monstertruck_estimation.slam.mapper import Event
 from monstertruck_runtime.errors import InputError
-from monstertruckd.workers.memory import give_back
+from monstertruckd.memory import give_back
 
 FEWEST = 3
 """Points without which a scan is left out."""

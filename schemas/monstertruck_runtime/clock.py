@@ -18,11 +18,15 @@ from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
 
+import uvloop
+
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 SECOND = 1_000_000_000
 """Nanoseconds of a second."""
+
+MILLISECOND: Final = SECOND // 1000
 
 MANY_TIMERS: Final = 100
 """From so many on, cancelled timers are cleared away."""
@@ -73,7 +77,19 @@ class _LoopClock(ABC):
 
 
 class WallClock(_LoopClock):
-    """CLOCK_MONOTONIC and the ordinary event loop."""
+    """CLOCK_MONOTONIC and uvloop, whose timers round what they are asked for to whole milliseconds."""
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait at least ``seconds``, and one turn of the loop."""
+        if seconds > 0.0:
+            await self.sleep_until(self.now() + round(seconds * SECOND))
+        else:
+            await asyncio.sleep(0)
+
+    async def sleep_until(self, instant: int) -> None:
+        """Wait until ``now() >= instant``; most often less than a millisecond longer."""
+        while (left := instant - self.now()) > 0:
+            await asyncio.sleep(-(-left // MILLISECOND) / 1000)
 
     def now(self) -> int:
         """Nanoseconds of CLOCK_MONOTONIC."""
@@ -250,6 +266,6 @@ def run_replay(
 
 
 def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
-    """Run ``main(clock)`` on the ordinary event loop."""
-    with asyncio.Runner() as runner:
+    """Run ``main(clock)`` on uvloop."""
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(main(WallClock()))

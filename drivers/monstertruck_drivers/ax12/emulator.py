@@ -87,7 +87,6 @@ class Ax12Bus:
         self._rng = np.random.default_rng(seed)
         self._damage: dict[Damage, int] = {}
         self._late_s = 0.0
-        self._line_free = 0.0
         places = positions or {}
         now = clock.now()
         self.units = [Unit(ident, places.get(ident, 512), now, load, self._voltage) for ident in ids]
@@ -197,7 +196,7 @@ class Ax12Bus:
             heard = now
             self.received.extend(data)
             if self._echo:
-                self._send(end, data, 0.0)
+                end.write(data, self.latency_s)
             for packet in parser.feed(data):
                 self._obey(end, packet)
             if self._answers_damage:
@@ -276,14 +275,8 @@ class Ax12Bus:
                 case "late":
                     asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
                     return
-        self._send(end, wire, delay + BYTE_TIME)
+        end.write(wire, self.latency_s + delay + BYTE_TIME)
 
     def _garbled(self, wire: bytes) -> bytes:
         noise = self._rng.integers(1, 256, len(wire), dtype=np.uint8)
         return bytes(np.frombuffer(wire, dtype=np.uint8) ^ noise)
-
-    def _send(self, end: DeviceEnd, data: bytes, delay: float) -> None:
-        """To the host, in order, after the adapter's latency."""
-        loop = asyncio.get_running_loop()
-        self._line_free = max(loop.time() + self.latency_s + delay, self._line_free + BYTE_TIME)
-        loop.call_at(self._line_free, end.write, data)

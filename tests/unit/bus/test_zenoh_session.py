@@ -321,7 +321,8 @@ async def test_no_thread_of_zenoh_outlives_the_bridge():
     before = set(threading.enumerate())
     async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
         assert await client.call("topics")
-    await eventually(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith("asyncio")])
+    loops = "uvloop"
+    await eventually(lambda: not [t for t in set(threading.enumerate()) - before if not t.name.startswith(loops)])
 
 
 async def test_a_bug_behind_the_bridge_ends_the_service(monkeypatch: pytest.MonkeyPatch):

@@ -18,7 +18,7 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import Standing
-from monstertruckd.workers import estimation, memory
+from monstertruckd.workers import estimation
 from monstertruckd.workers.estimation import EstimationWorker
 
 ANGLES = np.linspace(-2.1, 2.1, 400)
@@ -89,7 +89,6 @@ def test_the_worker_gives_memory_back_when_the_map_is_thinned(monkeypatch: pytes
         thinned += "thinned" in estimate.events
         assert len(given) == thinned
     assert thinned > 2
-    memory.give_back()
 
 
 def test_a_saved_map_reads_back(saved: Path):

@@ -1,0 +1,47 @@
+"""What a process tells the garbage collector, the C library and the kernel of its memory."""
+
+import ctypes
+import gc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+HUGE: Final = 2 * 1024 * 1024
+"""Bytes of a huge page; where it is another size the kernel refuses, and nothing is lost."""
+_MADV_COLLAPSE: Final = 25
+"""See madvise(2), Linux 6.1 and later; the C library's headers came later."""
+
+_LIBRARY: Final = ctypes.CDLL(None)
+
+
+def settle() -> None:
+    """Declare that what is loaded now stays: the collector looks at it no more, and it moves into huge pages.
+
+    A full collection over it takes tens of milliseconds, again and again. And a loop that sleeps between short
+    callbacks finds caches and address translation cold: fewer pages save it a few hundredths of its processor time.
+    Takes up to a third of a second: for the end of start-up, before anything moves.
+    """
+    gc.collect()
+    gc.freeze()
+    for begin, end in _heaps():
+        for page in range(-(-begin // HUGE) * HUGE, end - HUGE + 1, HUGE):
+            _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), _MADV_COLLAPSE)
+
+
+def give_back() -> None:
+    """Return free pages to the system, also those between what is in use; the heap keeps them otherwise.
+
+    About a millisecond for 200 MB; nothing where the C library cannot (it is glibc's ``malloc_trim``).
+    """
+    trim = getattr(_LIBRARY, "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def _heaps() -> Iterator[tuple[int, int]]:
+    """Address ranges of the C library's and Python's own memory."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        span, rights, _, _, _, *name = line.split()
+        if rights.startswith("rw") and name in ([], ["[heap]"]):
+            begin, _, end = span.partition("-")
+            yield int(begin, 16), int(end, 16)
