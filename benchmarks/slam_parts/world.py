@@ -191,7 +191,7 @@ def _tell(run: Run, reckoner: Reckoner, now: int, truth: Array, drive: Drive) ->
     if (drive.carried is None or now < drive.carried) and now > (1 + STARTED) * SECOND:
         off = np.array(estimate.pose) - _at(truth, now / SECOND)
         off[2] = math.remainder(off[2], math.tau)
-        run.nees.append(float(off @ np.linalg.solve(estimate.pose_covariance + 1e-10 * np.eye(3), off)))
+        run.nees.append(float(off @ np.linalg.solve(estimate.pose_covariance.reshape(3, 3) + 1e-10 * np.eye(3), off)))
 
 
 def _judge_match(run: Run, matching: Matching, drive: Drive, stamp: int, truth: Array) -> None:

@@ -166,8 +166,9 @@ class DriveSession:
             await self._clock.sleep(PING)
 
     async def _draw(self, follower: Follower) -> None:
+        """Show the state; returns when the terminal is gone, which the keyboard may notice later."""
         console = Console(file=self._screen)
-        with Live(console=console, screen=True, auto_refresh=False) as live:
+        with suppress(OSError), Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 live.update(draw(follower.state, self._teleop, self._stream, console.width), refresh=True)
                 await self._clock.sleep(PERIOD)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from monstertruck_estimation.spread import Spread
 from monstertruck_estimation.transforms import wrap_angle
-from monstertruck_estimation.wheel_motion import WheelMotion
+from monstertruck_estimation.wheel_motion import Roll, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND, Clock
@@ -82,9 +83,9 @@ class Estimate:
     twist: Vector
     """vx, vy (m/s), wz (rad/s)."""
     pose_covariance: Array
-    """Shape (3, 3)."""
+    """Shape (9,), row-major."""
     twist_covariance: Array
-    """Shape (3, 3)."""
+    """Shape (9,), row-major."""
     age: float
     """Seconds since the newest drive reading."""
     sources: tuple[str, ...]
@@ -118,9 +119,10 @@ class DeadReckoning:
         self._config = config
         self._chassis = chassis
         self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
-        self._covariance: Array = np.zeros((3, 3))
-        self._slip = np.array((config.distance_noise, config.lateral_noise, config.yaw_noise)) ** 2
-        self._drift = np.diag((config.speed_noise**2, config.speed_noise**2, config.turn_noise**2))
+        self._covariance = Spread()
+        self._slip = (config.distance_noise**2, config.lateral_noise**2, config.yaw_noise**2)
+        self._drift = Spread(xx=config.speed_noise**2, yy=config.speed_noise**2, ww=config.turn_noise**2)
+        self._twist_covariance = np.frombuffer(np.array(self._drift.matrix()).tobytes())
         self._wheels = WheelMotion(chassis, config.max_speed)
         self._driven = 0.0
         self._aligning: list[float] = []
@@ -143,11 +145,10 @@ class DeadReckoning:
             self._lose(dt)
             return
         self._driven += roll.way
-        by_pose, by_twist = integration_jacobians(self._pose, *roll.twist, dt)
-        slipped = by_twist * (self._slip * roll.way / dt**2) @ by_twist.T
-        moved = by_pose @ self._covariance @ by_pose.T + slipped
-        self._covariance = (moved + moved.T) / 2
-        self._pose = integrate(self._pose, *roll.twist, dt)
+        pose = integrate(self._pose, *roll.twist, dt)
+        moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
+        self._covariance = moved.plus(self._slipped(roll))
+        self._pose = pose
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take a heading: the first ones find north, the others correct the yaw."""
@@ -162,18 +163,14 @@ class DeadReckoning:
             self._align(off, config)
             return
         innovation = wrap_angle(off - self._north)
-        variance = float(self._covariance[2, 2]) + config.noise**2
+        variance = self._covariance.ww + config.noise**2
         if innovation**2 > config.gate**2 * variance:
             self.rejected_headings += 1
             return
-        gain = self._covariance[:, 2] / variance
         x, y, heading = self._pose
-        self._pose = (
-            x + float(gain[0]) * innovation,
-            y + float(gain[1]) * innovation,
-            heading + float(gain[2]) * innovation,
-        )
-        self._covariance = self._covariance - np.outer(gain, self._covariance[2])
+        gain_x, gain_y, gain = (share / variance for share in self._covariance[3:])
+        self._pose = (x + gain_x * innovation, y + gain_y * innovation, heading + gain * innovation)
+        self._covariance = self._covariance.corrected(gain_x, gain_y, gain)
         self._compass_used = attitude.stamp
 
     def estimate(self, now: int) -> Estimate | None:
@@ -184,7 +181,8 @@ class DeadReckoning:
         twist = self._wheels.twist
         x, y, yaw = integrate(self._pose, *twist, min(age, self._config.max_prediction))
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
-        swing = np.array(((1.0, 0.0, self._pose[1] - y), (0.0, 1.0, x - self._pose[0]), (0.0, 0.0, 1.0)))
+        moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
+        covariance = moved.plus(term * age**2 for term in self._drift)
         sources = ["drive"]
         for name, used in (("steering", self._wheels.steered), ("compass", self._compass_used)):
             if used is not None and now - used <= MEMORY:
@@ -192,8 +190,8 @@ class DeadReckoning:
         return Estimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
-            pose_covariance=swing @ self._covariance @ swing.T + self._drift * age**2,
-            twist_covariance=self._drift,
+            pose_covariance=np.array(covariance.matrix()),
+            twist_covariance=self._twist_covariance,
             age=age,
             sources=tuple(sources),
         )
@@ -202,7 +200,20 @@ class DeadReckoning:
         """The drive counts from a new origin: what it did in between is not known."""
         lost = (self._config.max_speed * dt) ** 2
         turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
-        self._covariance = self._covariance + np.diag((lost, lost, turned))
+        self._covariance = self._covariance.plus(Spread(xx=lost, yy=lost, ww=turned))
+
+    def _slipped(self, roll: Roll) -> Spread:
+        """What slip adds along the arc."""
+        (a, b, c), (d, e, f), (_, _, g) = integration_jacobians(self._pose, *roll.twist, roll.dt)[1].tolist()
+        along, aside, turned = (share * roll.way / roll.dt**2 for share in self._slip)
+        return Spread(
+            xx=a * a * along + b * b * aside + c * c * turned,
+            xy=a * d * along + b * e * aside + c * f * turned,
+            yy=d * d * along + e * e * aside + f * f * turned,
+            xw=c * g * turned,
+            yw=f * g * turned,
+            ww=g * g * turned,
+        )
 
     def _align(self, off: float, config: CompassConfig) -> None:
         self._aligning.append(off)
@@ -301,8 +312,8 @@ def _message(estimate: Estimate, now: int, seq: int) -> Odometry:
         frame="odom",
         pose=Pose2D(x=x, y=y, yaw=yaw),
         twist=Twist2D(vx=vx, vy=vy, wz=wz),
-        pose_covariance=estimate.pose_covariance.ravel(),
-        twist_covariance=estimate.twist_covariance.ravel(),
+        pose_covariance=estimate.pose_covariance,
+        twist_covariance=estimate.twist_covariance,
         age=estimate.age,
         sources=estimate.sources,
     )

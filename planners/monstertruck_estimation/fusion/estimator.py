@@ -211,8 +211,8 @@ class Fusion:
         return Estimate(
             pose=(float(pose[0]), float(pose[1]), math.remainder(float(pose[2]), math.tau)),
             twist=(vx, vy, wz),
-            pose_covariance=grown[POSE, POSE] + np.outer(off, off),
-            twist_covariance=grown[TWIST, TWIST].copy(),
+            pose_covariance=(grown[POSE, POSE] + np.outer(off, off)).ravel(),
+            twist_covariance=grown[TWIST, TWIST].ravel(),
             age=max((now - moved) / SECOND, 0.0),
             sources=self.sources(now),
         )

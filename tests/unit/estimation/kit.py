@@ -72,4 +72,4 @@ class Truck:
 
 
 def spread(covariance):
-    return np.sqrt(np.diag(covariance))
+    return np.sqrt(np.diag(np.reshape(covariance, (3, 3))))
