@@ -20,7 +20,8 @@ from typing import Any
 
 import uvloop
 
-from monstertruck_runtime.clock import SECOND, WallClock, run_wall
+from monstertruck_runtime.clock import WallClock, run_wall
+from monstertruck_runtime.schedule import Schedule
 from monstertruckd.gate.meter import TickMeter
 
 NOTABLE = 0.5
@@ -100,14 +101,12 @@ def watch_ticks(report: dict[str, Any]) -> None:
 
 async def empty(clock: WallClock, report: dict[str, Any], seconds: float) -> None:
     """The floor: the gate's way of waiting for its ticks, and no work."""
-    period = round(SECOND / RATE)
-    due = clock.now() + period
+    schedule = Schedule(clock, RATE)
     ticks = report.setdefault("ticks", [])
     for _ in range(round(seconds * RATE)):
-        await clock.sleep_until(due)
+        due = await schedule.next()
         now = clock.now()
         ticks.append((now, (now - due) / 1e6))
-        due += period
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from same_python import go_on_in_the_systems_python
 
 from monstertruck_drivers.world.raycast import cast_rays, clearance
 from monstertruckd.demo.fast import run_fast_demo
@@ -189,6 +190,7 @@ def main() -> None:
     parser.add_argument("--peer", type=Path, help="laser_models.py of f1tenth_gym")
     parser.add_argument("--laps", type=int, default=3)
     arguments = parser.parse_args()
+    go_on_in_the_systems_python()
     figures: dict[str, Any] = lidar(arguments.peer)
     if arguments.peer is None:
         print(f"f1tenth_gym is not measured but quoted, scans/s by reach in m: {QUOTED}; ratios are to the greater")

@@ -77,7 +77,7 @@ class _LoopClock(ABC):
 
 
 class WallClock(_LoopClock):
-    """CLOCK_MONOTONIC and uvloop, whose timers round what they are asked for to whole milliseconds."""
+    """CLOCK_MONOTONIC and uvloop, whose timers count its whole milliseconds."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``, and one turn of the loop."""
@@ -87,9 +87,9 @@ class WallClock(_LoopClock):
             await asyncio.sleep(0)
 
     async def sleep_until(self, instant: int) -> None:
-        """Wait until ``now() >= instant``; most often less than a millisecond longer."""
-        while (left := instant - self.now()) > 0:
-            await asyncio.sleep(-(-left // MILLISECOND) / 1000)
+        """Wait for the whole millisecond at or after ``instant``; the kernel may take most of another one."""
+        while (now := self.now()) < instant:
+            await asyncio.sleep((-(-instant // MILLISECOND) - now // MILLISECOND) / 1000)
 
     def now(self) -> int:
         """Nanoseconds of CLOCK_MONOTONIC."""

@@ -1,6 +1,8 @@
 import asyncio
 
-from monstertruck_runtime.clock import SECOND, run_virtual
+import pytest
+
+from monstertruck_runtime.clock import MILLISECOND, SECOND, run_virtual, run_wall
 from monstertruck_runtime.schedule import Schedule
 
 TENTH = SECOND // 10
@@ -11,13 +13,13 @@ def test_instants_stay_on_the_grid_whatever_the_work_takes():
         start = clock.now()
         schedule = Schedule(clock, 10)
         dues = []
-        for work in (0.0, 0.03, 0.09, 0.25, 0.0, 0.2):
+        for work in (0.0, 0.03, 0.09, 0.25, 0.0, 0.2, 0.1005, 0.102, 0.0):
             dues.append(await schedule.next() - start)
-            assert 0 <= clock.now() - start - dues[-1] < 1000
+            assert 0 <= clock.now() - start - dues[-1] < MILLISECOND
             await asyncio.sleep(work)
         return dues
 
-    assert run_virtual(main) == [0, TENTH, 2 * TENTH, 3 * TENTH, 6 * TENTH, 7 * TENTH]
+    assert run_virtual(main) == [tenth * TENTH for tenth in (0, 1, 2, 3, 6, 7, 9, 10, 12)]
 
 
 def test_the_first_instant_is_now():
@@ -26,3 +28,40 @@ def test_the_first_instant_is_now():
         assert await schedule.next() == clock.now()
 
     run_virtual(main)
+
+
+def test_the_grid_lies_on_whole_milliseconds_as_the_loops_timers_do():
+    async def main(clock):
+        schedule = Schedule(clock, 50)
+        return [await schedule.next() for _ in range(3)]
+
+    assert run_virtual(main, start=SECOND + 123_456) == [SECOND + i * 20 * MILLISECOND for i in range(3)]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.0002, 0.0007, 0.0031])
+def test_a_sleep_on_the_wall_clock_is_never_too_short(seconds):
+    async def main(clock):
+        short = []
+        for _ in range(50):
+            begin = clock.now()
+            await clock.sleep(seconds)
+            short.append(begin + seconds * SECOND - clock.now())
+        return max(short)
+
+    assert run_wall(main) <= 0
+
+
+def test_a_sleep_of_no_time_lets_the_others_run():
+    async def main(clock):
+        turns = []
+
+        async def other():
+            turns.append("other")
+
+        task = asyncio.create_task(other())
+        await clock.sleep(0.0)
+        turns.append("slept")
+        await task
+        return turns
+
+    assert run_wall(main) == ["other", "slept"]
