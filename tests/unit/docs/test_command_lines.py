@@ -27,7 +27,7 @@ from tests.unit.docs.command_lines import (
 
 pytestmark = pytest.mark.timeout(180)  # the first route of a computer compiles
 
-GOLDEN = ROOT / "tests" / "data" / "golden" / "0.1.0" / "run.mcap"
+RECORDED = ROOT / "tests" / "data" / "replay" / "level.mcap"
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "configs", folder / "configs")
     for logs in (folder / "logs", folder / "runs" / "demo" / "logs"):
         logs.mkdir(parents=True)
-        shutil.copy(GOLDEN, logs / "run-000001-000.mcap")
+        shutil.copy(RECORDED, logs / "run-000001-000.mcap")
     installed = CliRunner().invoke(
         app, ["install-service", "--config", str(ROOT / "configs" / "truck.yaml"), "--root", str(folder / "system")]
     )

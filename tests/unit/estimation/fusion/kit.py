@@ -126,7 +126,7 @@ class Rig:
         for estimate, truth in zip(self.shown, self.truths, strict=True):
             off = np.array(estimate.pose) - truth
             off[2] = math.remainder(off[2], math.tau)
-            values.append(float(off @ np.linalg.solve(estimate.pose_covariance + 1e-9 * np.eye(3), off)))
+            values.append(float(off @ np.linalg.solve(estimate.pose_covariance.reshape(3, 3) + 1e-9 * np.eye(3), off)))
         return np.array(values)
 
     def steps(self):
