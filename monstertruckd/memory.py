@@ -3,6 +3,7 @@
 import ctypes
 import gc
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -23,9 +24,10 @@ def settle() -> None:
     """
     gc.collect()
     gc.freeze()
-    for begin, end in _heaps():
-        for page in range(-(-begin // HUGE) * HUGE, end - HUGE + 1, HUGE):
-            _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), _MADV_COLLAPSE)
+    with suppress(OSError):  # /proc may be hidden
+        for begin, end in _heaps():
+            for page in range(-(-begin // HUGE) * HUGE, end - HUGE + 1, HUGE):
+                _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), _MADV_COLLAPSE)
 
 
 def give_back() -> None:

@@ -21,7 +21,7 @@ from monstertruck_runtime.errors import DeviceLostError, PortBusyError, Protocol
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
 TIMER_STEP = 0.001
-"""Seconds; the loop's timers ring at the nearest one."""
+"""Seconds; the loop's timers count in these, and ring up to one and a half too early."""
 
 
 class Link:
@@ -44,6 +44,8 @@ class Link:
         """Loop time at which the present wait has lasted too long."""
         self._alarm: asyncio.TimerHandle | None = None
         """Rings at ``_due`` or earlier; outlives its wait, because the next one most likely needs it as well."""
+        self._rings = 0.0
+        """Loop time at which the alarm does."""
 
     # What the transport calls
 
@@ -179,7 +181,7 @@ class Link:
         if self._waiting is not None:
             raise RuntimeError(f"{self.name}: two readers")
         self._waiting, self._due = waiting, due
-        if due is not None and (self._alarm is None or self._alarm.when() > due):
+        if due is not None and (self._alarm is None or self._rings > due):
             self._set_alarm(asyncio.get_running_loop(), due)
 
     def end_wait(self) -> None:
@@ -203,7 +205,7 @@ class Link:
     def _set_alarm(self, loop: asyncio.AbstractEventLoop, due: float) -> None:
         if self._alarm is not None:
             self._alarm.cancel()
-        self._alarm = loop.call_at(due, self._ring, loop)
+        self._alarm, self._rings = loop.call_at(due, self._ring, loop), due
 
     def _ring(self, loop: asyncio.AbstractEventLoop) -> None:
         self._alarm = None

@@ -49,7 +49,8 @@ class Outgoing:
         """Deliver all that waits, a row a turn."""
         waiting = self._waiting
         try:
-            for _ in range(min(ROW, len(waiting))):
-                self._deliver(*waiting.popleft())
+            for _ in range(ROW):
+                if waiting:
+                    self._deliver(*waiting.popleft())
         finally:
             self._timer = asyncio.get_running_loop().call_later(0.0, self._due) if waiting else None

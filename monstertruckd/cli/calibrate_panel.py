@@ -12,6 +12,7 @@ from typing import Self
 from monstertruck_runtime.errors import InputError
 from monstertruckd.calibrate.steps import Confirm, Number
 from monstertruckd.cli.output import progress, remark
+from monstertruckd.cli.terminal import when_readable
 
 WORDS = {"y": True, "yes": True, "n": False, "no": False}
 
@@ -104,7 +105,7 @@ class TerminalPanel:
         while b"\n" not in self._rest:
             readable = asyncio.Event()
             try:
-                loop.add_reader(source, readable.set)
+                when_readable(source, readable.set)
             except PermissionError:  # a file, or /dev/null: always readable
                 readable.set()
             try:

@@ -18,7 +18,7 @@ from monstertruck_schemas.topics import GATE
 from monstertruckd.cli.drive_screen import Stream, draw
 from monstertruckd.cli.keys import KeyReader
 from monstertruckd.cli.teleop import Command, Teleop, Wish
-from monstertruckd.cli.terminal import every_key, forget_input
+from monstertruckd.cli.terminal import every_key, forget_input, when_readable
 from monstertruckd.cli.watch import PERIOD, Follower
 
 RATE: Final = 20.0
@@ -64,7 +64,7 @@ class DriveSession:
         async with TruckClient(robot, endpoint, role=Role.KEYBOARD, clock=self._clock) as client:
             follower = Follower(client, self._clock)
             with every_key(self._keyboard, self._screen):
-                loop.add_reader(self._keyboard, self._read)
+                when_readable(self._keyboard.fileno(), self._read)
                 loop.add_signal_handler(signal.SIGHUP, self._commands.put_nowait, "end")
                 try:
                     await self._until_the_end(client, follower)

@@ -55,7 +55,10 @@ class Clock(Protocol):
         ...
 
     def deadline(self, seconds: float) -> asyncio.Timeout:
-        """Async context manager that raises ``TimeoutError`` inside after ``seconds``."""
+        """Async context manager that raises ``TimeoutError`` inside after ``seconds``.
+
+        On the wall clock it may be 1.5 ms early.
+        """
         ...
 
 
@@ -81,10 +84,10 @@ class WallClock(_LoopClock):
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``, and one turn of the loop."""
-        if seconds > 0.0:
-            await self.sleep_until(self.now() + round(seconds * SECOND))
-        else:
+        until = self.now() + round(seconds * SECOND)
+        if until <= self.now():
             await asyncio.sleep(0)
+        await self.sleep_until(until)
 
     async def sleep_until(self, instant: int) -> None:
         """Wait for the whole millisecond at or after ``instant``; the kernel may take most of another one."""

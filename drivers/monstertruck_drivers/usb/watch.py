@@ -63,6 +63,9 @@ class UdevWatcher:
                 pass
         except OSError as error:  # the kernel's queue overflowed: announcements are lost
             log.debug("udev: %s", error)
+            if self._loop is not None:  # uvloop calls the reader of a file with an error once, and then no more
+                self._loop.remove_reader(self._monitor.fileno())
+                self._loop.add_reader(self._monitor.fileno(), self._drain)
         self._hint()
 
 

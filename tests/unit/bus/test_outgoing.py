@@ -147,3 +147,23 @@ def test_an_event_is_not_held_back():
         assert got == [Event]
 
     run_virtual(main)
+
+
+def test_who_is_told_may_have_all_that_waits_delivered():
+    found = []
+
+    def deliver(_, __, at):
+        found.append(at)
+        outgoing[0].flush()
+
+    outgoing = []
+
+    async def main(clock):
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: found.append(context))
+        outgoing.append(Outgoing(0.02, deliver))
+        for number in range(3):
+            outgoing[0].send(POSE, None, number)
+        await clock.sleep(0.1)
+
+    run_virtual(main)
+    assert found == [0, 1, 2]

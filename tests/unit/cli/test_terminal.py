@@ -1,16 +1,18 @@
 """A terminal is itself again after driving."""
 
+import asyncio
 import fcntl
 import os
 import pty
 import sys
 import termios
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO
 
 import pytest
 
-from monstertruckd.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input
+from monstertruckd.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input, when_readable
 
 
 @pytest.fixture
@@ -54,3 +56,21 @@ def test_a_terminal_that_vanishes_is_no_failure():
         with every_key(stream, stream):
             os.close(user)
         forget_input(stream)
+
+
+async def test_a_watched_terminal_keeps_its_mode_which_the_screen_shares(terminal: tuple[int, IO[bytes]]):
+    user, stream = terminal
+    news = asyncio.Event()
+    when_readable(stream.fileno(), news.set)
+    assert os.get_blocking(stream.fileno())
+    os.write(user, b"w\n")
+    await asyncio.wait_for(news.wait(), 5)
+    asyncio.get_running_loop().remove_reader(stream.fileno())
+    assert os.get_blocking(stream.fileno())
+
+
+async def test_a_file_is_not_watched_and_keeps_its_mode():
+    with Path(os.devnull).open("rb") as nothing:
+        with pytest.raises(PermissionError):
+            when_readable(nothing.fileno(), lambda: None)
+        assert os.get_blocking(nothing.fileno())

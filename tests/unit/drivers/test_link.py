@@ -314,3 +314,30 @@ def test_delayed_bytes_keep_their_order_also_when_the_delay_ends():
             return await link.exactly(200)
 
     assert run_virtual(main) == bytes(range(200))
+
+
+class Waiter:
+    """Somebody who waits."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def news(self) -> None:
+        self.heard.append("news")
+
+    def late(self) -> None:
+        self.heard.append("late")
+
+
+async def test_a_wait_shorter_than_the_loops_timers_may_be_followed_by_a_long_one():
+    port, waiter = await plugged(), Waiter()
+    now = asyncio.get_running_loop().time()
+    async with await port.open() as link:
+        link.begin_wait(waiter, now + 0.0003)
+        link.end_wait()
+        link.begin_wait(waiter, now + 0.05)
+        await asyncio.sleep(0.02)
+        assert waiter.heard == []
+        await asyncio.sleep(0.1)
+        assert waiter.heard == ["late"]
+        link.end_wait()

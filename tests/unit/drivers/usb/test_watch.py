@@ -3,6 +3,7 @@
 import asyncio
 import builtins
 import os
+import socket
 from collections import deque
 from collections.abc import Iterator
 from typing import Any
@@ -76,6 +77,49 @@ async def test_lost_announcements_are_a_hint_too(monitor: Monitor):
     await asyncio.sleep(0.01)
     assert hints == [1]
     watcher.stop()
+
+
+class Overrun:
+    """A socket whose pending error the kernel reports as netlink's lost messages: EPOLLERR, and an exception once."""
+
+    def __init__(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+            gone.bind(("127.0.0.1", 0))
+            nobody = gone.getsockname()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(nobody)
+        self._socket.setblocking(False)
+
+    def start(self) -> None:
+        pass
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def overrun(self) -> None:
+        self._socket.send(b"nobody listens")
+
+    def poll(self, timeout: float) -> Any:
+        try:
+            return self._socket.recv(100)
+        except BlockingIOError:
+            return None
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+async def test_every_overrun_is_a_hint_not_only_the_first():
+    monitor, hints = Overrun(), []
+    watcher = UdevWatcher(monitor)
+    watcher.start(lambda: hints.append(1))
+    for count in range(1, 4):
+        monitor.overrun()
+        async with asyncio.timeout(5):
+            while len(hints) < count:
+                await asyncio.sleep(0.01)
+    watcher.stop()
+    monitor.close()
 
 
 async def test_real_udev_is_listened_to_where_there_is_one():
