@@ -16,6 +16,7 @@ told, too. The last line is JSON.
 import argparse
 import importlib.util
 import json
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -102,6 +103,7 @@ def load_peer(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules["laser_models"] = module  # numba's cache of a first run looks for it there
     spec.loader.exec_module(module)
     return module
 
