@@ -26,18 +26,26 @@ from monstertruckd.gate.meter import TickMeter
 
 NOTABLE = 0.5
 RATE = 50.0
+MEASURED = {"add_reader": 1, "call_soon": 0, "call_soon_threadsafe": 0, "call_later": 1, "call_at": 1}
+"""The loop's ways to take a callback, with the number of arguments before it."""
 
 
 class WatchedLoop(uvloop.Loop):
-    """Event loop that measures its callbacks once ``watch`` is called."""
+    """Event loop that measures its callbacks once ``watch`` is called, and until then is as fast as ever."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._call: Callable[..., None] = _call
+        self._readers: dict[int, tuple[Callable[..., Any], tuple[Any, ...]]] = {}
 
     def add_reader(self, fd: Any, callback: Callable[..., Any], *args: Any) -> None:
-        """As ever, but what is added now is measured later."""
-        super().add_reader(fd, lambda: self._call(callback, *args))
+        """As ever, but what is added now can be measured later."""
+        self._readers[fd] = (callback, args)
+        super().add_reader(fd, callback, *args)
+
+    def remove_reader(self, fd: Any) -> Any:
+        """As ever."""
+        self._readers.pop(fd, None)
+        return super().remove_reader(fd)
 
     def watch(self, report: dict[str, Any]) -> None:
         """Measure every callback from now on."""
@@ -55,13 +63,16 @@ class WatchedLoop(uvloop.Loop):
             """``method`` whose callback, behind so many other arguments, is measured."""
             return lambda *args, **options: method(*args[:before], measured, *args[before:], **options)
 
-        self._call = measured
-        for name, before in (("call_soon", 0), ("call_soon_threadsafe", 0), ("call_later", 1), ("call_at", 1)):
+        for fd, (callback, args) in self._readers.items():
+            super().add_reader(fd, measured, callback, *args)
+        for name, before in (
+            ("add_reader", 1),
+            ("call_soon", 0),
+            ("call_soon_threadsafe", 0),
+            ("call_later", 1),
+            ("call_at", 1),
+        ):
             setattr(self, name, through(getattr(self, name), before))
-
-
-def _call(callback: Callable[..., Any], *args: Any) -> None:
-    callback(*args)
 
 
 def _name(callback: Any) -> str:

@@ -54,14 +54,16 @@ class Link:
         self._buffer += data
         if len(self._buffer) > BUFFER_LIMIT:
             del self._buffer[:-BUFFER_LIMIT]
-        self._wake()
+        if self._waiting is not None:
+            self._waiting.news()
 
     def lose(self, why: str) -> None:
         """The transport is gone; pending and later reads raise ``DeviceLostError``."""
         self._hang_up = _nothing
         if self._lost is None:
             self._lost = why
-            self._wake()
+            if self._waiting is not None:
+                self._waiting.news()
         if self._alarm is not None:
             self._alarm.cancel()
             self._alarm = None
@@ -216,10 +218,6 @@ class Link:
         else:
             self._waiting.late()
 
-    def _wake(self) -> None:
-        if self._waiting is not None:
-            self._waiting.news()
-
 
 class Waiting(Protocol):
     """Who waits at a link."""
@@ -316,11 +314,25 @@ class SerialPort:
 
 
 class _Transport(serial_asyncio.SerialTransport):  # type: ignore[misc]  # untyped
-    """Reads at once what the loop found ready; pyserial would first ask the kernel again, at twice the cost."""
+    """Reads and writes at once what the tty has and takes; pyserial would ask the kernel once more for each."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, tty: serial.Serial) -> None:
+        super().__init__(loop, protocol, tty)
+        self._fd = tty.fileno()
+
+    def send(self, data: bytes) -> None:
+        """Write; what the tty does not take now, hardly ever anything, goes later, or ends in the loss of the link."""
+        if not self._write_buffer:
+            try:  # noqa: SIM105  # four hundred times a second
+                data = data[os.write(self._fd, data) :]
+            except OSError:  # not even one byte now
+                pass
+        if data:
+            self.write(data)
 
     def _read_ready(self) -> None:
         try:
-            data = os.read(self._serial.fileno(), BUFFER_LIMIT)
+            data = os.read(self._fd, BUFFER_LIMIT)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -337,23 +349,12 @@ class _SerialProtocol(asyncio.Protocol):
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._transport: serial_asyncio.SerialTransport | None = None
         self.link: Link | None = None
 
-    def own(self, transport: "serial_asyncio.SerialTransport") -> Link:
-        self._transport = transport
+    def own(self, transport: _Transport) -> Link:
         # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(self._name, self._send, transport.abort)
+        self.link = Link(self._name, transport.send, transport.abort)
         return self.link
-
-    def _send(self, data: bytes) -> None:
-        """Write what the tty takes at once, nearly always all; the transport sends the rest, or reports the loss."""
-        assert self._transport is not None
-        if self._transport.get_write_buffer_size() == 0:
-            with contextlib.suppress(OSError):  # not even one byte now
-                data = data[os.write(self._transport.serial.fileno(), data) :]
-        if data:
-            self._transport.write(data)
 
     def data_received(self, data: bytes) -> None:
         if self.link is not None:

@@ -6,12 +6,13 @@ of them.
 """
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Value
 from monstertruck_schemas.base import Message
@@ -19,7 +20,7 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import CMD_DRIVES, CMD_STEERING, EVENT, Topic, Writer
-from monstertruckd.bus.outgoing import Outgoing
+from monstertruckd.bus.outgoing import Outgoing, Sent
 
 M = TypeVar("M", bound=Message)
 
@@ -78,7 +79,8 @@ class Bus:
         self._claimed: set[str] = set()
         self._listeners: defaultdict[str, list[Callable[[Any], object]]] = defaultdict(list)
         self._readers: defaultdict[str, list[Mailbox[Any]]] = defaultdict(list)
-        self._taps: defaultdict[str, list[Tap]] = defaultdict(list)
+        self._taps: list[Tap] = []
+        self._tapped: Counter[str] = Counter()
         self._retained: dict[str, tuple[Topic[Any], Any]] = {}
         self._drops = 0
         self._events = LocalPublisher(self, EVENT)
@@ -140,8 +142,8 @@ class Bus:
         self._outgoing.flush()
         chosen = tuple(topics)
         tap = Tap(self, callback, frozenset(topic.name for topic in chosen))
-        for topic in chosen:
-            self._taps[topic.name].append(tap)
+        self._taps.append(tap)
+        self._tapped.update(tap.topics)
         for topic, message, data in self.retained():
             if topic.name in tap.topics:
                 callback(topic, message, data, self._clock.now())
@@ -176,22 +178,35 @@ class Bus:
             listener(message)
         for mailbox in tuple(self._readers[name]):
             mailbox.put(message)
-        if self._taps[name]:
+        if self._tapped[name]:
             self._outgoing.send(topic, message, self._clock.now())
 
     def untap(self, tap: Tap) -> None:
         """End ``tap``; see ``Tap.close``."""
         self._outgoing.flush()
-        for name in tap.topics:
-            if tap in self._taps[name]:
-                self._taps[name].remove(tap)
+        if tap in self._taps:
+            self._taps.remove(tap)
+            self._tapped.subtract(tap.topics)
 
-    def _tell_taps(self, topic: Topic[Any], message: Message, at: int) -> None:
-        taps = tuple(self._taps[topic.name])
-        if taps:
-            data = wire.encode(topic, message)
-            for tap in taps:
-                tap.callback(topic, message, data, at)
+    def _tell_taps(self, row: Sequence[Sent]) -> None:
+        """Encode the whole row, then hand it to one tap after the other.
+
+        Raises:
+            InputError: a message cannot be encoded; all others are told.
+        """
+        encoded, bad = [], None
+        for topic, message, at in row:
+            try:
+                encoded.append((topic, message, wire.encode(topic, message), at))
+            except InputError as error:
+                bad = error
+        for tap in tuple(self._taps):
+            topics, callback = tap.topics, tap.callback
+            for sent in encoded:
+                if sent[0].name in topics:
+                    callback(*sent)
+        if bad is not None:
+            raise bad
 
     def _claim(self, topic: Topic[M]) -> LocalPublisher[M]:
         if topic.name in self._claimed:

@@ -5,52 +5,68 @@ The code that encodes, records and puts is then in the caches, and each row wake
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+from monstertruck_runtime.clock import MILLISECOND, SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
 OFTEN: Final = 10.0
 """Topics of so many messages a second or more may wait for others."""
-ROW: Final = 8
+BEHIND: Final = MILLISECOND
+"""Nanoseconds after the gate's tick at which rows leave: what it says goes with them, and nothing holds it up."""
+ROW: Final = 10
 """Messages delivered in one turn of the loop: a fraction of a millisecond."""
+
+Sent = tuple[Topic[Any], Message, int]
+"""Topic, message and the time it was sent, ns."""
 
 
 class Outgoing:
     """Delivers rare messages at once, and with them, or after a moment, the frequent ones that wait before them.
 
     Args:
-        seconds: a frequent message waits at most this long; 0: it does not.
-        deliver: gets topic, message and the time it was sent.
+        seconds: rows leave a moment after the multiples of this; 0: nothing waits.
+        deliver: gets a row of messages.
     """
 
-    def __init__(self, seconds: float, deliver: Callable[[Topic[Any], Message, int], None]) -> None:
-        self._seconds = seconds
+    def __init__(self, seconds: float, deliver: Callable[[Sequence[Sent]], None]) -> None:
+        self._period = round(seconds * SECOND)
         self._deliver = deliver
-        self._waiting: deque[tuple[Topic[Any], Message, int]] = deque()
+        self._waiting: deque[Sent] = deque()
+        self._delivering = False
         self._timer: asyncio.TimerHandle | None = None
 
     def send(self, topic: Topic[Any], message: Message, at: int) -> None:
         """Deliver now or soon; messages never overtake each other."""
         self._waiting.append((topic, message, at))
-        if self._seconds == 0.0 or topic.rate is None or topic.rate < OFTEN:
+        if not self._period or topic.rate is None or topic.rate < OFTEN:
             self.flush()
         elif self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(self._seconds, self._due)
+            loop = asyncio.get_running_loop()
+            passed = round(loop.time() * SECOND)
+            due = passed - passed % self._period + self._period + BEHIND
+            self._timer = loop.call_at(due / SECOND, self._due)
 
     def flush(self) -> None:
-        """Deliver all that waits."""
-        waiting = self._waiting
-        while waiting:
-            self._deliver(*waiting.popleft())
+        """Deliver all that waits; what is sent meanwhile comes behind it."""
+        while self._waiting and not self._delivering:
+            self._next_row()
 
     def _due(self) -> None:
         """Deliver all that waits, a row a turn."""
-        waiting = self._waiting
         try:
-            for _ in range(ROW):
-                if waiting:
-                    self._deliver(*waiting.popleft())
+            if self._waiting:
+                self._next_row()
         finally:
-            self._timer = asyncio.get_running_loop().call_later(0.0, self._due) if waiting else None
+            self._timer = asyncio.get_running_loop().call_later(0.0, self._due) if self._waiting else None
+
+    def _next_row(self) -> None:
+        waiting = self._waiting
+        row = [waiting.popleft() for _ in range(min(ROW, len(waiting)))]
+        self._delivering = True
+        try:
+            self._deliver(row)
+        finally:
+            self._delivering = False

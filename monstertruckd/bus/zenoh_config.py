@@ -38,7 +38,7 @@ class ZenohConfig(Schema):
     """Refuse forged state from everybody who can connect; always on with ``tls``. Subscribers must then ask for
     one group (``mt/truck/state/**``): wider expressions get nothing."""
     max_sessions: int = Field(default=64, ge=1)
-    gather_seconds: float = Field(default=0.015, ge=0, le=0.1)
+    gather_seconds: float = Field(default=0.04, ge=0, le=0.1)
     """Messages of frequent topics (10 Hz and more) leave for network and log together, each after this time at the
     latest; 0: at once."""
 

@@ -156,7 +156,7 @@ class GateService:
             await self._store_latch()
 
     async def _tick_for_ever(self, ready: Ready) -> None:
-        schedule = Schedule(self._clock, self._rate)
+        schedule = Schedule(self._clock, self._rate, ahead=0)
         while True:
             due = await schedule.next()
             now = self._clock.now()

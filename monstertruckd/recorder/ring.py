@@ -21,6 +21,8 @@ BLOCK: Final = 256 * 1024
 """Bytes of entries that are freed together."""
 SHARE: Final = 32
 """Part of the whole memory that a block takes at most."""
+LOOK: Final = SECOND // 10
+"""Nanoseconds between two looks for what is too old: letting go of many at a time is cheaper."""
 
 _HEAD: Final = Struct("<qqqII")
 """Log time, stamp, sequence, number of the topic, length of the payload."""
@@ -51,15 +53,6 @@ class _Block:
     def __init__(self, size: int) -> None:
         self.data = mmap(-1, size)
         self.used = 0
-
-    def fits(self, entry: Entry) -> bool:
-        return self.used + _length(entry) <= len(self.data)
-
-    def append(self, entry: Entry, topic: int) -> None:
-        head, begin = self.used, self.used + _HEAD.size
-        _HEAD.pack_into(self.data, head, entry.log_time, entry.stamp, entry.sequence, topic, len(entry.payload))
-        self.used = begin + len(entry.payload)
-        self.data[begin : self.used] = entry.payload
 
     def time(self, at: int) -> int:
         """Log time of the entry that begins there."""
@@ -143,16 +136,27 @@ class _Part:
     def __len__(self) -> int:
         return self._count
 
-    def append(self, entry: Entry) -> None:
-        """Add the newest entry."""
-        if not self._blocks or not self._blocks[-1].fits(entry):
-            self._blocks.append(_Block(max(self._block, _length(entry))))
+    def append(self, entry: Entry) -> bool:
+        """Add the newest entry; whether that took another block."""
+        topic, log_time, stamp, sequence, payload = entry
+        length = len(payload)
+        grown = not self._blocks or self._blocks[-1].used + _HEAD.size + length > len(self._blocks[-1].data)
+        if grown:
+            self._blocks.append(_Block(max(self._block, _HEAD.size + length)))
             self.size += len(self._blocks[-1].data)
-        self._blocks[-1].append(entry, self._number(entry.topic))
-        self.newest = entry.log_time
+        block = self._blocks[-1]
+        begin = block.used + _HEAD.size
+        number = self._numbers.get(topic.name)
+        if number is None:
+            number = self._number(topic)
+        _HEAD.pack_into(block.data, block.used, log_time, stamp, sequence, number, length)
+        block.used = begin + length
+        block.data[begin : block.used] = payload
+        self.newest = log_time
         if not self._count:
-            self.oldest = entry.log_time
+            self.oldest = log_time
         self._count += 1
+        return grown
 
     def popleft(self) -> Entry:
         """Take out the oldest entry."""
@@ -175,10 +179,8 @@ class _Part:
         return _View(self._topics, tuple(self._blocks), self._at, self._count)
 
     def _number(self, topic: Topic[Any]) -> int:
-        number = self._numbers.get(topic.name)
-        if number is None:
-            number = self._numbers[topic.name] = len(self._topics)
-            self._topics.append(topic)
+        number = self._numbers[topic.name] = len(self._topics)
+        self._topics.append(topic)
         return number
 
 
@@ -203,6 +205,9 @@ class Ring:
         self._part_of: dict[str, _Part] = {}
         self._period = round(span.picture_period * SECOND)
         self._heads: dict[str, Entry] = {}
+        self._newest = 0
+        """Log time of the newest message."""
+        self._next_look = 0
         self.lost = 0
         """Messages that had to go before their time."""
 
@@ -213,25 +218,30 @@ class Ring:
 
     def add(self, entry: Entry) -> None:
         """Take the newest message, and let go what is too old or too much."""
-        before = self.size
-        self._part(entry.topic).append(entry)
-        self._expire(entry.log_time)
-        if self.size > before:
+        part = self._part_of.get(entry.topic.name)
+        if part is None:
+            part = self._part(entry.topic)
+        grown = part.append(entry)
+        self._newest = entry.log_time
+        if grown or entry.log_time >= self._next_look:
+            self._expire()
+        if grown:
             self._make_room()
 
     def snapshot(self) -> Snapshot:
         """Everything kept; takes no longer however much it is than a list of its blocks."""
+        self._expire()
         parts = (self._rest, self._journal, self._thinned, self._fresh)
         return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
 
     def _part(self, topic: Topic[Any]) -> _Part:
-        part = self._part_of.get(topic.name)
-        if part is None:
-            part = self._journal if topic.group == JOURNAL else self._rest
-            self._part_of[topic.name] = part = self._fresh if topic.foxglove == PICTURES else part
+        part = self._journal if topic.group == JOURNAL else self._rest
+        self._part_of[topic.name] = part = self._fresh if topic.foxglove == PICTURES else part
         return part
 
-    def _expire(self, now: int) -> None:
+    def _expire(self) -> None:
+        now = self._newest
+        self._next_look = now + LOOK
         for part in (self._rest, self._journal, self._thinned):
             while part.expired(now):
                 self._drop(part.popleft())

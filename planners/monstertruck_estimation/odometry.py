@@ -122,7 +122,7 @@ class DeadReckoning:
         self._covariance = Spread()
         self._slip = (config.distance_noise**2, config.lateral_noise**2, config.yaw_noise**2)
         self._drift = Spread(xx=config.speed_noise**2, yy=config.speed_noise**2, ww=config.turn_noise**2)
-        self._twist_covariance = np.frombuffer(np.array(self._drift.matrix()).tobytes())
+        self._twist_covariance = self._drift.matrix()
         self._wheels = WheelMotion(chassis, config.max_speed)
         self._driven = 0.0
         self._aligning: list[float] = []
@@ -190,7 +190,7 @@ class DeadReckoning:
         return Estimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
-            pose_covariance=np.array(covariance.matrix()),
+            pose_covariance=covariance.matrix(),
             twist_covariance=self._twist_covariance,
             age=age,
             sources=tuple(sources),

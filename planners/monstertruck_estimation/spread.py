@@ -2,7 +2,13 @@
 
 import operator
 from collections.abc import Iterable
-from typing import NamedTuple
+from struct import Struct
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_NINE: Final = Struct("9d")
 
 
 class Spread(NamedTuple):
@@ -32,7 +38,7 @@ class Spread(NamedTuple):
             xx - gain_x * xw, xy - gain_x * yw, yy - gain_y * yw, xw - gain_x * ww, yw - gain_y * ww, ww - gain * ww
         )
 
-    def matrix(self) -> tuple[float, ...]:
-        """Nine numbers, row-major."""
+    def matrix(self) -> NDArray[np.float64]:
+        """All nine numbers, row-major; read-only."""
         xx, xy, yy, xw, yw, ww = self
-        return xx, xy, xw, xy, yy, yw, xw, yw, ww
+        return np.frombuffer(_NINE.pack(xx, xy, xw, xy, yy, yw, xw, yw, ww))

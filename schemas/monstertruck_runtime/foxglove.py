@@ -25,6 +25,7 @@ from monstertruck_runtime.foxglove_layouts import (
     VECTOR3,
     planar_pose,
 )
+from monstertruck_runtime.foxglove_poses import encode_odometry, encode_transform
 from monstertruck_runtime.foxglove_scan import decode_scan, encode_scan
 from monstertruck_runtime.protobuf import Layout
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
@@ -62,20 +63,6 @@ def _doubles3(values: Any) -> tuple[float, float, float]:
         raise InputError(msg)
     a, b, c = values.tolist()
     return a, b, c
-
-
-def _odometry_values(odometry: Odometry) -> dict[str, Any]:
-    pose, twist = odometry.pose, odometry.twist
-    return _header(odometry) | {
-        "pose": planar_pose(pose.x, pose.y, pose.yaw),
-        "child": odometry.child,
-        "pose2d": array("d", (pose.x, pose.y, pose.yaw)),
-        "twist2d": array("d", (twist.vx, twist.vy, twist.wz)),
-        "pose_covariance": odometry.pose_covariance,
-        "twist_covariance": odometry.twist_covariance,
-        "age": odometry.age,
-        "sources": odometry.sources,
-    }
 
 
 def _odometry_model(values: Mapping[str, Any]) -> Odometry:
@@ -149,18 +136,7 @@ def _grid_model(values: Mapping[str, Any]) -> Grid:
 
 
 def _transforms_values(tree: Transforms) -> dict[str, Any]:
-    return _header(tree) | {
-        "transforms": [
-            {
-                "stamp": transform.stamp,
-                "parent": transform.parent,
-                "child": transform.child,
-                "translation": dict(zip("xyz", transform.translation, strict=True)),
-                "rotation": dict(zip("xyzw", transform.rotation, strict=True)),
-            }
-            for transform in tree.transforms
-        ],
-    }
+    return _header(tree) | {"transforms": [encode_transform(transform) for transform in tree.transforms]}
 
 
 def _transforms_model(values: dict[str, Any]) -> Transforms:
@@ -208,7 +184,7 @@ def _by_values(
 BINDINGS: Final[Mapping[type[Message], Binding]] = {
     LaserScan: Binding(LASER_SCAN, encode_scan, decode_scan),
     CompressedImage: _by_values(COMPRESSED_IMAGE, vars, CompressedImage.model_validate),
-    Odometry: _by_values(POSE_IN_FRAME, _odometry_values, _odometry_model),
+    Odometry: Binding(POSE_IN_FRAME, encode_odometry, lambda data: _odometry_model(POSE_IN_FRAME.decode(data))),
     Path: _by_values(POSES_IN_FRAME, _path_values, _path_model),
     Grid: _by_values(GRID, _grid_values, _grid_model),
     Transforms: _by_values(FRAME_TRANSFORMS, _transforms_values, _transforms_model),

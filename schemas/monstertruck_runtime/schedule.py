@@ -1,19 +1,29 @@
 """Periodic work without drift."""
 
+from typing import Final
+
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
+
+AHEAD: Final = 4 * MILLISECOND
+"""So long before the gate's ticks the instants of all others lie: its newest input is fresh then, and the loop free."""
 
 
 class Schedule:
     """Instants on one fixed grid. Those that were missed by a millisecond are skipped, not made up for.
 
+    Schedules of one rate have the same instants, so that services wake together: a loop that sleeps in between runs
+    code from cold caches, and what comes first pays for what follows.
+
     Args:
-        clock: time; the grid begins at the millisecond of the first ``next``, for timers have no finer steps.
+        clock: time.
         rate: instants per second.
+        ahead: of the multiples of the period, ns; negative: behind them.
     """
 
-    def __init__(self, clock: Clock, rate: float) -> None:
+    def __init__(self, clock: Clock, rate: float, ahead: int = AHEAD) -> None:
         self._clock = clock
         self._period = round(SECOND / rate)
+        self._ahead = ahead
         self._due: int | None = None
 
     async def next(self) -> int:
@@ -26,7 +36,7 @@ class Schedule:
         if self._due is None:
             self._due = now - now % MILLISECOND
         else:
-            passed = now - self._due - MILLISECOND
-            self._due += self._period * max(1, -(-passed // self._period))
+            behind = max(self._due, now - MILLISECOND)
+            self._due = behind + self._period - (behind + self._ahead) % self._period
         await self._clock.sleep_until(self._due)
         return self._due

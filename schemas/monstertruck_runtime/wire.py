@@ -45,7 +45,7 @@ def encode(topic: Topic[M], message: M) -> bytes:
         msg = f"{topic.name}: expected {topic.model.__name__}, got {type(message).__name__}"
         raise InputError(msg)
     if topic.foxglove is None:
-        return message.model_dump_json(exclude_none=True).encode()
+        return message.__pydantic_serializer__.to_json(message, exclude_none=True)
     return BINDINGS[topic.model].encode(message)
 
 

@@ -70,31 +70,45 @@ def _equal(a: object, b: object) -> bool:
     return bool(a == b)
 
 
-def _frozen_array(dtype: type[np.generic]) -> PlainValidator:
+def _frozen_array(dtype: type[np.generic], size: int | None) -> PlainValidator:
     exact = np.dtype(dtype)
 
     def freeze(value: Any, info: ValidationInfo) -> NDArray[Any]:
         if type(value) is np.ndarray and value.dtype is exact and value.ndim == 1:
-            return np.frombuffer(value.tobytes(), exact) if value.flags.writeable else value
-        # What came in from outside is looked at first: numpy takes its time over strings and nested lists.
-        if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
-            msg = "expected a list of numbers"
-            raise ValueError(msg)
-        try:
-            array = np.asarray(value, dtype=dtype)
-        except (TypeError, OverflowError) as error:
-            raise ValueError(str(error)) from error
-        if array.ndim != 1:
-            msg = f"expected one dimension, got {array.ndim}"
+            array = value
+        else:
+            array = _array(value, dtype, info)
+        if size is not None and len(array) != size:
+            msg = f"expected {size} numbers, got {len(array)}"
             raise ValueError(msg)
         return np.frombuffer(array.tobytes(), exact) if array.flags.writeable else array
 
     return PlainValidator(freeze)
 
 
-def _array_type(dtype: type[np.generic], json_item: str) -> Any:
+def _array(value: Any, dtype: type[np.generic], info: ValidationInfo) -> NDArray[Any]:
+    """One-dimensional array of what came in.
+
+    Raises:
+        ValueError: it cannot be one.
+    """
+    # It is looked at first: numpy takes its time over strings and nested lists.
+    if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
+        msg = "expected a list of numbers"
+        raise ValueError(msg)
+    try:
+        array = np.asarray(value, dtype=dtype)
+    except (TypeError, OverflowError) as error:
+        raise ValueError(str(error)) from error
+    if array.ndim != 1:
+        msg = f"expected one dimension, got {array.ndim}"
+        raise ValueError(msg)
+    return array
+
+
+def _array_type(dtype: type[np.generic], json_item: str, size: int | None = None) -> Any:
     return (
-        _frozen_array(dtype),
+        _frozen_array(dtype, size),
         PlainSerializer(lambda a: a.tolist(), when_used="json"),
         WithJsonSchema({"type": "array", "items": {"type": json_item}}),
     )
@@ -102,6 +116,8 @@ def _array_type(dtype: type[np.generic], json_item: str) -> Any:
 
 Float64Array = Annotated[NDArray[np.float64], *_array_type(np.float64, "number")]
 """Read-only float64 array; JSON: list of numbers. May hold +inf for "no return" only where stated."""
+Covariance = Annotated[NDArray[np.float64], *_array_type(np.float64, "number", 9)]
+"""Shape (9,): that of three values, row-major."""
 UInt8Array = Annotated[NDArray[np.uint8], *_array_type(np.uint8, "integer")]
 Int8Array = Annotated[NDArray[np.int8], *_array_type(np.int8, "integer")]
 

@@ -1,12 +1,12 @@
 """Messages of the ``state`` group: what the robot believes and in which state it is."""
 
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from monstertruck_schemas.base import (
-    Float64Array,
+    Covariance,
     FrameId,
     Int8Array,
     Message,
@@ -25,21 +25,14 @@ class Odometry(Message):
     child: FrameId = "base"
     pose: Pose2D
     twist: Twist2D
-    pose_covariance: Float64Array
+    pose_covariance: Covariance
     """Shape (9,), row-major covariance of (x, y, yaw): m^2, m rad, rad^2."""
-    twist_covariance: Float64Array
+    twist_covariance: Covariance
     """Shape (9,), row-major covariance of (vx, vy, wz)."""
     age: Annotated[float, Field(ge=0)]
     """Seconds since the newest drive reading this estimate rests on; the rest is predicted."""
     sources: tuple[str, ...] = ()
     """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
-
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        if self.pose_covariance.shape != (9,) or self.twist_covariance.shape != (9,):
-            msg = "covariances must have shape (9,)"
-            raise ValueError(msg)
-        return self
 
 
 class ScanMotion(Message):
@@ -49,16 +42,9 @@ class ScanMotion(Message):
     """Stamp of the earlier scan."""
     motion: Pose2D
     """Base at ``stamp`` in base at ``since``."""
-    covariance: Float64Array
+    covariance: Covariance
     """Shape (9,), row-major covariance of the later scan's place on the map, (x, y, yaw) in its own base's axes: m^2,
     m rad, rad^2; huge along a corridor. That of the earlier scan came with the motion before."""
-
-    @model_validator(mode="after")
-    def _shape(self) -> Self:
-        if self.covariance.shape != (9,):
-            msg = "covariance must have shape (9,)"
-            raise ValueError(msg)
-        return self
 
 
 class Transform(Schema):

@@ -234,10 +234,11 @@ class Joint:
 
     def _tell_alarms(self, error: Alarm, now: int) -> None:
         """Each bit once, until all were clear for a while."""
-        if error:
-            self._clean_since = now
-        elif now - self._clean_since >= self._config.alarm.settled_after * SECOND:
-            self._told = Alarm(0)
+        if not error:
+            if self._told and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
+                self._told = Alarm(0)
+            return
+        self._clean_since = now
         new = error & ~self._told
         self._told |= error
         if new:

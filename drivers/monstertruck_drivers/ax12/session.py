@@ -112,7 +112,7 @@ class Session:
             if packet is None:
                 continue
             error = Alarm(packet.code)
-            if Alarm.CHECKSUM in error and attempt < retries:
+            if packet.code and Alarm.CHECKSUM in error and attempt < retries:
                 continue
             if len(packet.params) != count:
                 raise ProtocolError(f"{self._link.name}: unit {unit} gave no data: {alarm_names(error)} error")

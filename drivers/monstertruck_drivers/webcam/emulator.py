@@ -148,7 +148,8 @@ class WebcamEmulator:
     async def _stream(self, end: DeviceEnd) -> None:
         while True:
             await self._wanted.wait()
-            session, schedule = self._session, Schedule(self._clock, self._rate)
+            session = self._session
+            schedule = Schedule(self._clock, self._rate, ahead=-self._clock.now())  # a clock of its own
             while self._wanted.is_set() and session == self._session:
                 stamp = await schedule.next()
                 if self._wanted.is_set() and session == self._session and self._renderer is not None:

@@ -2,13 +2,14 @@ import asyncio
 
 import pytest
 
-from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT, HEALTH, ODOMETRY, POSE, Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.outgoing import ROW, Outgoing
-from tests.bus_kit import odometry
+from monstertruckd.bus.outgoing import BEHIND, ROW, Outgoing
+from tests.bus_kit import gate_state, odometry
 
 
 def delivered(scenario, seconds=0.02):
@@ -19,8 +20,8 @@ def delivered(scenario, seconds=0.02):
         begin = clock.now()
         outgoing = Outgoing(
             seconds,
-            lambda topic, _, at: found.append(
-                (topic.name, round((at - begin) / 10**6), round((clock.now() - begin) / 10**6))
+            lambda row: found.extend(
+                (topic.name, round((at - begin) / 10**6), round((clock.now() - begin) / 10**6)) for topic, _, at in row
             ),
         )
         await scenario(lambda topic: outgoing.send(topic, None, clock.now()), outgoing, clock)
@@ -38,7 +39,7 @@ def test_frequent_messages_wait_for_each_other():
         send(ODOMETRY)
         await clock.sleep(0.1)
 
-    assert delivered(scenario) == [("state/odometry", 0, 20), ("state/pose", 5, 20), ("state/odometry", 35, 55)]
+    assert delivered(scenario) == [("state/odometry", 0, 21), ("state/pose", 5, 21), ("state/odometry", 35, 41)]
 
 
 @pytest.mark.parametrize("rare", [HEALTH, EVENT])
@@ -50,18 +51,18 @@ def test_a_rare_message_leaves_at_once_behind_what_waits(rare):
         send(POSE)
         await clock.sleep(0.1)
 
-    assert delivered(scenario) == [("state/odometry", 0, 5), (rare.name, 5, 5), ("state/pose", 5, 20)]
+    assert delivered(scenario) == [("state/odometry", 0, 5), (rare.name, 5, 5), ("state/pose", 5, 21)]
 
 
 def test_a_long_row_leaves_in_several_turns_of_the_loop():
     found = []
 
     async def main(clock):
-        outgoing = Outgoing(0.02, lambda *message: found.append(message))
+        outgoing = Outgoing(0.02, found.extend)
         for number in range(2 * ROW + 1):
             outgoing.send(ODOMETRY, None, number)
         counts = []
-        await clock.sleep(0.02)
+        await clock.sleep_until(2 * SECOND // 100 + clock.now() + BEHIND)
         for _ in range(3):
             counts.append(len(found))
             await asyncio.sleep(0)
@@ -79,27 +80,62 @@ def test_nothing_waits_if_it_is_told_so():
     assert delivered(scenario, seconds=0.0) == [("state/odometry", 0, 0)]
 
 
-def test_a_failure_loses_only_its_own_message():
+def test_after_a_failure_the_rest_is_delivered_all_the_same():
     found = []
 
-    def deliver(topic, _, __):
-        if topic is ODOMETRY:
+    def deliver(row):
+        found.extend(at for _, _, at in row)
+        if found[0] == 0 and len(found) == ROW:
             raise OSError("full")
-        found.append(topic.name)
 
     async def main(clock):
+        errors = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
         outgoing = Outgoing(0.02, deliver)
-        outgoing.send(ODOMETRY, None, 0)
-        outgoing.send(POSE, None, 0)
-        with pytest.raises(OSError, match="full"):
-            outgoing.flush()
-        asyncio.get_running_loop().set_exception_handler(lambda *_: None)
-        outgoing.send(ODOMETRY, None, 0)
-        outgoing.send(POSE, None, 0)
+        for number in range(ROW + 1):
+            outgoing.send(ODOMETRY, None, number)
         await clock.sleep(0.1)
+        assert [str(error) for error in errors] == ["full"]
 
     run_virtual(main)
-    assert found == ["state/pose", "state/pose"]
+    assert found == list(range(ROW + 1))
+
+
+def test_a_message_that_cannot_be_encoded_costs_no_other_one():
+    async def main(clock):
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
+        bus = Bus(clock, 0.02)
+        bus.tap(lambda _t, message, *_: got.append(message.seq), [ODOMETRY])
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        for message in (odometry(0), gate_state(1), odometry(2)):
+            out.put(message)
+        await clock.sleep(0.1)
+
+    got, errors = [], []
+    run_virtual(main)
+    assert got == [0, 2]
+    assert [type(error) for error in errors] == [InputError]
+
+
+def test_each_tap_gets_a_row_before_what_it_makes_others_publish():
+    async def main(clock):
+        bus = Bus(clock, 0.02)
+        events = bus.event_sink()
+
+        def complain(_topic, message, *_):
+            if message.seq == 0:
+                events(Reason.DISARMED, Severity.INFO, "tap")
+
+        bus.tap(complain, [ODOMETRY])
+        bus.tap(lambda topic, *_: got.append(topic.name), [ODOMETRY, EVENT])
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        for number in range(2):
+            out.put(odometry(number))
+        await clock.sleep(0.1)
+
+    got = []
+    run_virtual(main)
+    assert got == ["state/odometry", "state/odometry", "event/event"]
 
 
 def test_readers_get_a_message_at_once_and_taps_in_rows():
@@ -152,8 +188,8 @@ def test_an_event_is_not_held_back():
 def test_who_is_told_may_have_all_that_waits_delivered():
     found = []
 
-    def deliver(_, __, at):
-        found.append(at)
+    def deliver(row):
+        found.extend(at for _, _, at in row)
         outgoing[0].flush()
 
     outgoing = []

@@ -162,7 +162,7 @@ def test_service_publishes_the_whole_tree_ten_times_a_second():
 
     run_virtual(main)
     assert len(out) == pytest.approx(11, abs=1)
-    assert np.diff([message.stamp for message in out]) == pytest.approx(SECOND // 10, abs=1000)
+    assert np.diff([message.stamp for message in out[1:]]) == pytest.approx(SECOND // 10, abs=1000)
     assert [t.child for t in out[0].transforms] == ["odom", "lidar"]
     assert [t.child for t in out[-1].transforms] == ["odom", "lidar", "base"]
     assert out[-1].transforms[1].stamp == out[-1].stamp

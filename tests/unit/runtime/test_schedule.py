@@ -3,7 +3,7 @@ import asyncio
 import pytest
 
 from monstertruck_runtime.clock import MILLISECOND, SECOND, run_virtual, run_wall
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.schedule import AHEAD, Schedule
 
 TENTH = SECOND // 10
 
@@ -11,7 +11,7 @@ TENTH = SECOND // 10
 def test_instants_stay_on_the_grid_whatever_the_work_takes():
     async def main(clock):
         start = clock.now()
-        schedule = Schedule(clock, 10)
+        schedule = Schedule(clock, 10, ahead=0)
         dues = []
         for work in (0.0, 0.03, 0.09, 0.25, 0.0, 0.2, 0.1005, 0.102, 0.0):
             dues.append(await schedule.next() - start)
@@ -30,12 +30,25 @@ def test_the_first_instant_is_now():
     run_virtual(main)
 
 
-def test_the_grid_lies_on_whole_milliseconds_as_the_loops_timers_do():
+def test_services_that_began_at_different_times_wake_together_ahead_of_the_gate():
     async def main(clock):
-        schedule = Schedule(clock, 50)
-        return [await schedule.next() for _ in range(3)]
+        async def three(rate, **options):
+            schedule = Schedule(clock, rate, **options)
+            return [await schedule.next() - SECOND for _ in range(3)][1:]
 
-    assert run_virtual(main, start=SECOND + 123_456) == [SECOND + i * 20 * MILLISECOND for i in range(3)]
+        begun = []
+        for rate, options in ((50, {}), (50, {}), (25, {}), (50, {"ahead": 0})):
+            begun.append(asyncio.create_task(three(rate, **options)))
+            await clock.sleep(0.0037)
+        return [[due / MILLISECOND for due in await task] for task in begun]
+
+    ahead = AHEAD / MILLISECOND
+    assert run_virtual(main, start=SECOND + 123_456) == [
+        [20 - ahead, 40 - ahead],
+        [20 - ahead, 40 - ahead],
+        [40 - ahead, 80 - ahead],
+        [20, 40],
+    ]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.0002, 0.0007, 0.0031])

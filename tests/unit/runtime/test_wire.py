@@ -116,6 +116,31 @@ def test_the_scans_own_codec_writes_what_its_layout_says_and_reads_it_without_th
         assert not known.ranges.flags.writeable
 
 
+@modest
+@given(data=st.data())
+def test_the_poses_own_writers_write_what_their_layouts_say(data):
+    odometry = data.draw(messages.of(t.ODOMETRY))
+    pose, twist = odometry.pose, odometry.twist
+    values = vars(odometry) | {
+        "pose": foxglove_layouts.planar_pose(pose.x, pose.y, pose.yaw),
+        "pose2d": np.array([pose.x, pose.y, pose.yaw]),
+        "twist2d": np.array([twist.vx, twist.vy, twist.wz]),
+    }
+    assert wire.encode(t.ODOMETRY, odometry) == foxglove_layouts.POSE_IN_FRAME.encode(values)
+    tree = data.draw(messages.of(t.TRANSFORMS))
+    rows = [
+        vars(transform)
+        | {
+            "translation": dict(zip("xyz", transform.translation, strict=True)),
+            "rotation": dict(zip("xyzw", transform.rotation, strict=True)),
+        }
+        for transform in tree.transforms
+    ]
+    assert wire.encode(t.TRANSFORMS, tree) == foxglove_layouts.FRAME_TRANSFORMS.encode(
+        vars(tree) | {"transforms": rows}
+    )
+
+
 @pytest.mark.parametrize("bits", range(65))
 def test_numbers_of_every_length_are_written_as_the_standard_says(bits):
     for value in {2**bits - 1, 2**bits - 1 & 0x5555_5555_5555_5555}:
