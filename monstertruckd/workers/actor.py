@@ -53,6 +53,8 @@ class WorkerActor:
         self._patience = patience
         self._virtual = isinstance(clock, VirtualClock)
         self._process: WorkerProcess | None = None
+        self._built = False
+        """The process has told that it can take steps."""
         self._turn = asyncio.Lock()
 
     @property
@@ -63,12 +65,17 @@ class WorkerActor:
     async def start(self) -> None:
         """Start the process if it does not run; a step does so itself, this only saves it the wait.
 
+        On the virtual clock nobody waits: the process starts beside the run, and the first step tells how that went.
+
         Raises:
             WorkerError: the factory failed.
             WorkerTimeoutError: it took longer than ``patience``.
         """
         async with self._turn:
-            await self._started()
+            if not self._virtual:
+                await self._started()
+            elif self._process is None:
+                self._spawn()
 
     async def step(self, inputs: Any) -> Any:
         """Take one step.
@@ -90,17 +97,17 @@ class WorkerActor:
         await self._discard()
 
     async def _started(self) -> WorkerProcess:
-        if self._process is not None:
+        if self._process is not None and self._built:
             return self._process
         try:
-            process = await self._blocking(self._spawn)
-            await self._built(process)
+            process = self._process or await self._blocking(self._spawn)
+            await self._build(process)
         except BaseException:
             await self._discard()
             raise
         return process
 
-    async def _built(self, process: WorkerProcess) -> None:
+    async def _build(self, process: WorkerProcess) -> None:
         try:
             if self._virtual:
                 process.receive(self._patience)
@@ -110,6 +117,7 @@ class WorkerActor:
         except TimeoutError:
             msg = f"worker {self._name} did not start within {self._patience} s"
             raise WorkerTimeoutError(msg) from None
+        self._built = True
 
     async def _step_really(self, process: WorkerProcess, inputs: Any) -> Any:
         try:
@@ -135,7 +143,7 @@ class WorkerActor:
         return WorkerTimeoutError(f"worker {self._name} missed its deadline of {self._deadline} s and was killed")
 
     def _spawn(self) -> WorkerProcess:
-        self._process = WorkerProcess(self._name, self._target)
+        self._process, self._built = WorkerProcess(self._name, self._target), False
         return self._process
 
     async def _discard(self) -> None:

@@ -44,7 +44,7 @@ STYLES: Mapping[str, Style] = {
 }
 
 _UNKNOWN, _FREE, _WALL = (np.array(rgb, dtype=np.float64) for rgb in ((216, 221, 227), (250, 251, 252), (34, 43, 54)))
-_INK, _FAINT, _PAPER = "#222b36", "#6b7785", "#ffffff"
+_INK, _FAINT, _RULE, _PAPER = "#222b36", "#6b7785", "#c3cad3", "#ffffff"
 _LONG_SIDE = 1200
 """Pixels of the map's longer side."""
 _OVERSAMPLING = 2
@@ -100,7 +100,9 @@ def render(
     drawn = [(path["name"], STYLES[path["style"]], np.asarray(path["poses"], dtype=np.float64)) for path in paths]
     frame = _Frame.around(_shown(raster, [poses for _, _, poses in drawn if len(poses)]))
     sheet = Image.new("RGB", frame.sheet_size, _PAPER)
-    sheet.paste(ImageChops.darker(_background(raster, frame), _grid(frame)), frame.to_sheet(0, 0))
+    background = _background(raster, frame)
+    _rule(background, frame)
+    sheet.paste(background, frame.to_sheet(0, 0))
     pen = ImageDraw.Draw(sheet)
     for _, style, poses in drawn:
         _line(pen, [frame.pixel(*pose[:2]) for pose in poses], style)
@@ -187,19 +189,20 @@ def _background(raster: OccupancyRaster, frame: _Frame) -> Image.Image:
     return canvas
 
 
-def _grid(frame: _Frame) -> Image.Image:
-    """Faint lines at round metres on white, as large as the map."""
-    area = frame.area
-    grid = Image.new("RGB", frame.map_size, "white")
-    pen = ImageDraw.Draw(grid)
-    step = frame.unit
+def _rule(canvas: Image.Image, frame: _Frame) -> None:
+    """Faint lines at round metres, behind the walls."""
+    area, step = frame.area, frame.unit
     for x in np.arange(np.ceil(area.x0 / step), np.floor(area.x1 / step) + 1) * step:
-        at = (x - area.x0) * frame.scale
-        pen.line([(at, 0), (at, grid.height)], fill="#c3cad3", width=_OVERSAMPLING)
+        at = round((x - area.x0) * frame.scale)
+        _darken(canvas, (at, 0, min(at + _OVERSAMPLING, canvas.width), canvas.height))
     for y in np.arange(np.ceil(area.y0 / step), np.floor(area.y1 / step) + 1) * step:
-        at = (area.y1 - y) * frame.scale
-        pen.line([(0, at), (grid.width, at)], fill="#c3cad3", width=_OVERSAMPLING)
-    return grid
+        at = round((area.y1 - y) * frame.scale)
+        _darken(canvas, (0, at, canvas.width, min(at + _OVERSAMPLING, canvas.height)))
+
+
+def _darken(canvas: Image.Image, box: tuple[int, int, int, int]) -> None:
+    strip = canvas.crop(box)
+    canvas.paste(ImageChops.darker(strip, Image.new("RGB", strip.size, _RULE)), box[:2])
 
 
 def _line(pen: ImageDraw.ImageDraw, points: list[Point], style: Style) -> None:

@@ -254,3 +254,25 @@ def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
                 await worker.step(None)
 
     run_virtual(main)
+
+
+@pytest.mark.parametrize(
+    ("target", "error"), [("slow_to_build", WorkerTimeoutError), ("broken", WorkerError), ("Counter", None)]
+)
+def test_on_the_virtual_clock_a_worker_starts_beside_the_run(target: str, error: type[Exception] | None):
+    async def main(clock: VirtualClock) -> None:
+        async with counter(clock, target, patience=0.3 if target == "slow_to_build" else 30.0) as worker:
+            await worker.start()
+            pid = worker.pid
+            await worker.start()
+            assert worker.pid == pid is not None
+            if error is None:
+                assert await worker.step(None) == 1
+                assert worker.pid == pid
+                return
+            with pytest.raises(error):
+                await worker.step(None)
+            assert worker.pid is None
+            assert gone(pid)
+
+    run_virtual(main)
