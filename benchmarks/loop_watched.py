@@ -65,13 +65,7 @@ class WatchedLoop(uvloop.Loop):
 
         for fd, (callback, args) in self._readers.items():
             super().add_reader(fd, measured, callback, *args)
-        for name, before in (
-            ("add_reader", 1),
-            ("call_soon", 0),
-            ("call_soon_threadsafe", 0),
-            ("call_later", 1),
-            ("call_at", 1),
-        ):
+        for name, before in MEASURED.items():
             setattr(self, name, through(getattr(self, name), before))
 
 

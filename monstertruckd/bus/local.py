@@ -12,7 +12,6 @@ from typing import Any, Generic, TypeVar
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Value
 from monstertruck_schemas.base import Message
@@ -70,7 +69,7 @@ class Bus:
 
     Args:
         clock: time.
-        gather_seconds: messages of frequent topics reach the taps together, after this time at the latest; 0: at once.
+        gather_seconds: messages of frequent topics reach the taps together, about this late at most; 0: at once.
     """
 
     def __init__(self, clock: Clock, gather_seconds: float = 0.0) -> None:
@@ -187,26 +186,30 @@ class Bus:
         if tap in self._taps:
             self._taps.remove(tap)
             self._tapped.subtract(tap.topics)
+            tap.topics = frozenset()
 
     def _tell_taps(self, row: Sequence[Sent]) -> None:
         """Encode the whole row, then hand it to one tap after the other.
 
         Raises:
-            InputError: a message cannot be encoded; all others are told.
+            Exception: a message cannot be encoded, or a tap has a bug; that costs nothing but this message.
         """
-        encoded, bad = [], None
+        encoded: list[tuple[Topic[Any], Message, bytes, int]] = []
+        bug: Exception | None = None
         for topic, message, at in row:
             try:
                 encoded.append((topic, message, wire.encode(topic, message), at))
-            except InputError as error:
-                bad = error
+            except Exception as error:  # noqa: BLE001  # raised below
+                bug = error
         for tap in tuple(self._taps):
-            topics, callback = tap.topics, tap.callback
             for sent in encoded:
-                if sent[0].name in topics:
-                    callback(*sent)
-        if bad is not None:
-            raise bad
+                if sent[0].name in tap.topics:
+                    try:
+                        tap.callback(*sent)
+                    except Exception as error:  # noqa: BLE001  # raised below
+                        bug = error
+        if bug is not None:
+            raise bug
 
     def _claim(self, topic: Topic[M]) -> LocalPublisher[M]:
         if topic.name in self._claimed:

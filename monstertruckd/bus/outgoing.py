@@ -15,7 +15,7 @@ from monstertruck_schemas.topics import Topic
 OFTEN: Final = 10.0
 """Topics of so many messages a second or more may wait for others."""
 BEHIND: Final = MILLISECOND
-"""Nanoseconds after the gate's tick at which rows leave: what it says goes with them, and nothing holds it up."""
+"""Nanoseconds after the multiples at which rows leave: what the gate says there goes with them, not held up by them."""
 ROW: Final = 10
 """Messages delivered in one turn of the loop: a fraction of a millisecond."""
 
@@ -36,7 +36,7 @@ class Outgoing:
         self._deliver = deliver
         self._waiting: deque[Sent] = deque()
         self._delivering = False
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.Handle | None = None
 
     def send(self, topic: Topic[Any], message: Message, at: int) -> None:
         """Deliver now or soon; messages never overtake each other."""
@@ -51,8 +51,14 @@ class Outgoing:
 
     def flush(self) -> None:
         """Deliver all that waits; what is sent meanwhile comes behind it."""
-        while self._waiting and not self._delivering:
-            self._next_row()
+        if self._delivering:
+            return
+        try:
+            while self._waiting:
+                self._next_row()
+        finally:
+            if self._waiting and self._timer is None:
+                self._timer = asyncio.get_running_loop().call_soon(self._due)
 
     def _due(self) -> None:
         """Deliver all that waits, a row a turn."""

@@ -224,13 +224,11 @@ class Ring:
         grown = part.append(entry)
         self._newest = entry.log_time
         if grown or entry.log_time >= self._next_look:
-            self._expire()
-        if grown:
-            self._make_room()
+            self._let_go()
 
     def snapshot(self) -> Snapshot:
         """Everything kept; takes no longer however much it is than a list of its blocks."""
-        self._expire()
+        self._let_go()
         parts = (self._rest, self._journal, self._thinned, self._fresh)
         return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
 
@@ -239,9 +237,15 @@ class Ring:
         self._part_of[topic.name] = part = self._fresh if topic.foxglove == PICTURES else part
         return part
 
-    def _expire(self) -> None:
-        now = self._newest
-        self._next_look = now + LOOK
+    def _let_go(self) -> None:
+        """What is too old first; what then still is too much was lost."""
+        self._next_look = self._newest + LOOK
+        self._expire(self._newest)
+        while self.size > self._limit and (crowded := self._fullest()) is not None:
+            self._drop(crowded.popleft())
+            self.lost += 1
+
+    def _expire(self, now: int) -> None:
         for part in (self._rest, self._journal, self._thinned):
             while part.expired(now):
                 self._drop(part.popleft())
@@ -252,11 +256,6 @@ class Ring:
                 self._drop(picture)
             else:
                 kept.append(picture)
-
-    def _make_room(self) -> None:
-        while self.size > self._limit and (crowded := self._fullest()) is not None:
-            self._drop(crowded.popleft())
-            self.lost += 1
 
     def _fullest(self) -> _Part | None:
         """Where to make room; never the newest message of its sort."""

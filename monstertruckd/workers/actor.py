@@ -65,11 +65,11 @@ class WorkerActor:
     async def start(self) -> None:
         """Start the process if it does not run; a step does so itself, this only saves it the wait.
 
-        On the virtual clock nobody waits: the process starts beside the run, and the first step tells how that went.
+        On the virtual clock nobody waits: the process starts beside the run, and the first step raises what went wrong.
 
         Raises:
-            WorkerError: the factory failed.
-            WorkerTimeoutError: it took longer than ``patience``.
+            WorkerError: the factory failed (wall clock).
+            WorkerTimeoutError: it took longer than ``patience`` (wall clock).
         """
         async with self._turn:
             if not self._virtual:
@@ -97,10 +97,12 @@ class WorkerActor:
         await self._discard()
 
     async def _started(self) -> WorkerProcess:
-        if self._process is not None and self._built:
-            return self._process
+        process = self._process
+        if process is not None and self._built:
+            return process
         try:
-            process = self._process or await self._blocking(self._spawn)
+            if process is None:
+                process = await self._blocking(self._spawn)
             await self._build(process)
         except BaseException:
             await self._discard()

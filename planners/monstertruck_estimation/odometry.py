@@ -19,7 +19,7 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.schedule import ESTIMATES, Schedule
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
@@ -265,7 +265,7 @@ class OdometryService:
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled; the first pose follows the first drive reading."""
         ready()
-        schedule = Schedule(self._clock, self._rate)
+        schedule = Schedule(self._clock, self._rate, ESTIMATES)
         while True:
             await schedule.next()
             self.take()

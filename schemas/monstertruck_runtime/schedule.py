@@ -5,7 +5,10 @@ from typing import Final
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 
 AHEAD: Final = 4 * MILLISECOND
-"""So long before the gate's ticks the instants of all others lie: its newest input is fresh then, and the loop free."""
+"""So long before the gate's ticks the instants of the others lie: its newest input is fresh then, and the loop free."""
+
+ESTIMATES: Final = AHEAD + MILLISECOND
+"""The same of those whose estimates the others use."""
 
 
 class Schedule:
@@ -24,19 +27,21 @@ class Schedule:
         self._clock = clock
         self._period = round(SECOND / rate)
         self._ahead = ahead
-        self._due: int | None = None
+        self._behind: int | None = None
+        """The next instant is the grid's first one behind this."""
 
     async def next(self) -> int:
-        """Wait for the next instant of the grid, at once the first time.
+        """Wait for the next instant of the grid, at once the first time; the second one is half a period off at least.
 
         Returns:
             When it was due, ns.
         """
         now = self._clock.now()
-        if self._due is None:
-            self._due = now - now % MILLISECOND
+        if self._behind is None:
+            due = now - now % MILLISECOND
+            self._behind = due + self._period // 2
         else:
-            behind = max(self._due, now - MILLISECOND)
-            self._due = behind + self._period - (behind + self._ahead) % self._period
-        await self._clock.sleep_until(self._due)
-        return self._due
+            behind = max(self._behind, now - MILLISECOND)
+            self._behind = due = behind + self._period - (behind + self._ahead) % self._period
+        await self._clock.sleep_until(due)
+        return due

@@ -3,7 +3,6 @@ import asyncio
 import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
-from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT, HEALTH, ODOMETRY, POSE, Writer
@@ -101,20 +100,91 @@ def test_after_a_failure_the_rest_is_delivered_all_the_same():
     assert found == list(range(ROW + 1))
 
 
-def test_a_message_that_cannot_be_encoded_costs_no_other_one():
+def test_what_was_sent_while_a_row_failed_leaves_in_the_next_turn():
+    found = []
+
+    async def main(clock):
+        def deliver(row):
+            found.extend(at for _, _, at in row)
+            if found == [0]:
+                outgoing.send(EVENT, None, 1)
+                raise OSError("full")
+
+        outgoing = Outgoing(0.0, deliver)
+        with pytest.raises(OSError, match="full"):
+            outgoing.send(EVENT, None, 0)
+        assert found == [0]
+        await asyncio.sleep(0)
+
+    run_virtual(main)
+    assert found == [0, 1]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        lambda bus: bus.publisher(ODOMETRY, Writer.ESTIMATION).put(gate_state(1)),
+        lambda bus: bus.event_sink()(Reason.INTERNAL, Severity.ERROR, "disk", "odd file name \udc80"),
+    ],
+)
+def test_a_message_that_cannot_be_encoded_costs_no_other_one(bad):
     async def main(clock):
         asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
         bus = Bus(clock, 0.02)
-        bus.tap(lambda _t, message, *_: got.append(message.seq), [ODOMETRY])
-        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
-        for message in (odometry(0), gate_state(1), odometry(2)):
-            out.put(message)
+        bus.tap(lambda _t, message, *_: got.append(message.seq), [POSE, ODOMETRY, EVENT])
+        out = bus.publisher(POSE, Writer.ESTIMATION)
+        out.put(odometry(0))
+        try:
+            bad(bus)
+        except ValueError as error:
+            errors.append(error)
+        out.put(odometry(2))
         await clock.sleep(0.1)
 
     got, errors = [], []
     run_virtual(main)
     assert got == [0, 2]
-    assert [type(error) for error in errors] == [InputError]
+    assert len(errors) == 1
+
+
+def test_a_bug_of_a_tap_costs_neither_its_other_messages_nor_other_taps():
+    def broken(_topic, message, *_):
+        got.append(("broken", message.seq))
+        if message.seq == 0:
+            raise OSError("no memory")
+
+    async def main(clock):
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
+        bus = Bus(clock, 0.02)
+        bus.tap(broken, [ODOMETRY])
+        bus.tap(lambda _topic, message, *_: got.append(("sound", message.seq)), [ODOMETRY])
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        for number in range(2):
+            out.put(odometry(number))
+        await clock.sleep(0.1)
+
+    got, errors = [], []
+    run_virtual(main)
+    assert got == [("broken", 0), ("broken", 1), ("sound", 0), ("sound", 1)]
+    assert [str(error) for error in errors] == ["no memory"]
+
+
+def test_a_tap_that_ends_in_the_middle_of_a_row_gets_no_more_of_it():
+    async def main(clock):
+        def once(_topic, message, *_):
+            got.append(message.seq)
+            tap.close()
+
+        bus = Bus(clock, 0.02)
+        tap = bus.tap(once, [ODOMETRY])
+        out = bus.publisher(ODOMETRY, Writer.ESTIMATION)
+        for number in range(3):
+            out.put(odometry(number))
+        await clock.sleep(0.1)
+
+    got = []
+    run_virtual(main)
+    assert got == [0]
 
 
 def test_each_tap_gets_a_row_before_what_it_makes_others_publish():

@@ -57,6 +57,16 @@ def test_memory_is_bounded_and_pictures_go_first():
     assert max(len(entry.payload) for entry in ring.snapshot()) == 10 * limit
 
 
+def test_pictures_that_are_thinned_out_keep_to_the_limit_too():
+    limit = 1_000_000
+    ring = Ring(SPAN, limit)
+    for number in range(600):
+        ring.add(picture(number * SECOND // 15))
+        assert ring.size <= limit
+    ring.snapshot()
+    assert ring.size <= limit
+
+
 def test_an_empty_ring_gives_nothing():
     snapshot = Ring(SPAN, 1000).snapshot()
     assert (len(snapshot), list(snapshot)) == (0, [])

@@ -1,9 +1,10 @@
 import asyncio
+from itertools import pairwise
 
 import pytest
 
 from monstertruck_runtime.clock import MILLISECOND, SECOND, run_virtual, run_wall
-from monstertruck_runtime.schedule import AHEAD, Schedule
+from monstertruck_runtime.schedule import AHEAD, ESTIMATES, Schedule
 
 TENTH = SECOND // 10
 
@@ -47,8 +48,35 @@ def test_services_that_began_at_different_times_wake_together_ahead_of_the_gate(
         [20 - ahead, 40 - ahead],
         [20 - ahead, 40 - ahead],
         [40 - ahead, 80 - ahead],
-        [20, 40],
+        [40, 60],
     ]
+
+
+def test_whose_estimates_others_use_comes_before_them():
+    async def main(clock):
+        schedules = Schedule(clock, 50, ESTIMATES), Schedule(clock, 50), Schedule(clock, 50, ahead=0)
+        for schedule in schedules:
+            await schedule.next()
+        return [await schedule.next() for schedule in schedules]
+
+    estimate, other, gate = run_virtual(main)
+    assert estimate < other < gate <= estimate + 10 * MILLISECOND
+
+
+@pytest.mark.parametrize("rate", [1, 3, 15, 30, 50, 400])
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.49, 0.51, 0.999])
+def test_no_two_instants_come_in_quick_succession(rate, fraction):
+    async def main(clock):
+        await clock.sleep(fraction / rate)
+        schedule = Schedule(clock, rate)
+        first = await schedule.next()
+        times = [first] + [(await schedule.next(), clock.now())[1] for _ in range(4)]
+        return [later - earlier for earlier, later in pairwise(times)]
+
+    steps = run_virtual(main, start=SECOND + 333_333_320)
+    period = SECOND / rate
+    assert 0.49 * period <= steps[0] <= 1.5 * period + MILLISECOND
+    assert steps[1:] == pytest.approx([period] * 3, abs=2)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.0002, 0.0007, 0.0031])
