@@ -48,9 +48,11 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; it is deep enough for the largest message.
+    No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
     transport: dict[str, Any] = {
         "unicast": {"max_sessions": config.max_sessions},
+        "shared_memory": {"enabled": False},
         "link": {
             "tx": {"queue": {"size": {"data": 16}, "congestion_control": {"drop": {"wait_before_drop": 0}}}},
         },

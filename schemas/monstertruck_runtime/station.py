@@ -54,16 +54,15 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
         "mode": "client",
         "connect": {"endpoints": [endpoint], "timeout_ms": round(timeout * 1000), "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}},
     }
     if tls is not None:
-        config["transport"] = {
-            "link": {
-                "tls": {
-                    "root_ca_certificate": str(tls.ca),
-                    "connect_certificate": str(tls.certificate),
-                    "connect_private_key": str(tls.key),
-                    "enable_mtls": True,
-                }
+        config["transport"]["link"] = {
+            "tls": {
+                "root_ca_certificate": str(tls.ca),
+                "connect_certificate": str(tls.certificate),
+                "connect_private_key": str(tls.key),
+                "enable_mtls": True,
             }
         }
     return config

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from monstertruck_runtime import wire
+from monstertruck_runtime import station, wire
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import BusyError, ConfigError
@@ -38,6 +38,19 @@ def raw_session(endpoint: str) -> zenoh.Session:
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
     return zenoh.open(config)
+
+
+GRID = Grid(
+    stamp=0,
+    received=0,
+    seq=0,
+    frame="map",
+    resolution=0.05,
+    width=400,
+    height=400,
+    origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
+    cells=np.zeros(160_000, dtype=np.int8),
+)
 
 
 def put(station: zenoh.Session, key: str, payload: bytes) -> None:
@@ -76,6 +89,22 @@ async def test_state_leaves_with_the_recorders_bytes_and_its_encoding():
     assert wire.decode(POSE, got[7][0]) == odometry(7)
 
 
+async def test_large_messages_take_no_shared_memory():
+    def shared() -> set[str]:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+        return {line.split()[-1] for line in lines if "/dev/shm/" in line}
+
+    before, got = shared(), []
+    async with running_robot() as robot:
+        dial = json.dumps(station.session_config(robot.endpoint, 3.0, None))
+        with zenoh.open(zenoh.Config.from_json5(dial)) as reader:
+            reader.declare_subscriber("mt/truck/state/map", got.append)
+            await asyncio.sleep(0.1)
+            robot.bus.publisher(MAP, Writer.ESTIMATION).put(GRID)
+            await eventually(lambda: got)
+            assert shared() == before
+
+
 async def test_a_frozen_reader_never_slows_the_truck():
     code = """
         import json, sys, zenoh
@@ -85,17 +114,6 @@ async def test_a_frozen_reader_never_slows_the_truck():
             for _ in samples:
                 pass
     """
-    grid = Grid(
-        stamp=0,
-        received=0,
-        seq=0,
-        frame="map",
-        resolution=0.05,
-        width=400,
-        height=400,
-        origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
-        cells=np.zeros(160_000, dtype=np.int8),
-    )
     async with running_robot() as robot:
         publisher = robot.bus.publisher(MAP, Writer.ESTIMATION)
         with subprocess.Popen(
@@ -108,7 +126,7 @@ async def test_a_frozen_reader_never_slows_the_truck():
             took = []
             for _ in range(200):  # 32 MB, far more than any socket buffers
                 start = WallClock().now()
-                publisher.put(grid)
+                publisher.put(GRID)
                 took.append(WallClock().now() - start)
             reader.kill()
     assert sorted(took)[100] < 2_000_000
