@@ -10,6 +10,9 @@ AHEAD: Final = 4 * MILLISECOND
 ESTIMATES: Final = AHEAD + MILLISECOND
 """The same of those whose estimates the others use."""
 
+IN_THREADS: Final = -2 * MILLISECOND
+"""The same of those that work in threads: behind the tick, which a thread that holds the interpreter would delay."""
+
 
 class Schedule:
     """Instants on one fixed grid. Those that were missed by a millisecond are skipped, not made up for.

@@ -9,7 +9,7 @@ from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.sensor import Battery, DriveFeedback
 
@@ -63,7 +63,7 @@ class IioBatteryDriver:
         channel = await self._offload(self._find)
         await self._offload(channel.read)
         ready()
-        schedule = Schedule(self._clock, self._config.rate)
+        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
         misses = 0
         while True:
             await schedule.next()

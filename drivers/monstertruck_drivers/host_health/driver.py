@@ -8,7 +8,7 @@ from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import Disk, Reading, busy_share, disk_of, read_host
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_runtime.thresholds import Alarm, Threshold
 from monstertruck_schemas.event import Severity
@@ -69,7 +69,7 @@ class HostHealthDriver:
             DeviceError: /proc cannot be read, or the disk cannot be asked.
             ProtocolError: /proc is not as documented.
         """
-        schedule = Schedule(self._clock, self._config.rate)
+        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
         while True:
             await schedule.next()
             stamp = self._clock.now()

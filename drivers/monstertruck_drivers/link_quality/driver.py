@@ -8,7 +8,7 @@ from monstertruck_drivers.link_quality.interfaces import Sample, choose, read_in
 from monstertruck_drivers.link_quality.judge import LinkJudge
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
@@ -61,7 +61,7 @@ class LinkQualityDriver:
 
     async def run(self, ready: Ready) -> None:
         """Look for ever; nothing the kernel says or leaves unsaid ends the session."""
-        schedule = Schedule(self._clock, self._config.rate)
+        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
         while True:
             await schedule.next()
             stamp = self._clock.now()

@@ -4,7 +4,7 @@ from itertools import pairwise
 import pytest
 
 from monstertruck_runtime.clock import MILLISECOND, SECOND, run_virtual, run_wall
-from monstertruck_runtime.schedule import AHEAD, ESTIMATES, Schedule
+from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, Schedule
 
 TENTH = SECOND // 10
 
@@ -52,15 +52,16 @@ def test_services_that_began_at_different_times_wake_together_ahead_of_the_gate(
     ]
 
 
-def test_whose_estimates_others_use_comes_before_them():
+def test_estimates_come_before_who_uses_them_and_threads_behind_the_gate():
     async def main(clock):
-        schedules = Schedule(clock, 50, ESTIMATES), Schedule(clock, 50), Schedule(clock, 50, ahead=0)
+        schedules = [Schedule(clock, 50, ahead) for ahead in (ESTIMATES, AHEAD, 0, IN_THREADS)]
         for schedule in schedules:
             await schedule.next()
         return [await schedule.next() for schedule in schedules]
 
-    estimate, other, gate = run_virtual(main)
-    assert estimate < other < gate <= estimate + 10 * MILLISECOND
+    estimate, other, gate, thread = run_virtual(main, start=SECOND - 10 * MILLISECOND)
+    assert gate % (20 * MILLISECOND) == 0
+    assert estimate < other < gate < thread <= estimate + 10 * MILLISECOND
 
 
 @pytest.mark.parametrize("rate", [1, 3, 15, 30, 50, 400])
