@@ -60,8 +60,14 @@ class WatchedLoop(uvloop.Loop):
                 found.append((time.monotonic_ns(), used, _name(callback)))
 
         def through(method: Callable[..., Any], before: int) -> Callable[..., Any]:
-            """``method`` whose callback, behind so many other arguments, is measured."""
-            return lambda *args, **options: method(*args[:before], measured, *args[before:], **options)
+            """``method`` whose callback, behind so many other arguments, is measured; once, if it uses another one."""
+
+            def call(*args: Any, **options: Any) -> Any:
+                if args[before] is measured:
+                    return method(*args, **options)
+                return method(*args[:before], measured, *args[before:], **options)
+
+            return call
 
         for fd, (callback, args) in self._readers.items():
             super().add_reader(fd, measured, callback, *args)
