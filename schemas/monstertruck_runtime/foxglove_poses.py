@@ -3,12 +3,17 @@
 As with scans, such code runs from cold caches, and what counts is how little of it there is.
 """
 
-import math
 import struct
 from functools import lru_cache
 from typing import Final
 
-from monstertruck_runtime.foxglove_layouts import FRAME_TRANSFORM, POSE_IN_FRAME, write_stamp
+from monstertruck_runtime.foxglove_layouts import (
+    FRAME_TRANSFORM,
+    IDENTITY,
+    POSE_IN_FRAME,
+    planar_pose,
+    write_stamp,
+)
 from monstertruck_runtime.protobuf import delimited, varint
 from monstertruck_schemas.state import Odometry, Transform
 
@@ -18,15 +23,11 @@ _TEXTS: Final = 64
 _POSE: Final = {row.name: row.tag for row in POSE_IN_FRAME.fields}
 _TRANSFORM: Final = {row.name: row.tag for row in FRAME_TRANSFORM.fields}
 
-_POSITION: Final = _POSE["pose"] + b"\x28\x0a\x12\x09"
-"""The planar pose's 40 bytes begin with 18 of the position, whose x is a double."""
-_ORIENTATION: Final = b"\x12\x12\x19"
-"""18 bytes, of which z is the first double."""
+_BEFORE_POSE: Final = _POSE["pose"] + varint(len(IDENTITY))
+_BEFORE_SEQ: Final = struct.Struct("<{}sq{}s".format(*map(len, (_POSE["received"], _POSE["seq"]))))
 _THREE: Final = varint(3 * 8)
 _NINE: Final = varint(9 * 8)
 # fmt: off
-_BEGIN: Final = (_POSITION, _ORIENTATION, _POSE["received"], _POSE["seq"])
-_BEGIN_ROW: Final = struct.Struct("<{}sdBd{}sdBd{}sq{}s".format(*map(len, _BEGIN)))
 _END: Final = (
     _POSE["pose2d"] + _THREE, _POSE["twist2d"] + _THREE, _POSE["pose_covariance"] + _NINE,
     _POSE["twist_covariance"] + _NINE, _POSE["age"],
@@ -42,19 +43,14 @@ def encode_odometry(odometry: Odometry) -> bytes:
     """Serialize ``odometry`` as ``POSE_IN_FRAME``."""
     pose, twist = odometry.pose, odometry.twist
     x, y, yaw = pose.x, pose.y, pose.yaw
-    half = yaw / 2
     stamp = write_stamp(odometry.stamp)
     frame, child, sources = _names(odometry.frame, odometry.child, odometry.sources)
-    position, orientation, received, seq = _BEGIN
     pose2d, twist2d, pose_covariance, twist_covariance, age = _END
     # fmt: off
     return b"".join((
         _POSE["timestamp"], varint(len(stamp)), stamp, frame,
-        _BEGIN_ROW.pack(
-            position, x, 0x11, y, orientation, math.sin(half), 0x21, math.cos(half),
-            received, odometry.received, seq,
-        ),
-        varint(odometry.seq), child,
+        _BEFORE_POSE, planar_pose(x, y, yaw),
+        _BEFORE_SEQ.pack(_POSE["received"], odometry.received, _POSE["seq"]), varint(odometry.seq), child,
         _END_ROW.pack(
             pose2d, x, y, yaw, twist2d, twist.vx, twist.vy, twist.wz,
             pose_covariance, odometry.pose_covariance.tobytes(),
