@@ -31,6 +31,7 @@ from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.demo.wall import connect
+from monstertruckd.memory import settle
 
 BEAMS = 682
 RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)
@@ -127,7 +128,7 @@ async def raw(
 
 async def pings(put: Callable[[int], None], receive: Callable[[], Awaitable[object]]) -> None:
     """Serve the commands on standard input."""
-    await asyncio.sleep(3.0)  # until the other end has subscribed
+    await asyncio.sleep(3.0)  # until the other end has subscribed and settled
     print("ready", flush=True)
     while words := (await asyncio.to_thread(sys.stdin.readline)).split():
         count, rate = int(words[0]), float(words[1])
@@ -149,6 +150,7 @@ async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> N
     """Play one end until standard input ends (ping) or for ever (echo)."""
     payload = wire.encode(SCAN, scan(0, time.monotonic_ns()))
     async with AsyncExitStack() as stack:
+        asyncio.get_running_loop().call_later(1.5, settle)  # as the daemon does
         if kind == "typed":
             put, receive = await stack.enter_async_context(typed(me, here, there))
             if me == "ping":

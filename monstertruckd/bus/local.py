@@ -6,8 +6,9 @@ of them.
 """
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from monstertruck_runtime import wire
@@ -61,6 +62,16 @@ class Tap:
         self._bus.untap(self)
 
 
+@dataclass(slots=True)
+class _ReadEnds:
+    """Who gets the messages of one topic."""
+
+    listeners: list[Callable[[Any], object]] = field(default_factory=list)
+    mailboxes: tuple[Mailbox[Any], ...] = ()
+    """Replaced when one comes or goes, never changed: a message may be on its way to them."""
+    taps: int = 0
+
+
 class Bus:
     """Topics of one daemon.
 
@@ -76,10 +87,8 @@ class Bus:
         self._clock = clock
         self._outgoing = Outgoing(gather_seconds, self._tell_taps)
         self._claimed: set[str] = set()
-        self._listeners: defaultdict[str, list[Callable[[Any], object]]] = defaultdict(list)
-        self._readers: defaultdict[str, list[Mailbox[Any]]] = defaultdict(list)
+        self._ends: defaultdict[str, _ReadEnds] = defaultdict(_ReadEnds)
         self._taps: list[Tap] = []
-        self._tapped: Counter[str] = Counter()
         self._retained: dict[str, tuple[Topic[Any], Any]] = {}
         self._drops = 0
         self._events = LocalPublisher(self, EVENT)
@@ -114,14 +123,14 @@ class Bus:
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
         """A read end of ``topic``; of a retained topic it holds the newest message at once."""
         mailbox: Mailbox[M] = Mailbox(delivery, lambda closed: self._forget(topic.name, closed))
-        self._readers[topic.name].append(mailbox)
+        self._ends[topic.name].mailboxes += (mailbox,)
         if (newest := self.newest(topic)) is not None:
             mailbox.put(newest)
         return mailbox
 
     def listen(self, topic: Topic[M], listener: Callable[[M], object]) -> None:
         """Call ``listener``, which must not block, with every message of ``topic``: no queue, so none is ever lost."""
-        self._listeners[topic.name].append(listener)
+        self._ends[topic.name].listeners.append(listener)
 
     def newest(self, topic: Topic[M]) -> M | None:
         """Newest message of a retained topic; None before the first, and for every other topic."""
@@ -142,7 +151,8 @@ class Bus:
         chosen = tuple(topics)
         tap = Tap(self, callback, frozenset(topic.name for topic in chosen))
         self._taps.append(tap)
-        self._tapped.update(tap.topics)
+        for name in tap.topics:
+            self._ends[name].taps += 1
         for topic, message, data in self.retained():
             if topic.name in tap.topics:
                 callback(topic, message, data, self._clock.now())
@@ -162,7 +172,7 @@ class Bus:
     @property
     def drops(self) -> int:
         """Messages lost in bounded queues since the start: all FIFO subscriptions, and what ``add_drops`` told."""
-        return self._drops + sum(mailbox.drops for readers in self._readers.values() for mailbox in readers)
+        return self._drops + sum(mailbox.drops for ends in self._ends.values() for mailbox in ends.mailboxes)
 
     def add_drops(self, count: int) -> None:
         """Count losses in a queue of someone else."""
@@ -170,14 +180,14 @@ class Bus:
 
     def hand_over(self, topic: Topic[M], message: M) -> None:
         """Deliver to listeners, readers and taps; called by the topic's own write end."""
-        name = topic.name
         if topic.retained:
-            self._retained[name] = (topic, message)
-        for listener in self._listeners[name]:
+            self._retained[topic.name] = (topic, message)
+        ends = self._ends[topic.name]
+        for listener in ends.listeners:
             listener(message)
-        for mailbox in tuple(self._readers[name]):
+        for mailbox in ends.mailboxes:
             mailbox.put(message)
-        if self._tapped[name]:
+        if ends.taps:
             self._outgoing.send(topic, message, self._clock.now())
 
     def untap(self, tap: Tap) -> None:
@@ -185,7 +195,8 @@ class Bus:
         self._outgoing.flush()
         if tap in self._taps:
             self._taps.remove(tap)
-            self._tapped.subtract(tap.topics)
+            for name in tap.topics:
+                self._ends[name].taps -= 1
             tap.topics = frozenset()
 
     def _tell_taps(self, row: Sequence[Sent]) -> None:
@@ -220,7 +231,8 @@ class Bus:
 
     def _forget(self, name: str, mailbox: Mailbox[Any]) -> None:
         self._drops += mailbox.drops
-        self._readers[name].remove(mailbox)
+        ends = self._ends[name]
+        ends.mailboxes = tuple(other for other in ends.mailboxes if other is not mailbox)
 
     def _emit(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
         now = self._clock.now()

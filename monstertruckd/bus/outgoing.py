@@ -4,7 +4,6 @@ The code that encodes, records and puts is then in the caches, and each row wake
 """
 
 import asyncio
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -34,7 +33,7 @@ class Outgoing:
     def __init__(self, seconds: float, deliver: Callable[[Sequence[Sent]], None]) -> None:
         self._period = round(seconds * SECOND)
         self._deliver = deliver
-        self._waiting: deque[Sent] = deque()
+        self._waiting: list[Sent] = []
         self._delivering = False
         self._timer: asyncio.Handle | None = None
 
@@ -69,8 +68,8 @@ class Outgoing:
             self._timer = asyncio.get_running_loop().call_later(0.0, self._due) if self._waiting else None
 
     def _next_row(self) -> None:
-        waiting = self._waiting
-        row = [waiting.popleft() for _ in range(min(ROW, len(waiting)))]
+        row = self._waiting[:ROW]
+        del self._waiting[:ROW]
         self._delivering = True
         try:
             self._deliver(row)

@@ -73,7 +73,8 @@ class Mailbox(Generic[M]):
         if self._counted and len(self._unread) == self._unread.maxlen:
             self._drops += 1
         self._unread.append(message)
-        self._wake()
+        if self._reader is not None:
+            _answer(self._reader, True)
 
     async def next(self) -> M:
         """Wait for a message not returned by ``next`` yet.
@@ -81,9 +82,11 @@ class Mailbox(Generic[M]):
         Raises:
             RuntimeError: the mailbox is closed, or another task already waits on it.
         """
-        if not await self._arrival():
-            msg = "the subscription is closed"
-            raise RuntimeError(msg)
+        while not self._unread:
+            if self._closed:
+                msg = "the subscription is closed"
+                raise RuntimeError(msg)
+            await self._news()
         return self._unread.popleft()
 
     async def next_within(self, seconds: float) -> M | None:
@@ -91,10 +94,9 @@ class Mailbox(Generic[M]):
 
         A timer costs much less than a deadline, which has to cancel its task.
         """
-        loop = asyncio.get_running_loop()
-        due = loop.time() + max(seconds, 0.0)
+        due = asyncio.get_running_loop().time() + max(seconds, 0.0)
         while not self._unread and not self._closed:
-            if not await self._news(loop, due):
+            if not await self._news(due):
                 return None
         return await self.next()
 
@@ -110,21 +112,16 @@ class Mailbox(Generic[M]):
             return
         self._closed = True
         self._unread.clear()
-        self._wake()
+        if self._reader is not None:
+            _answer(self._reader, True)
         self._on_close(self)
 
-    async def _arrival(self) -> bool:
-        """Wait until a message is unread; False if the mailbox is closed."""
-        loop = asyncio.get_running_loop()
-        while not self._unread and not self._closed:
-            await self._news(loop)
-        return not self._closed
-
-    async def _news(self, loop: asyncio.AbstractEventLoop, due: float | None = None) -> bool:
+    async def _news(self, due: float | None = None) -> bool:
         """Wait for the next message or the end; False if ``due``, loop time, came first."""
         if self._reader is not None:
             msg = "a subscription has one reader; subscribe again for another"
             raise RuntimeError(msg)
+        loop = asyncio.get_running_loop()
         reader: asyncio.Future[bool] = loop.create_future()
         self._reader = reader
         alarm = None if due is None else loop.call_at(due, _answer, reader, False)
@@ -135,16 +132,14 @@ class Mailbox(Generic[M]):
             if alarm is not None:
                 alarm.cancel()
 
-    def _wake(self) -> None:
-        if self._reader is not None:
-            _answer(self._reader, True)
-
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> M:
-        if not await self._arrival():
-            raise StopAsyncIteration
+        while not self._unread:
+            if self._closed:
+                raise StopAsyncIteration
+            await self._news()
         return self._unread.popleft()
 
     def __enter__(self) -> Self:

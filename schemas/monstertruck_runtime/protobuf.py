@@ -187,11 +187,11 @@ class Layout:
 
 def varint(value: int) -> bytes:
     """Base-128 form of ``value``; negative numbers as 64-bit two's complement."""
-    if 0 <= value < 0x80:
-        return _SHORT[value]
-    if 0 <= value < 0x4000:
-        return bytes((value & 0x7F | 0x80, value >> 7))
     if 0 <= value < 0x8_0000_0000:
+        if value < 0x80:
+            return _SHORT[value]
+        if value < 0x4000:
+            return bytes((value & 0x7F | 0x80, value >> 7))
         groups = value & 0x7F | value << 1 & 0x7F00 | value << 2 & 0x7F_0000 | value << 3 & 0x7F00_0000
         count = (value.bit_length() + 6) // 7
         return _FIVE.pack(groups | value << 4 & 0x7F_0000_0000 | _CONTINUED[count])[:count]

@@ -4,6 +4,7 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 (map > odom > base > sensors). A value that is absent is ``None``, never NaN.
 """
 
+from functools import cache
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -45,10 +46,16 @@ def assembled(model: type[S], values: dict[str, Any]) -> S:
     """
     record = object.__new__(model)
     _set_values(record, values)
-    _set_given(record, set(values))
+    _set_given(record, _all_given(model))
     _set_extra(record, None)
     _set_private(record, None)
     return record
+
+
+@cache
+def _all_given(model: type[Schema]) -> set[str]:
+    """Names of all fields; one set serves all records, for a frozen one's never changes."""
+    return set(model.model_fields)
 
 
 # A record refuses to be written to; its own descriptors are the shortest way round that.

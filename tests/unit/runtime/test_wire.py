@@ -179,6 +179,22 @@ def test_values_beyond_the_limits_are_refused_in_a_known_shape(old, new, field):
         wire.decode(t.SCAN, data.replace(old, new))
 
 
+def test_scans_of_several_devices_are_read_without_the_layout_once_each_is_known():
+    devices = [scan(), scan(ranges=[1.0], codes=[255]), scan(range_max=30.0, tilt=0.5)]
+    datas = [wire.encode(t.SCAN, message) for message in devices]
+    assert [wire.decode(t.SCAN, data) for data in datas] == devices
+    with mock.patch.object(foxglove_scan, "_decode_any", side_effect=AssertionError):
+        assert [wire.decode(t.SCAN, data) for data in datas] == devices
+
+
+def test_devices_whose_scans_are_of_one_size_are_told_apart():
+    devices = [scan(), scan(range_max=30.0), scan(frame="other"), scan(start_angle=-0.0), scan(start_angle=0.0)]
+    for message in devices * 2:
+        again = wire.decode(t.SCAN, wire.encode(t.SCAN, message))
+        assert again == message
+        assert str(again.start_angle) == str(message.start_angle)
+
+
 def test_stock_reader_sees_the_standard_scan():
     message = stock(t.SCAN, wire.encode(t.SCAN, scan()))
     assert (message.timestamp.seconds, message.timestamp.nanos) == (1_700_000_000, 123_456_789)
