@@ -16,7 +16,7 @@ import numpy as np
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
-from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.scope import Scope, scope
 from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
@@ -104,6 +104,8 @@ class Daemon:
         self._body = Body.of(config)
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
+        self.bus.listen(topics.REQ_DRIVE, self.gate.request)
+        self.bus.listen(topics.PLAN_DRIVE, self.gate.wish)
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
@@ -284,8 +286,6 @@ class Daemon:
             config.gate.rate,
             self.clock,
             GateInputs(
-                requests=bus.subscribe(topics.REQ_DRIVE, fifo(16)),
-                wishes=bus.subscribe(topics.PLAN_DRIVE, fifo(16)),
                 scan=bus.subscribe(topics.SCAN, latest()),
                 attitude=bus.subscribe(topics.COMPASS, latest()),
                 drives=tuple(bus.subscribe(topic, latest()) for topic in DRIVES[:shafts]),

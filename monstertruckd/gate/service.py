@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -27,6 +27,8 @@ from monstertruckd.gate.stops import Trip
 
 log = logging.getLogger(__name__)
 
+M = TypeVar("M")
+
 STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` goes out on every change and at least this often, ns."""
 
@@ -36,12 +38,8 @@ LATCH_RETRY: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """What the gate reads: requests as FIFOs, sensors by their newest message. Orders come by ``control``."""
+    """What the gate reads, by the newest message. Requests, wishes and orders are told it as they come."""
 
-    requests: Subscription[DriveRequest]
-    """``req/drive``."""
-    wishes: Subscription[DriveRequest]
-    """``plan/drive``."""
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
     drives: tuple[Subscription[DriveFeedback], ...]
@@ -93,7 +91,6 @@ class GateService:
         self._gate = gate
         self._rate = rate
         self._clock = clock
-        self._inputs = inputs
         self._outputs = outputs
         self._events = events
         self._black_box = black_box
@@ -105,6 +102,7 @@ class GateService:
         """What is on the disk; None while it is being written."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
+        self._bug: Exception | None = None
         self._told: tuple[object, ...] = ()
         self._told_at = 0
         self._feeds: list[_Feed] = [
@@ -131,7 +129,15 @@ class GateService:
 
     def control(self, order: ControlRequest) -> Reason:
         """Carry out an order at once, before any queue could lose it; see ``Gate.control``."""
-        return self._gate.control(order, self._clock.now())
+        return self._taken(self._gate.control, order)
+
+    def request(self, request: DriveRequest) -> Reason:
+        """Take a drive request from outside, at once; see ``Gate.request``."""
+        return self._taken(self._gate.request, request)
+
+    def wish(self, request: DriveRequest) -> Reason:
+        """Take one of the robot's own planners, at once; see ``Gate.wish``."""
+        return self._taken(self._gate.wish, request)
 
     def observe_event(self, event: Event) -> None:
         """Take any service's event at once: it may be what is behind a stop."""
@@ -141,12 +147,18 @@ class GateService:
         """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
+    def _taken(self, take: Callable[[M, int], Reason], message: M) -> Reason:
+        """A bug in here ends this service, at its next tick, and not whoever sent ``message``."""
+        try:
+            return take(message, self._clock.now())
+        except Exception as bug:  # noqa: BLE001  # raised by the tick
+            self._bug = bug
+            return Reason.INTERNAL
+
     async def run(self, ready: Ready) -> None:
         """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk."""
         try:
             async with asyncio.TaskGroup() as group:
-                group.create_task(self._take_requests(), name="gate requests")
-                group.create_task(self._take_wishes(), name="gate wishes")
                 group.create_task(self._keep_latch(), name="gate latch")
                 try:
                     await self._tick_for_ever(ready)
@@ -159,20 +171,14 @@ class GateService:
         schedule = Schedule(self._clock, self._rate, ahead=0)
         while True:
             due = await schedule.next()
+            if self._bug is not None:
+                raise self._bug
             now = self._clock.now()
             self._meter.record((now - due) / SECOND)
             for feed in self._feeds:
                 feed.poll()
             self._publish(self._gate.tick(now), now)
             ready()
-
-    async def _take_requests(self) -> None:
-        while True:
-            self._gate.request(await self._inputs.requests.next(), self._clock.now())
-
-    async def _take_wishes(self) -> None:
-        while True:
-            self._gate.wish(await self._inputs.wishes.next(), self._clock.now())
 
     def _publish(self, output: GateOutput, now: int) -> None:
         steering = self._outputs.steering

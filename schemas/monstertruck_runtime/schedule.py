@@ -10,6 +10,9 @@ AHEAD: Final = 4 * MILLISECOND
 ESTIMATES: Final = AHEAD + MILLISECOND
 """The same of those whose estimates the others use."""
 
+QUESTIONS: Final = ESTIMATES + 3 * MILLISECOND
+"""The same of those who ask a device: its answer is there when the estimates are made."""
+
 IN_THREADS: Final = -2 * MILLISECOND
 """The same of those that work in threads: behind the tick, which a thread that holds the interpreter would delay."""
 
@@ -34,11 +37,13 @@ class Schedule:
         """The next instant is the grid's first one behind this."""
 
     async def next(self) -> int:
-        """Wait for the next instant of the grid, at once the first time; the second one is half a period off at least.
+        """Wait for the next instant; returns when it was due, ns."""
+        due = self.step()
+        await self._clock.sleep_until(due)
+        return due
 
-        Returns:
-            When it was due, ns.
-        """
+    def step(self) -> int:
+        """The next instant of the grid, ns, at once the first time; the second one is half a period off at least."""
         now = self._clock.now()
         if self._behind is None:
             due = now - now % MILLISECOND
@@ -46,5 +51,4 @@ class Schedule:
         else:
             behind = max(self._behind, now - MILLISECOND)
             self._behind = due = behind + self._period - (behind + self._ahead) % self._period
-        await self._clock.sleep_until(due)
         return due

@@ -10,6 +10,7 @@ from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import StabiliserFeedback, TorqueState
 
@@ -92,17 +93,15 @@ class Ax12Driver:
             joint.tell_absent(why)
 
     async def _serve(self, session: Session) -> None:
-        period = round(SECOND / self._config.rate)
-        due = self._clock.now()
+        schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
         while True:
-            await self._follow(session, due)
+            await self._follow(session, schedule.step())
             asked = self._clock.now()
             for joint in self._joints:
                 await joint.poll(session)
             if all(joint.torque is TorqueState.ABSENT for joint in self._joints):
                 raise DeviceTimeoutError(f"{self._port.name}: no unit answers any more: is the 12 V rail down?")
             self._publish(asked)
-            due = max(due + period, self._clock.now())
 
     async def _follow(self, session: Session, until: int) -> None:
         """Pass goals on as they come."""

@@ -31,6 +31,7 @@ from monstertruck_runtime.errors import (
     WrongDeviceError,
 )
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.cmd import DriveCommand
 from monstertruck_schemas.event import Severity
@@ -193,15 +194,15 @@ class _Session:
 
     async def serve(self, ready: Ready) -> None:
         """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
-        tick, failures, told_ready = self._clock.now(), 0, False
+        schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
+        failures, told_ready = 0, False
         while True:
             try:
                 await self._cycle()
                 if not told_ready and self._state not in FAULTED:
                     told_ready = True
                     ready()
-                tick = max(tick + int(SECOND / self._config.rate), self._clock.now())
-                await self._idle(tick)
+                await self._idle(schedule.step())
             except (DeviceTimeoutError, ProtocolError):
                 failures += 1
                 if failures >= FAILURE_LIMIT:

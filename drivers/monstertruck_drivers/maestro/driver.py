@@ -11,6 +11,7 @@ from monstertruck_drivers.maestro.session import Session
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -106,18 +107,16 @@ class MaestroDriver:
                     session.send(*self._line(session, high=False))
 
     async def _serve(self, session: Session) -> None:
-        period = round(SECOND / self._config.poll_rate)
+        schedule = Schedule(self._clock, self._config.poll_rate, QUESTIONS)
         every = max(1, round(self._config.poll_rate / self._config.battery_rate))
-        due = self._clock.now()
         cycle = 0
         while True:
-            await self._follow(session, due)
+            await self._follow(session, schedule.step())
             session.require_link()
             self._watch(session)
             if self._fresh or self._command is None or self._config.deadman_feed == "always":
                 await self._poll(session, self._battery if cycle % every == 0 else None)
             cycle += 1
-            due = max(due + period, self._clock.now())
 
     async def _follow(self, session: Session, until: int) -> None:
         """Pass commands on as they come."""

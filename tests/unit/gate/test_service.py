@@ -55,14 +55,11 @@ class Bench:
     def __init__(self, clock, latch=None):
         self.clock = clock
         self.latch = latch or MemoryLatch()
-        self.requests, self.wishes = Inbox(), Inbox()
         self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
         self.out = GateOutputs((Outbox(),), Outbox(), Outbox(), Outbox())
         self.events = []
         self.readies = 0
         inputs = GateInputs(
-            self.requests,
-            self.wishes,
             self.scan,
             self.attitude,
             (self.drive,),
@@ -109,9 +106,9 @@ class Bench:
             )
         )
 
-    def wish(self, inbox, role):
+    def ask(self, take, role):
         now = self.clock.now()
-        inbox.send(
+        return take(
             DriveRequest(
                 **header(now, now),
                 source=role.value,
@@ -180,10 +177,10 @@ def test_requests_of_both_kinds_reach_the_gate():
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.mode is GateMode.ARMED
-        bench.wish(bench.wishes, Role.TRACKER)
+        assert bench.ask(bench.service.wish, Role.TRACKER) is Reason.OK
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.holder == "tracker"
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.holder == "gamepad"
         assert bench.out.drives[0].last.speed > 0
@@ -237,7 +234,7 @@ def test_the_last_commands_are_neutral():
     async def scenario(bench):
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
         await bench.clock.sleep(0.1)
         assert bench.out.drives[0].last.speed > 0
 
@@ -251,15 +248,29 @@ def test_shutting_down_stops_at_once_and_for_good():
     async def scenario(bench):
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
         await bench.clock.sleep(0.05)
         bench.service.shut_down()
         assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.DISARMED
         await bench.clock.sleep(0.2)
         assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
 
     on_bench(scenario)
+
+
+def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
+    async def main(clock):
+        for name in ("control", "request", "wish"):
+            bench = Bench(clock)
+            task = asyncio.create_task(bench.service.run(bench.ready))
+            await clock.sleep(0.1)
+            assert getattr(bench.service, name)(None) is Reason.INTERNAL
+            with pytest.raises(ExceptionGroup):
+                await task
+            assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+
+    run_virtual(main)
 
 
 def test_a_bug_ends_the_service_with_neutral_commands():
@@ -421,7 +432,7 @@ def test_a_stop_is_published_with_its_black_box_and_again_when_more_is_known():
     async def scenario(bench):
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
         await bench.clock.sleep(0.1)
         bench.order(Order.ESTOP)
         await bench.clock.sleep(0.05)
@@ -433,7 +444,7 @@ def test_a_stop_is_published_with_its_black_box_and_again_when_more_is_known():
     async def lease(bench):
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
-        bench.wish(bench.requests, Role.GAMEPAD)
+        assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
         await bench.clock.sleep(0.4)
         down = {"reason": Reason.LINK_DOWN, "severity": "warning", "source": "link", "text": "wlan0: link is down"}
         bench.service.observe_event(Event.model_validate({**header(bench.clock.now()), **down}, strict=False))
