@@ -3,6 +3,7 @@
 Inside is the very service that runs in the loop, with its mailboxes filled by hand.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -75,7 +76,7 @@ class _Slot(Generic[M]):
     async def next(self) -> M:
         raise RuntimeError("a step does not wait")
 
-    async def next_within(self, seconds: float) -> M | None:
+    async def next_within(self, seconds: float, worth: Callable[[], bool] | None = None) -> M | None:
         raise RuntimeError(f"a step does not wait {seconds} s")
 
 

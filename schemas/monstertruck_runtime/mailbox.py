@@ -48,6 +48,7 @@ class Mailbox(Generic[M]):
         self._latest: M | None = None
         self._drops = 0
         self._reader: asyncio.Future[bool] | None = None
+        self._worth: Callable[[], bool] | None = None
         self._closed = False
 
     @property
@@ -74,7 +75,10 @@ class Mailbox(Generic[M]):
             self._drops += 1
         self._unread.append(message)
         if self._reader is not None:
-            _answer(self._reader, True)
+            if self._worth is None:
+                _answer(self._reader, True)
+            else:
+                self._judge(self._reader, self._worth)
 
     async def next(self) -> M:
         """Wait for a message not returned by ``next`` yet.
@@ -89,14 +93,22 @@ class Mailbox(Generic[M]):
             await self._news()
         return self._unread.popleft()
 
-    async def next_within(self, seconds: float) -> M | None:
+    async def next_within(self, seconds: float, worth: Callable[[], bool] | None = None) -> M | None:
         """As ``next``, or None if nothing comes within ``seconds``.
 
-        A timer costs much less than a deadline, which has to cancel its task.
+        A timer costs much less than a deadline, which has to cancel its task, and a question much less than a wake-up.
+
+        Args:
+            seconds: limit.
+            worth: asked when a message comes while nobody is woken yet; if it says no, the message counts as read.
+
+        Raises:
+            RuntimeError: as ``next``.
+            Exception: what ``worth`` raised.
         """
         due = asyncio.get_running_loop().time() + max(seconds, 0.0)
         while not self._unread and not self._closed:
-            if not await self._news(due):
+            if not await self._news(due, worth):
                 return None
         return await self.next()
 
@@ -116,14 +128,14 @@ class Mailbox(Generic[M]):
             _answer(self._reader, True)
         self._on_close(self)
 
-    async def _news(self, due: float | None = None) -> bool:
+    async def _news(self, due: float | None = None, worth: Callable[[], bool] | None = None) -> bool:
         """Wait for the next message or the end; False if ``due``, loop time, came first."""
         if self._reader is not None:
             msg = "a subscription has one reader; subscribe again for another"
             raise RuntimeError(msg)
         loop = asyncio.get_running_loop()
         reader: asyncio.Future[bool] = loop.create_future()
-        self._reader = reader
+        self._reader, self._worth = reader, worth
         alarm = None if due is None else loop.call_at(due, _answer, reader, False)
         try:
             return await reader
@@ -131,6 +143,19 @@ class Mailbox(Generic[M]):
             self._reader = None
             if alarm is not None:
                 alarm.cancel()
+
+    def _judge(self, reader: "asyncio.Future[bool]", worth: Callable[[], bool]) -> None:
+        if reader.done():
+            return
+        try:
+            wanted = worth()
+        except Exception as bug:  # noqa: BLE001  # the reader's, not the writer's
+            reader.set_exception(bug)
+        else:
+            if wanted:
+                reader.set_result(True)
+            else:
+                self._unread.clear()
 
     def __aiter__(self) -> Self:
         return self

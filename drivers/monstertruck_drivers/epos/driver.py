@@ -214,8 +214,7 @@ class _Session:
 
     async def _cycle(self) -> None:
         await self._act(also_faster=True)
-        self._rpm = await self._read(od.VELOCITY_AVERAGED)
-        raw = await self._read(od.POSITION)
+        self._rpm, raw = await self._read_row(od.VELOCITY_AVERAGED, od.POSITION)
         self._publish(raw, (self._line.began + self._line.ended) // 2)
         now = self._clock.now()
         if now >= self._status_due or not settled(self._state, self._want().goal):
@@ -229,13 +228,19 @@ class _Session:
     async def _idle(self, until: int) -> None:
         """Wait for the next cycle; a command to stop is obeyed at once."""
         while (left := until - self._clock.now()) > 0:
-            if await self._driver.commands.next_within(left / SECOND) is None:
+            if await self._driver.commands.next_within(left / SECOND, self._is_urgent) is None:
                 return
             await self._act()
 
     async def _read(self, entry: Entry) -> int:
-        await self._act()
-        return await self._line.read(entry)
+        return (await self._read_row(entry))[0]
+
+    async def _read_row(self, *entries: Entry) -> list[int]:
+        values: list[int] = []
+        while len(values) < len(entries):
+            await self._act()
+            values += await self._line.read_row(entries[len(values) :], self._is_urgent)
+        return values
 
     def _publish(self, raw: int, stamp: int) -> None:
         fastest = self._config.max_motor_rpm / 60 * self._counts_per_turn
@@ -275,11 +280,19 @@ class _Session:
             self._stopping = True
             if self._state in POWERED:
                 self._state = State.QUICK_STOP
-        rpm = want.rpm if self._state is State.ENABLED else 0
+        rpm = self._target(want)
         if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
             self._sent_rpm = None  # if this fails, whether it arrived is not known
             await self._line.write(od.TARGET_VELOCITY, rpm)
             self._sent_rpm = rpm
+
+    def _is_urgent(self) -> bool:
+        """Whether there is something that must not wait."""
+        want = self._want()
+        return (want.goal is State.QUICK_STOP and not self._stopping) or _slower(self._target(want), self._sent_rpm)
+
+    def _target(self, want: Wanted) -> int:
+        return want.rpm if self._state is State.ENABLED else 0
 
     async def _look(self) -> None:
         """Read the power state and judge its changes."""

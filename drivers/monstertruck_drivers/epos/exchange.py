@@ -1,6 +1,8 @@
 """The byte handshake of the EPOS over a link: one exchange at a time, with its time-outs and recovery."""
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Any, TypeVar
 
 from monstertruck_drivers.epos.objects import Entry, abort_text
 from monstertruck_drivers.epos.protocol import (
@@ -26,6 +28,8 @@ from monstertruck_drivers.link import Link
 from monstertruck_drivers.talk import Need, Steps, Talk
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+
+T = TypeVar("T")
 
 ACKNOWLEDGE_TIMEOUT = 0.1
 ANSWER_TIMEOUT = 0.25
@@ -78,7 +82,7 @@ class Exchanger:
         self._link = link
         self._clock = clock
         self._node = node
-        self._flight: Talk[Frame | None] | None = None
+        self._flight: Talk[Any] | None = None
         self.quiet_until = quiet_until
         """Instant from which the controller listens again; in the past while all is well."""
         self.strange = b""
@@ -98,10 +102,17 @@ class Exchanger:
             DeviceTimeoutError, ProtocolError: no usable answer in ``attempts`` tries.
             DeviceLostError: the link is down.
         """
-        words = (await self._answer(read_request(entry, self._node), entry, attempts)).words
-        if len(words) != 4:
-            raise ProtocolError(f"{self._link.name}: {entry}: answer of {len(words)} words")
-        return entry.decode(join(words[2], words[3]))
+        return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
+
+    async def read_row(self, entries: Sequence[Entry], enough: Callable[[], bool]) -> list[int]:
+        """Values of objects, read one right after the other: the first one, and the others until ``enough``.
+
+        Raises:
+            ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
+        """
+        requests = [read_request(entry, self._node) for entry in entries]
+        frames = await self._transact(self._run_row(requests, enough))
+        return [self._value(entry, self._checked(frame, entry)) for entry, frame in zip(entries, frames, strict=False)]
 
     async def write(self, entry: Entry, value: int, attempts: int = 1) -> None:
         """Set an object.
@@ -138,7 +149,7 @@ class Exchanger:
         Raises:
             DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
-        await self._transact(nmt_request(command, self._node), answered=False)
+        await self._transact(self._run(nmt_request(command, self._node), answered=False))
 
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
@@ -153,22 +164,29 @@ class Exchanger:
     async def _answer(self, request: Frame, entry: Entry, attempts: int, value: int | None = None) -> Frame:
         for left in reversed(range(attempts)):
             try:
-                frame = await self._transact(request)
+                frame = await self._transact(self._run(request))
             except (DeviceTimeoutError, ProtocolError):
                 if not left:
                     raise
             else:
-                assert frame is not None
-                if code := error_of(frame):
-                    subject = entry if value is None else f"{entry} = {value}"
-                    raise ObjectError(f"{self._link.name}: {subject}", code)
-                return frame
+                return self._checked(frame, entry if value is None else f"{entry} = {value}")
         raise ValueError("at least one attempt")
 
-    async def _transact(self, request: Frame, *, answered: bool = True) -> Frame | None:
+    def _checked(self, frame: Frame | None, subject: object) -> Frame:
+        assert frame is not None
+        if code := error_of(frame):
+            raise ObjectError(f"{self._link.name}: {subject}", code)
+        return frame
+
+    def _value(self, entry: Entry, frame: Frame) -> int:
+        if len(frame.words) != 4:
+            raise ProtocolError(f"{self._link.name}: {entry}: answer of {len(frame.words)} words")
+        return entry.decode(join(frame.words[2], frame.words[3]))
+
+    async def _transact(self, steps: Steps[T]) -> T:
         await self.finish()
         await self.settle()
-        self._flight = flight = Talk(self._link, self._run(request, answered))
+        self._flight = flight = Talk(self._link, steps)
         try:
             return await flight.result()
         finally:
@@ -192,7 +210,15 @@ class Exchanger:
     def _quiet(self) -> int:
         return self._clock.now() + int(QUIET * SECOND)
 
-    def _run(self, request: Frame, answered: bool) -> Steps[Frame | None]:
+    def _run_row(self, requests: Sequence[Frame], enough: Callable[[], bool]) -> Steps[list[Frame | None]]:
+        frames: list[Frame | None] = []
+        for request in requests:
+            frames.append((yield from self._run(request)))
+            if enough():
+                break
+        return frames
+
+    def _run(self, request: Frame, *, answered: bool = True) -> Steps[Frame | None]:
         """One exchange; whatever goes wrong in its middle is followed by silence."""
         self.began = self._clock.now()
         try:

@@ -70,6 +70,20 @@ async def time_of(clock: VirtualClock, act: Awaitable[Any]) -> float:
     return (clock.now() - start) / SECOND
 
 
+def test_a_row_of_objects_is_read_until_it_is_enough():
+    async def test(_emulator: EposEmulator, line: Exchanger, _clock: VirtualClock) -> None:
+        entries = (od.STATUSWORD, od.MODE, od.POSITION)
+        whole = await line.read_row(entries, lambda: False)
+        assert whole == [await line.read(entry) for entry in entries]
+        asked: list[None] = []
+        assert await line.read_row(entries, lambda: asked.append(None) or len(asked) == 2) == whole[:2]
+        assert await line.read_row(entries, lambda: True) == whole[:1]
+        with pytest.raises(ObjectError):
+            await line.read_row((od.STATUSWORD, od.Entry("nothing", 0x7FFF, 0, 16)), lambda: False)
+
+    on_line(test)
+
+
 def test_the_worked_exchange():
     async def test(peer: Peer, line: Exchanger) -> None:
         assert await line.read(od.STATUSWORD) == 0x0337
