@@ -19,7 +19,7 @@ class ThreadHop(Generic[T]):
         deliver: called on the loop for every item, in the order of ``put``.
         depth: items that may wait; beyond that the oldest one of the lowest rank is lost.
         on_loss: told on the loop how many were lost since the last delivery.
-        rank: worth of an item; by default all are worth the same.
+        rank: worth of an item; None = all are worth the same.
     """
 
     def __init__(
@@ -27,13 +27,14 @@ class ThreadHop(Generic[T]):
         deliver: Callable[[T], None],
         depth: int,
         on_loss: Callable[[int], None],
-        rank: Callable[[T], int] = lambda _: 0,
+        rank: Callable[[T], int] | None = None,
     ) -> None:
         self._deliver = deliver
         self._depth = depth
         self._on_loss = on_loss
         self._rank = rank
         self._items: deque[T] = deque()
+        """Its ends are anybody's; what lies between, and with ranks also its left end, is the lock's owner's."""
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._scheduled = False
@@ -42,18 +43,14 @@ class ThreadHop(Generic[T]):
 
     def put(self, item: T) -> None:
         """Queue ``item``; callable from any thread, never blocks."""
-        with self._lock:
-            if self._closed:
-                return
-            self._items.append(item)
-            if len(self._items) > self._depth:
-                ranks = [self._rank(waiting) for waiting in self._items]
-                del self._items[ranks.index(min(ranks))]
-                self._lost += 1
-            if self._scheduled:
-                return
-            self._scheduled = True
-        # Without the lock: the loop may run at once, and would have to wait for it.
+        if self._closed:
+            return
+        self._items.append(item)
+        if len(self._items) > self._depth:
+            self._make_room()
+        if self._scheduled:
+            return
+        self._scheduled = True
         try:
             self._loop.call_soon_threadsafe(self._take)
         except RuntimeError:  # the loop was closed meanwhile
@@ -62,21 +59,46 @@ class ThreadHop(Generic[T]):
 
     def close(self) -> None:
         """Discard what waits and everything to come; to be called while the loop lives."""
+        self._closed = True
+
+    def _make_room(self) -> None:
         with self._lock:
-            self._closed = True
-            self._items.clear()
+            if len(self._items) <= self._depth:
+                return
+            if self._rank is not None:
+                ranks = [self._rank(waiting) for waiting in tuple(self._items)]
+                del self._items[ranks.index(min(ranks))]
+                self._lost += 1
+            elif self._pop() is not None:
+                self._lost += 1
 
     def _take(self) -> None:
-        with self._lock:
-            lost, self._lost = self._lost, 0
-            item = self._items.popleft() if self._items else None
-            self._scheduled = bool(self._items)
-            if self._scheduled:
-                self._loop.call_soon(self._take)
-        if lost:
+        items = self._items
+        if self._closed:
+            items.clear()
+            return
+        if self._rank is None:
+            item = self._pop()
+        else:
+            with self._lock:
+                item = self._pop()
+        if not items:
+            self._scheduled = False
+        if items:  # perhaps just now, by somebody who still saw it scheduled
+            self._scheduled = True
+            self._loop.call_soon(self._take)
+        if self._lost:
+            with self._lock:
+                lost, self._lost = self._lost, 0
             self._on_loss(lost)
         if item is not None:
             self._deliver(item)
+
+    def _pop(self) -> T | None:
+        try:
+            return self._items.popleft()
+        except IndexError:  # somebody was quicker
+            return None
 
 
 async def in_thread(function: Callable[[], T]) -> T:

@@ -1,7 +1,9 @@
 """Mailboxes: delivery, counting, waking, closing; and the hop from foreign threads."""
 
 import asyncio
+import sys
 import threading
+import time
 
 import pytest
 
@@ -220,6 +222,40 @@ async def test_a_full_hop_loses_the_oldest_and_says_how_many():
     hop.put(6)
     await asyncio.sleep(0)
     assert got == [2, 3, 4]
+
+
+@pytest.mark.parametrize("rank", [None, lambda item: item[0] % 3])
+async def test_what_several_threads_send_arrives_in_their_order_or_is_counted(rank):
+    senders, count = 4, 3000
+    got: list[tuple[int, int]] = []
+    lost: list[int] = []
+    hop: ThreadHop[tuple[int, int]] = ThreadHop(got.append, 5, lost.append, rank)
+
+    def send(sender: int) -> None:
+        for number in range(count):
+            hop.put((sender, number))
+            if number % 100 == 0:
+                time.sleep(0.0005)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=send, args=(sender,)) for sender in range(senders)]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            await asyncio.sleep(0)
+    finally:
+        sys.setswitchinterval(interval)
+    for sender in range(senders):
+        await asyncio.sleep(0.01)  # nothing waits any more
+        hop.put((sender, count))
+    await asyncio.sleep(0.01)
+    assert [item for item in got if item[1] == count] == [(sender, count) for sender in range(senders)]
+    assert len(got) + sum(lost) == senders * (count + 1)
+    for sender in range(senders):
+        numbers = [number for who, number in got if who == sender]
+        assert numbers == sorted(set(numbers))
 
 
 async def test_a_full_hop_loses_the_least_valuable_first():
