@@ -76,7 +76,7 @@ class _Slot(Generic[M]):
     async def next(self) -> M:
         raise RuntimeError("a step does not wait")
 
-    async def next_within(self, seconds: float, worth: Callable[[], bool] | None = None) -> M | None:
+    async def next_within(self, seconds: float, take: Callable[[M], bool] | None = None) -> M | None:
         raise RuntimeError(f"a step does not wait {seconds} s")
 
 

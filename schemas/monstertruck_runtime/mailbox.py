@@ -48,7 +48,7 @@ class Mailbox(Generic[M]):
         self._latest: M | None = None
         self._drops = 0
         self._reader: asyncio.Future[bool] | None = None
-        self._worth: Callable[[], bool] | None = None
+        self._take: Callable[[M], bool] | None = None
         self._closed = False
 
     @property
@@ -75,10 +75,10 @@ class Mailbox(Generic[M]):
             self._drops += 1
         self._unread.append(message)
         if self._reader is not None:
-            if self._worth is None:
+            if self._take is None:
                 _answer(self._reader, True)
             else:
-                self._judge(self._reader, self._worth)
+                self._offer(message, self._reader, self._take)
 
     async def next(self) -> M:
         """Wait for a message not returned by ``next`` yet.
@@ -93,22 +93,23 @@ class Mailbox(Generic[M]):
             await self._news()
         return self._unread.popleft()
 
-    async def next_within(self, seconds: float, worth: Callable[[], bool] | None = None) -> M | None:
+    async def next_within(self, seconds: float, take: Callable[[M], bool] | None = None) -> M | None:
         """As ``next``, or None if nothing comes within ``seconds``.
 
-        A timer costs much less than a deadline, which has to cancel its task, and a question much less than a wake-up.
+        A timer costs much less than a deadline, which has to cancel its task, and ``take`` much less than a wake-up.
 
         Args:
             seconds: limit.
-            worth: asked when a message comes while nobody is woken yet; if it says no, the message counts as read.
+            take: gets a message that comes during the wait at once, in its writer's own callback; if it says True the
+                wait goes on, and the message counts as read.
 
         Raises:
             RuntimeError: as ``next``.
-            Exception: what ``worth`` raised.
+            Exception: what ``take`` raised.
         """
         due = asyncio.get_running_loop().time() + max(seconds, 0.0)
         while not self._unread and not self._closed:
-            if not await self._news(due, worth):
+            if not await self._news(due, take):
                 return None
         return await self.next()
 
@@ -128,14 +129,14 @@ class Mailbox(Generic[M]):
             _answer(self._reader, True)
         self._on_close(self)
 
-    async def _news(self, due: float | None = None, worth: Callable[[], bool] | None = None) -> bool:
+    async def _news(self, due: float | None = None, take: Callable[[M], bool] | None = None) -> bool:
         """Wait for the next message or the end; False if ``due``, loop time, came first."""
         if self._reader is not None:
             msg = "a subscription has one reader; subscribe again for another"
             raise RuntimeError(msg)
         loop = asyncio.get_running_loop()
         reader: asyncio.Future[bool] = loop.create_future()
-        self._reader, self._worth = reader, worth
+        self._reader, self._take = reader, take
         alarm = None if due is None else loop.call_at(due, _answer, reader, False)
         try:
             return await reader
@@ -144,18 +145,18 @@ class Mailbox(Generic[M]):
             if alarm is not None:
                 alarm.cancel()
 
-    def _judge(self, reader: "asyncio.Future[bool]", worth: Callable[[], bool]) -> None:
+    def _offer(self, message: M, reader: "asyncio.Future[bool]", take: Callable[[M], bool]) -> None:
         if reader.done():
             return
         try:
-            wanted = worth()
+            taken = take(message)
         except Exception as bug:  # noqa: BLE001  # the reader's, not the writer's
             reader.set_exception(bug)
         else:
-            if wanted:
-                reader.set_result(True)
-            else:
+            if taken:
                 self._unread.clear()
+            else:
+                reader.set_result(True)
 
     def __aiter__(self) -> Self:
         return self

@@ -43,12 +43,13 @@ class Subscription(Protocol[M_co]):
         """Wait for a message not returned by ``next`` yet."""
         ...
 
-    async def next_within(self, seconds: float, worth: Callable[[], bool] | None = None) -> M_co | None:
+    async def next_within(self, seconds: float, take: Callable[[M_co], bool] | None = None) -> M_co | None:
         """The same, or None if nothing comes in that time.
 
         Args:
             seconds: limit.
-            worth: asked when a message comes while nobody is woken yet; if it says no, the message counts as read.
+            take: gets a message that comes during the wait at once, in its writer's own callback; if it says True the
+                wait goes on, and the message counts as read.
         """
         ...
 

@@ -11,7 +11,7 @@ ESTIMATES: Final = AHEAD + MILLISECOND
 """The same of those whose estimates the others use."""
 
 QUESTIONS: Final = ESTIMATES + 3 * MILLISECOND
-"""The same of those who ask a device: its answer is there when the estimates are made."""
+"""The same of those who ask a device: unless its line is slow, the answer is there when the estimates are made."""
 
 IN_THREADS: Final = -2 * MILLISECOND
 """The same of those that work in threads: behind the tick, which a thread that holds the interpreter would delay."""

@@ -5,7 +5,7 @@ from collections import defaultdict
 import pytest
 
 from monstertruck_runtime.clock import MILLISECOND, VirtualClock, run_virtual
-from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS
+from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTIONS
 from monstertruck_schemas import topics
 from monstertruckd.config.validate import load_config
 from monstertruckd.sim.config import SimulatedTruckConfig
@@ -26,7 +26,12 @@ PLACES = {
 """Rate, and ns before the multiples of its period."""
 
 
-def test_estimates_come_first_then_who_uses_them_then_the_gate_then_threads():
+ASKED = {topics.STEERING: (20, 1), topics.STABILISER: (25, 4), topics.DRIVES[0]: (20, 19)}
+"""Rate, and the ms that the answer of the device takes: the drive's two exchanges take their time on its line."""
+
+
+def seen(wanted, instant):
+    """``instant`` of the messages of two seconds, by topic."""
     config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0]
     found = defaultdict(list)
 
@@ -34,11 +39,26 @@ def test_estimates_come_first_then_who_uses_them_then_the_gate_then_threads():
         rig = VirtualRig(with_overlay(config, {"recorder": None, "map": None}), clock)
         async with rig.running():
             await clock.sleep(4.0)
-            tap = rig.bus.tap(lambda topic, message, *_: found[topic].append(message.stamp), PLACES)
+            tap = rig.bus.tap(lambda topic, message, *_: found[topic].append(instant(message)), wanted)
             await clock.sleep(2.0)
             tap.close()
 
     run_virtual(main)
+    return found
+
+
+def test_devices_are_asked_before_the_estimates_are_made():
+    found = seen(ASKED, lambda message: message.received)
+    for topic, (rate, takes) in ASKED.items():
+        period = 1000 * MILLISECOND // rate
+        took = sorted((instant + QUESTIONS) % period for instant in found[topic])
+        assert len(took) == pytest.approx(2 * rate, abs=1), topic.name
+        assert (takes - 1) * MILLISECOND <= took[len(took) // 2] <= takes * MILLISECOND, topic.name
+        assert took[0] >= took[len(took) // 2] - MILLISECOND // 10, topic.name
+
+
+def test_estimates_come_first_then_who_uses_them_then_the_gate_then_threads():
+    found = seen(PLACES, lambda message: message.stamp)
     for topic, (rate, ahead) in PLACES.items():
         period = 1000 * MILLISECOND // rate
         late = [(stamp + ahead) % period for stamp in found[topic]]

@@ -228,7 +228,7 @@ class _Session:
     async def _idle(self, until: int) -> None:
         """Wait for the next cycle; a command to stop is obeyed at once."""
         while (left := until - self._clock.now()) > 0:
-            if await self._driver.commands.next_within(left / SECOND, self._is_urgent) is None:
+            if await self._driver.commands.next_within(left / SECOND, lambda _: not self._is_urgent()) is None:
                 return
             await self._act()
 

@@ -120,11 +120,16 @@ class MaestroDriver:
 
     async def _follow(self, session: Session, until: int) -> None:
         """Pass commands on as they come."""
-        while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:
+
+        def pass_on(command: SteeringCommand) -> bool:
             if self._is_fresh(command):
                 self._command = command
                 self._fresh = True
                 session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
+            return True
+
+        while (waiting := await self._commands.next_within((until - self._clock.now()) / SECOND, pass_on)) is not None:
+            pass_on(waiting)
 
     def _is_fresh(self, command: SteeringCommand) -> bool:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND

@@ -68,36 +68,37 @@ def test_a_wait_with_a_limit_ends_with_a_message_or_at_its_time():
     assert run_virtual(main) == [(None, 10), (0, 25), (None, 25), (1, 50)]
 
 
-def test_a_message_that_is_not_worth_it_wakes_nobody_and_counts_as_read():
+def test_a_message_that_is_taken_on_its_way_wakes_nobody_and_counts_as_read():
     async def main(clock: VirtualClock) -> None:
         box: Mailbox[Message] = Mailbox(latest())
-        loop, asked = asyncio.get_running_loop(), []
+        loop, offered = asyncio.get_running_loop(), []
 
-        def worth() -> bool:
-            asked.append(box.latest.seq)
-            return asked[-1] >= 2
+        def take(given: Message) -> bool:
+            assert given is box.latest
+            offered.append(given.seq)
+            return given.seq < 2
 
         for seq in range(3):
             loop.call_later(0.1 + 0.1 * seq, box.put, message(seq))
         start = clock.now()
-        got = await box.next_within(1.0, worth)
+        got = await box.next_within(1.0, take)
         assert got == message(2)
         assert round((clock.now() - start) / SECOND, 2) == 0.3
-        assert await box.next_within(0.05, worth) is None
+        assert await box.next_within(0.05, take) is None
         box.put(message(5))
-        assert await box.next_within(0.05, worth) == message(5), "nobody waited when it came"
+        assert await box.next_within(0.05, take) == message(5), "nobody waited when it came"
         loop.call_later(0.1, box.put, message(0))
-        assert await box.next_within(0.2, worth) is None
-        assert asked == [0, 1, 2, 0]
+        assert await box.next_within(0.2, take) is None
+        assert offered == [0, 1, 2, 0]
         assert box.latest == message(0)
         assert box.drops == 0
 
     run_virtual(main)
 
 
-async def test_a_bug_in_the_question_is_the_readers_not_the_writers():
+async def test_a_bug_in_taking_is_the_readers_not_the_writers():
     box: Mailbox[Message] = Mailbox(latest())
-    reader = asyncio.create_task(box.next_within(1.0, lambda: 1 // 0 > 0))
+    reader = asyncio.create_task(box.next_within(1.0, lambda _: 1 // 0 > 0))
     await asyncio.sleep(0)
     box.put(message(0))
     box.put(message(1))
