@@ -27,7 +27,7 @@ from monstertruckd.gate.stops import Trip
 
 log = logging.getLogger(__name__)
 
-M = TypeVar("M")
+T = TypeVar("T")
 
 STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` goes out on every change and at least this often, ns."""
@@ -102,6 +102,7 @@ class GateService:
         """What is on the disk; None while it is being written."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
+        self._broken = asyncio.Event()
         self._bug: Exception | None = None
         self._told: tuple[object, ...] = ()
         self._told_at = 0
@@ -129,37 +130,45 @@ class GateService:
 
     def control(self, order: ControlRequest) -> Reason:
         """Carry out an order at once, before any queue could lose it; see ``Gate.control``."""
-        return self._taken(self._gate.control, order)
+        return self._taken(Reason.INTERNAL, self._gate.control, order, self._clock.now())
 
     def request(self, request: DriveRequest) -> Reason:
         """Take a drive request from outside, at once; see ``Gate.request``."""
-        return self._taken(self._gate.request, request)
+        return self._taken(Reason.INTERNAL, self._gate.request, request, self._clock.now())
 
     def wish(self, request: DriveRequest) -> Reason:
         """Take one of the robot's own planners, at once; see ``Gate.wish``."""
-        return self._taken(self._gate.wish, request)
+        return self._taken(Reason.INTERNAL, self._gate.wish, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
         """Take any service's event at once: it may be what is behind a stop."""
-        self._gate.observe_event(event)
+        self._taken(None, self._gate.observe_event, event)
 
     def shut_down(self) -> None:
         """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
-    def _taken(self, take: Callable[[M, int], Reason], message: M) -> Reason:
-        """A bug in here ends this service, at its next tick, and not whoever sent ``message``."""
+    def _taken(self, otherwise: T, take: Callable[..., T], *arguments: object) -> T:
+        """What ``take`` returns; a bug in it ends this service, and not whoever sent the message."""
         try:
-            return take(message, self._clock.now())
-        except Exception as bug:  # noqa: BLE001  # raised by the tick
+            return take(*arguments)
+        except Exception as bug:
+            log.exception("a message could not be taken")
             self._bug = bug
-            return Reason.INTERNAL
+            self._broken.set()
+            return otherwise
+
+    async def _fail(self) -> None:
+        await self._broken.wait()
+        assert self._bug is not None
+        raise self._bug
 
     async def run(self, ready: Ready) -> None:
         """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk."""
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._keep_latch(), name="gate latch")
+                group.create_task(self._fail(), name="gate bug")
                 try:
                     await self._tick_for_ever(ready)
                 finally:
@@ -171,8 +180,6 @@ class GateService:
         schedule = Schedule(self._clock, self._rate, ahead=0)
         while True:
             due = await schedule.next()
-            if self._bug is not None:
-                raise self._bug
             now = self._clock.now()
             self._meter.record((now - due) / SECOND)
             for feed in self._feeds:

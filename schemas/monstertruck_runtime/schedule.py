@@ -18,7 +18,7 @@ IN_THREADS: Final = -2 * MILLISECOND
 
 
 class Schedule:
-    """Instants on one fixed grid. Those that were missed by a millisecond are skipped, not made up for.
+    """Instants on one fixed grid. Of those that were missed by a millisecond none is made up for.
 
     Schedules of one rate have the same instants, so that services wake together: a loop that sleeps in between runs
     code from cold caches, and what comes first pays for what follows.
@@ -38,17 +38,24 @@ class Schedule:
 
     async def next(self) -> int:
         """Wait for the next instant; returns when it was due, ns."""
-        due = self.step()
+        due = self._step(self._clock.now() - MILLISECOND)
         await self._clock.sleep_until(due)
         return due
 
     def step(self) -> int:
-        """The next instant of the grid, ns, at once the first time; the second one is half a period off at least."""
-        now = self._clock.now()
+        """The next instant, ns, for those who wait by themselves; if it was missed, now: slow work goes on at once."""
+        due = self._step(0)
+        if (newest := self._clock.now() - MILLISECOND) > due:
+            self._behind = due = newest
+        return due
+
+    def _step(self, earliest: int) -> int:
+        """The next instant behind ``earliest``: at once the first time; the second is half a period off at least."""
         if self._behind is None:
+            now = self._clock.now()
             due = now - now % MILLISECOND
             self._behind = due + self._period // 2
         else:
-            behind = max(self._behind, now - MILLISECOND)
+            behind = max(self._behind, earliest)
             self._behind = due = behind + self._period - (behind + self._ahead) % self._period
         return due

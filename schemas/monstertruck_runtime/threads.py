@@ -66,7 +66,8 @@ class ThreadHop(Generic[T]):
             if len(self._items) <= self._depth:
                 return
             if self._rank is not None:
-                ranks = [self._rank(waiting) for waiting in tuple(self._items)]
+                # By number, for items may come meanwhile.
+                ranks = [self._rank(self._items[i]) for i in range(len(self._items))]
                 del self._items[ranks.index(min(ranks))]
                 self._lost += 1
             elif self._pop() is not None:
@@ -75,7 +76,8 @@ class ThreadHop(Generic[T]):
     def _take(self) -> None:
         items = self._items
         if self._closed:
-            items.clear()
+            with self._lock:
+                items.clear()
             return
         if self._rank is None:
             item = self._pop()

@@ -214,7 +214,7 @@ class _Session:
 
     async def _cycle(self) -> None:
         await self._act(also_faster=True)
-        self._rpm, raw = await self._read_row(od.VELOCITY_AVERAGED, od.POSITION)
+        _, raw = await self._read_row(od.VELOCITY_AVERAGED, od.POSITION)
         self._publish(raw, (self._line.began + self._line.ended) // 2)
         now = self._clock.now()
         if now >= self._status_due or not settled(self._state, self._want().goal):
@@ -237,9 +237,16 @@ class _Session:
 
     async def _read_row(self, *entries: Entry) -> list[int]:
         values: list[int] = []
+
+        def take(value: int) -> bool:
+            if entries[len(values)] is od.VELOCITY_AVERAGED:
+                self._rpm = value
+            values.append(value)
+            return not self._is_urgent()
+
         while len(values) < len(entries):
             await self._act()
-            values += await self._line.read_row(entries[len(values) :], self._is_urgent)
+            await self._line.read_row(entries[len(values) :], take)
         return values
 
     def _publish(self, raw: int, stamp: int) -> None:

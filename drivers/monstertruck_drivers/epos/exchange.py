@@ -83,6 +83,8 @@ class Exchanger:
         self._clock = clock
         self._node = node
         self._flight: Talk[Any] | None = None
+        self._hurried = False
+        """Somebody waits for the end of the row that is read."""
         self.quiet_until = quiet_until
         """Instant from which the controller listens again; in the past while all is well."""
         self.strange = b""
@@ -104,15 +106,15 @@ class Exchanger:
         """
         return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
 
-    async def read_row(self, entries: Sequence[Entry], enough: Callable[[], bool]) -> list[int]:
-        """Values of objects, read one right after the other: the first one, and the others until ``enough``.
+    async def read_row(self, entries: Sequence[Entry], take: Callable[[int], bool]) -> None:
+        """Read objects one right after the other, until ``take``, which gets every value at once, says False.
+
+        Nor does a row go on that nobody waits for.
 
         Raises:
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
-        requests = [read_request(entry, self._node) for entry in entries]
-        frames = await self._transact(self._run_row(requests, enough))
-        return [self._value(entry, self._checked(frame, entry)) for entry, frame in zip(entries, frames, strict=False)]
+        await self._transact(self._run_row(entries, take))
 
     async def write(self, entry: Entry, value: int, attempts: int = 1) -> None:
         """Set an object.
@@ -154,6 +156,7 @@ class Exchanger:
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
         if self._flight is not None:
+            self._hurried = True
             await self._flight.end()
 
     async def close(self) -> None:
@@ -210,13 +213,13 @@ class Exchanger:
     def _quiet(self) -> int:
         return self._clock.now() + int(QUIET * SECOND)
 
-    def _run_row(self, requests: Sequence[Frame], enough: Callable[[], bool]) -> Steps[list[Frame | None]]:
-        frames: list[Frame | None] = []
-        for request in requests:
-            frames.append((yield from self._run(request)))
-            if enough():
-                break
-        return frames
+    def _run_row(self, entries: Sequence[Entry], take: Callable[[int], bool]) -> Steps[None]:
+        self._hurried = False
+        for entry in entries:
+            self._link.discard()
+            frame = yield from self._run(read_request(entry, self._node))
+            if not take(self._value(entry, self._checked(frame, entry))) or self._hurried:
+                return
 
     def _run(self, request: Frame, *, answered: bool = True) -> Steps[Frame | None]:
         """One exchange; whatever goes wrong in its middle is followed by silence."""

@@ -266,8 +266,10 @@ def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
             task = asyncio.create_task(bench.service.run(bench.ready))
             await clock.sleep(0.1)
             assert getattr(bench.service, name)(None) is Reason.INTERNAL
+            begin = clock.now()
             with pytest.raises(ExceptionGroup):
                 await task
+            assert clock.now() - begin < SECOND // 1000, "not only at the next tick"
             assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
 
     run_virtual(main)

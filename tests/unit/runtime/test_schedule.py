@@ -23,6 +23,20 @@ def test_instants_stay_on_the_grid_whatever_the_work_takes():
     assert run_virtual(main) == [tenth * TENTH for tenth in (0, 1, 2, 3, 6, 7, 9, 10, 12)]
 
 
+def test_who_waits_by_himself_goes_on_at_once_when_late_and_comes_back_to_the_grid():
+    async def main(clock):
+        start = clock.now()
+        schedule = Schedule(clock, 10, ahead=0)
+        begun = []
+        for work in (0.0, 0.03, 0.09, 0.25, 0.0, 0.12, 0.0, 0.0):
+            await clock.sleep_until(schedule.step())
+            begun.append(round((clock.now() - start) / MILLISECOND))
+            await asyncio.sleep(work)
+        return begun
+
+    assert run_virtual(main) == [0, 100, 200, 300, 550, 600, 720, 800]
+
+
 def test_the_first_instant_is_now():
     async def main(clock):
         schedule = Schedule(clock, 50)

@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import math
+from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
@@ -53,6 +55,23 @@ def test_the_sign_can_be_that_of_the_controller():
             assert rig.newest.velocity == pytest.approx(1_000 * RAD_S_PER_RPM, rel=1e-3)
 
     on_bench(test, EposConfig(inverted=False))
+
+
+@pytest.mark.parametrize("rate", [20.0, 25.0])
+@pytest.mark.parametrize("rpm", [lambda step: 12_000 + step * 7919 % 400, lambda step: 16_000 - 20 * step])
+def test_a_cycle_longer_than_its_period_is_followed_by_the_next_at_once(rate: float, rpm: Callable[[int], int]):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(16_000)
+            first = len(rig.out.kept)
+            for step in range(200):
+                rig.gate.say(DriveAction.RUN, rpm(step))
+                await rig.settle(0.02)
+            stamps = [feedback.stamp for feedback in rig.out.kept[first:]]
+            assert len(stamps) >= 4 * 19
+            assert max(later - earlier for earlier, later in pairwise(stamps)) < 0.075 * SECOND
+
+    on_bench(test, EposConfig(rate=rate))
 
 
 @pytest.mark.parametrize("rate", [20.0, 25.0])

@@ -73,15 +73,44 @@ async def time_of(clock: VirtualClock, act: Awaitable[Any]) -> float:
 def test_a_row_of_objects_is_read_until_it_is_enough():
     async def test(_emulator: EposEmulator, line: Exchanger, _clock: VirtualClock) -> None:
         entries = (od.STATUSWORD, od.MODE, od.POSITION)
-        whole = await line.read_row(entries, lambda: False)
-        assert whole == [await line.read(entry) for entry in entries]
-        asked: list[None] = []
-        assert await line.read_row(entries, lambda: asked.append(None) or len(asked) == 2) == whole[:2]
-        assert await line.read_row(entries, lambda: True) == whole[:1]
+        whole = [await line.read(entry) for entry in entries]
+        for count in (1, 2, 3):
+            got: list[int] = []
+
+            def take(value: int, got: list[int] = got, count: int = count) -> bool:
+                got.append(value)
+                return len(got) < count
+
+            await line.read_row(entries, take)
+            assert got == whole[:count]
         with pytest.raises(ObjectError):
-            await line.read_row((od.STATUSWORD, od.Entry("nothing", 0x7FFF, 0, 16)), lambda: False)
+            await line.read_row((od.STATUSWORD, od.Entry("nothing", 0x7FFF, 0, 16)), lambda _: True)
 
     on_line(test)
+
+
+def test_a_row_that_nobody_waits_for_any_more_ends_with_the_exchange_that_has_begun():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        got: list[int] = []
+        task = asyncio.create_task(line.read_row((od.STATUSWORD, od.MODE, od.POSITION), lambda v: not got.append(v)))
+        await asyncio.sleep(0)
+        assert not task.done()
+        task.cancel()
+        await asyncio.wait([task])
+        assert task.cancelled()
+        await line.write(od.CONTROLWORD, 0x0002)
+        assert len(got) == 1
+
+    on_line(test)
+
+
+def test_a_stray_byte_between_the_exchanges_of_a_row_is_dropped():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        got: list[int] = []
+        await line.read_row((od.STATUSWORD, od.STATUSWORD), lambda value: not got.append(value))
+        assert got == [DISABLED, DISABLED]
+
+    with_peer(O, O + b"\0", ANSWER, O, O, O + b"\0", ANSWER, b"")(test)
 
 
 def test_the_worked_exchange():
