@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-KEPT: Final = 1 << 14
-"""Ticks remembered: 5.5 minutes at 50 Hz."""
+KEPT: Final = 1 << 12
+"""Ticks remembered: 82 s at 50 Hz."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,11 +74,12 @@ class Mailbox(Generic[M]):
         if self._counted and len(self._unread) == self._unread.maxlen:
             self._drops += 1
         self._unread.append(message)
-        if self._reader is not None:
+        reader = self._reader
+        if reader is not None and not reader.done():
             if self._take is None:
-                _answer(self._reader, True)
+                reader.set_result(True)
             else:
-                self._offer(message, self._reader, self._take)
+                self._offer(message, reader, self._take)
 
     async def next(self) -> M:
         """Wait for a message not returned by ``next`` yet.
@@ -146,8 +147,6 @@ class Mailbox(Generic[M]):
                 alarm.cancel()
 
     def _offer(self, message: M, reader: "asyncio.Future[bool]", take: Callable[[M], bool]) -> None:
-        if reader.done():
-            return
         try:
             taken = take(message)
         except Exception as bug:  # noqa: BLE001  # the reader's, not the writer's
