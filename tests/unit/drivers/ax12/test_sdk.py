@@ -144,7 +144,7 @@ async def test_the_driver_over_the_same_pty(tmp_path: Path):
         driver = Ax12Driver(Ax12Config(), SerialPort(path, p.BAUD), clock, commands, out, events)
         async with background(driver.run(ready.set)):
             await asyncio.wait_for(ready.wait(), 5)
-            seq, goals = 0, pytest.approx((0.1, -0.1), abs=2 * p.STEP)
+            seq, goals = 0, pytest.approx((0.1, -0.1), abs=p.STEP)
             async with asyncio.timeout(20):
                 while not out.kept or (out.kept[-1].pitch, out.kept[-1].roll) != goals:
                     now = clock.now()
@@ -152,4 +152,4 @@ async def test_the_driver_over_the_same_pty(tmp_path: Path):
                     seq += 1
                     await asyncio.sleep(0.02)
             assert out.kept[-1].pitch_joint.torque is TorqueState.HOLDING
-        assert bus.angle(1, clock.now()) / p.STEP == pytest.approx(511 + 0.1 / p.STEP, abs=2.5)
+        assert bus.angle(1, clock.now()) / p.STEP == pytest.approx(511 + 0.1 / p.STEP, abs=1.5)
