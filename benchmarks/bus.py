@@ -4,8 +4,9 @@
 
 Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them, and every
 round starts them anew, for where the system puts a process weighs as much as what it does. They are: the product
-(message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio), the
-same without asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``), rospy's
+(message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio; once
+as zenoh-python hands them over, once taken in the thread that reads the network, as the product does), the same without
+asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``), rospy's
 ``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100 round
 trips a second. The codec is measured alone, in processor time of many calls in a row, and for comparison once after a
 pause each. The last line is JSON.
@@ -167,7 +168,7 @@ def from_cold_caches(repeats: int = 200) -> dict[str, float]:
 
 def compare(rounds: int) -> dict[str, float]:
     """Medians over the rounds; ratios are those of one round."""
-    kinds = ("typed", "raw", "thread", *(("rospy",) if has_rospy() else ()))
+    kinds = ("typed", "raw", "direct", "thread", *(("rospy",) if has_rospy() else ()))
     p50, p99, cpu = ({kind: np.empty(rounds) for kind in kinds} for _ in range(3))
     for number in range(rounds):
         with ExitStack() as stack:

@@ -1,10 +1,11 @@
 """The two ends of ``bus.py``: scans to and fro over Zenoh, as the product does it and as plain bytes.
 
-    python bus_peers.py typed|raw|thread ping|echo HERE THERE
+    python bus_peers.py typed|raw|direct|thread ping|echo HERE THERE
 
 ``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
-``raw``: plain bytes, put and awaited in asyncio. ``thread``: plain bytes answered in Zenoh's own thread, no asyncio
-at all. Every end listens at HERE and dials THERE. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
+``raw``: plain bytes, put and awaited in asyncio, taken as zenoh-python hands them over. ``direct``: the same, taken in
+the thread that reads the network, as the product does. ``thread``: plain bytes answered in Zenoh's own thread, no
+asyncio at all. Every end listens at HERE and dials THERE. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
 other) on its standard input and answers with a JSON list of round trips in ns.
 """
 
@@ -24,6 +25,7 @@ import zenoh
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
 from monstertruckd.bus.local import Bus
@@ -105,7 +107,7 @@ class Inbox:
 
 @asynccontextmanager
 async def raw(
-    me: str, here: str, there: str, receive: Callable[[zenoh.Sample], None]
+    me: str, here: str, there: str, receive: "Callable[[zenoh.Sample], None] | zenoh.handlers.Callback[zenoh.Sample]"
 ) -> AsyncIterator[Callable[[bytes], None]]:
     """Put function of plain bytes; ``receive`` is called with every sample of the other end.
 
@@ -157,9 +159,10 @@ async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> N
                 await pings(lambda number: put(scan(number, time.monotonic_ns())), receive)
             while True:
                 put(await receive())
-        if kind == "raw":
+        if kind in ("raw", "direct"):
             inbox = Inbox()
-            send = await stack.enter_async_context(raw(me, here, there, inbox.put))
+            take = inbox.put if kind == "raw" else in_network_thread(inbox.put)
+            send = await stack.enter_async_context(raw(me, here, there, take))
             if me == "ping":
                 await pings(lambda _: send(payload), inbox.get)
             while True:

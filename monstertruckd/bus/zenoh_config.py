@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import Schema
 from monstertruckd.bus.access import access_rules
+
+HANG_UP_US: Final = 50_000
+"""A station that takes nothing for so long while another one's message to it waits is hung up on."""
 
 
 class TlsConfig(Schema):
@@ -48,13 +51,23 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; it is deep enough for the largest message.
+    A message from one station to another that must not be lost stops all traffic, requests too, while the other one's
+    queue is full: hence ``HANG_UP_US`` instead of Zenoh's 5 s.
     No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
     transport: dict[str, Any] = {
         "unicast": {"max_sessions": config.max_sessions},
         "shared_memory": {"enabled": False},
         "link": {
-            "tx": {"queue": {"size": {"data": 16}, "congestion_control": {"drop": {"wait_before_drop": 0}}}},
+            "tx": {
+                "queue": {
+                    "size": {"data": 16},
+                    "congestion_control": {
+                        "drop": {"wait_before_drop": 0},
+                        "block": {"wait_before_close": HANG_UP_US},
+                    },
+                }
+            },
         },
     }
     session: dict[str, Any] = {

@@ -21,6 +21,7 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.station import ClientTls, session_config, station_tls
 from monstertruck_runtime.threads import ThreadHop, in_thread
+from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
@@ -143,7 +144,7 @@ class TruckClient:
                 history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             )
             if topic.retained
-            else self._open_session().declare_subscriber(key, receive)
+            else self._open_session().declare_subscriber(key, in_network_thread(receive))
         )
 
         def end() -> None:

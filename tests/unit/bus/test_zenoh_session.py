@@ -9,6 +9,8 @@ import subprocess
 import sys
 import textwrap
 import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
@@ -414,3 +416,44 @@ async def test_the_ten_lines_of_the_docs_print_the_pose(tmp_path: Path):
         process.kill()
         await process.communicate()
     assert line.result() == b"x 1.250 m, y 2.000 m in map\n"
+
+
+STATIONS = """
+    import json, sys, time, zenoh
+    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [sys.argv[2]]}}))
+    with zenoh.open(config) as session:
+        if sys.argv[1] == "reader":
+            session.declare_subscriber("mt/truck/**", lambda _: None)
+        print("ready", flush=True)
+        while sys.argv[1] == "writer":
+            session.put("mt/truck/chatter", b"x" * 60_000, congestion_control=zenoh.CongestionControl.BLOCK)
+            time.sleep(0.002)
+        time.sleep(60)
+"""
+
+
+@asynccontextmanager
+async def other_station(kind: str, endpoint: str) -> AsyncIterator["subprocess.Popen[bytes]"]:
+    program = [sys.executable, "-c", textwrap.dedent(STATIONS), kind, endpoint]
+    with subprocess.Popen(program, stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert await asyncio.to_thread(process.stdout.readline) == b"ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
+async def test_a_frozen_reader_of_another_stations_messages_stops_the_truck_for_a_moment_only():
+    async with running_robot() as robot, other_station("reader", robot.endpoint) as reader:
+        await asyncio.sleep(0.2)
+        reader.send_signal(signal.SIGSTOP)
+        publisher = robot.bus.publisher(POSE, Writer.ESTIMATION)
+        longest = 0
+        async with other_station("writer", robot.endpoint):
+            for seq in range(400):
+                start = WallClock().now()
+                publisher.put(odometry(seq))
+                longest = max(longest, WallClock().now() - start)
+                await asyncio.sleep(0.01)
+    assert longest < 0.5 * SECOND

@@ -1,0 +1,33 @@
+"""Messages taken in the thread that reads the network."""
+
+import asyncio
+import threading
+from pathlib import Path
+
+import zenoh
+
+from monstertruck_runtime.zenoh_threads import in_network_thread
+from tests.bus_kit import running_robot
+from tests.unit.bus.test_zenoh_session import put, raw_session
+
+
+async def test_messages_are_taken_in_a_network_thread_whose_state_is_kept():
+    places: set[str] = set()
+    memory = threading.local()
+    counts: dict[int, list[int]] = {}
+
+    def take(_: zenoh.Sample) -> None:
+        thread = threading.get_native_id()
+        places.add(Path(f"/proc/self/task/{thread}/comm").read_text().partition("-")[0])
+        memory.count = getattr(memory, "count", 0) + 1
+        counts.setdefault(thread, []).append(memory.count)
+
+    async with running_robot() as robot:
+        with raw_session(robot.endpoint) as reader, raw_session(robot.endpoint) as writer:
+            reader.declare_subscriber("mt/truck/chatter", in_network_thread(take))
+            while sum(map(len, counts.values())) < 20:
+                put(writer, "mt/truck/chatter", b"x")
+                await asyncio.sleep(0.01)
+    assert places == {"rx"}
+    for counted in counts.values():
+        assert counted == list(range(1, len(counted) + 1))
