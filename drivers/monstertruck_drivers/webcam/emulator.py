@@ -21,8 +21,8 @@ SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (
 """Sizes offered; like a real driver it grants the nearest one."""
 RATE_MAX: Final = 30.0
 LINE_LIMIT: Final = 256
-CHUNK: Final = 2048
-"""Bytes written at a time: a pty takes no more than a few thousand until they are read."""
+CHUNK: Final = 4095
+"""Bytes written at a time: as many as the reader of a pty gets in one go."""
 CHUNK_PAUSE: Final = 0.0002
 
 REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno.ENOSPC, "off": 0}
@@ -166,8 +166,8 @@ class WebcamEmulator:
         data = self._damaged(await self._offload(lambda: renderer.jpeg(ranges, number)))
         packet = Packet(Kind.PICTURE, number, stamp + self._jump, data).encode()
         for at in range(0, len(packet), CHUNK):
-            end.write(packet[at : at + CHUNK])
             await self._clock.sleep(CHUNK_PAUSE)
+            end.write(packet[at : at + CHUNK])
 
     def _ranges(self, stamp: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
         if self._view is None:

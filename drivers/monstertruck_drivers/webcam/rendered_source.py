@@ -47,7 +47,7 @@ class RenderedSource:
     async def _answer(self, link: Link, parser: PacketParser) -> Mode:
         """Wait for it; pictures of an earlier session are dropped."""
         while True:
-            for packet in parser.feed(await link.read()):
+            for packet in parser.feed(await link.exactly(min(parser.missing, MOST))):
                 if packet.kind is Kind.GRANTED:
                     return decode_mode(packet.payload)
                 if packet.kind is Kind.REFUSED:
