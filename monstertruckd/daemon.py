@@ -84,7 +84,7 @@ class Daemon:
     ) -> None:
         self.config = config
         self.clock = clock
-        self.bus = Bus(clock, config.zenoh.gather_seconds if seed is None else 0.0)
+        self.bus = Bus(clock, config.zenoh.gather_seconds)
         self.digest = LogDigest()
         self._seed = seed
         self._offload: Offload = in_thread if seed is None else inline

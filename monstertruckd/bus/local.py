@@ -80,7 +80,7 @@ class Bus:
 
     Args:
         clock: time.
-        gather_seconds: messages of frequent topics reach the taps together, about this late at most; 0: at once.
+        gather_seconds: messages of regular topics reach the taps together, about this late at most; 0: at once.
     """
 
     def __init__(self, clock: Clock, gather_seconds: float = 0.0) -> None:

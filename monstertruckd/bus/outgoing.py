@@ -11,7 +11,7 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
-OFTEN: Final = 10.0
+OFTEN: Final = 1.0
 """Topics of so many messages a second or more may wait for others."""
 BEHIND: Final = MILLISECOND
 """Nanoseconds after the multiples at which rows leave: what the gate says there goes with them, not held up by them."""

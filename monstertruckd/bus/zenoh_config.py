@@ -42,7 +42,7 @@ class ZenohConfig(Schema):
     one group (``mt/truck/state/**``): wider expressions get nothing."""
     max_sessions: int = Field(default=64, ge=1)
     gather_seconds: float = Field(default=0.04, ge=0, le=0.1)
-    """Messages of frequent topics (10 Hz and more) leave for network and log together, each about this late
+    """Messages of regular topics (1 Hz and more) leave for network and log together, each about this late
     at most; 0: at once."""
 
 

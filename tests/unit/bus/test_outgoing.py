@@ -5,7 +5,7 @@ import pytest
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import EVENT, HEALTH, ODOMETRY, POSE, Writer
+from monstertruck_schemas.topics import EVENT, MAP, ODOMETRY, POSE, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.outgoing import BEHIND, ROW, Outgoing
 from tests.bus_kit import gate_state, odometry
@@ -41,7 +41,7 @@ def test_frequent_messages_wait_for_each_other():
     assert delivered(scenario) == [("state/odometry", 0, 21), ("state/pose", 5, 21), ("state/odometry", 35, 41)]
 
 
-@pytest.mark.parametrize("rare", [HEALTH, EVENT])
+@pytest.mark.parametrize("rare", [MAP, EVENT])
 def test_a_rare_message_leaves_at_once_behind_what_waits(rare):
     async def scenario(send, _, clock):
         send(ODOMETRY)

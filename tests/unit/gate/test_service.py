@@ -427,7 +427,7 @@ def test_meter_forgets_percentiles_but_not_the_maximum():
     for lateness in (9.0, 1.0, 2.0, 3.0, 4.0):
         meter.record(lateness)
     found = meter.lateness()
-    assert (found.ticks, found.p50, found.max) == (5, 2.5, 9.0)
+    assert (found.ticks, found.p50, found.p99, found.max) == (5, 2.0, 4.0, 9.0)
 
 
 def test_a_stop_is_published_with_its_black_box_and_again_when_more_is_known():
