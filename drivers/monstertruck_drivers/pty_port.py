@@ -5,8 +5,12 @@ import contextlib
 import os
 import tty
 from pathlib import Path
+from typing import Final
 
 from monstertruck_drivers.cable import DeviceEnd
+
+FRAME: Final = 0.001
+"""Seconds of a USB frame: what a device says within one reaches the host together."""
 
 
 class PtyPort:
@@ -21,6 +25,7 @@ class PtyPort:
         self.device = DeviceEnd(self.name)
         self._path = path
         self._fds: tuple[int, int] | None = None
+        self._frame = bytearray()
 
     def plug(self) -> None:
         """Create the pty, raw, and point the symlink at it. Needs a running loop."""
@@ -45,6 +50,7 @@ class PtyPort:
             return
         master, slave = self._fds
         self._fds = None
+        self._frame.clear()
         self.device.connect(None)
         asyncio.get_running_loop().remove_reader(master)
         self._path.unlink(missing_ok=True)
@@ -60,7 +66,14 @@ class PtyPort:
             self.device.take(os.read(self._fds[0], 4096))
 
     def _send(self, data: bytes) -> None:
-        assert self._fds is not None
+        if not self._frame:
+            asyncio.get_running_loop().call_later(FRAME, self._end_frame)
+        self._frame += data
+
+    def _end_frame(self) -> None:
+        if self._fds is None:
+            return
         # A full buffer means nobody reads: the bytes are lost, as a USB device's are.
         with contextlib.suppress(BlockingIOError):
-            os.write(self._fds[0], data)
+            os.write(self._fds[0], self._frame)
+        self._frame.clear()

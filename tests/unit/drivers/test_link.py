@@ -289,6 +289,17 @@ async def test_a_vanished_pty_does_not_spin_the_loop(tmp_path: Path):
     link.close()
 
 
+async def test_what_a_device_says_within_a_usb_frame_arrives_together(tmp_path: Path):
+    pty = PtyPort(tmp_path / "dev")
+    pty.plug()
+    async with await SerialPort(tmp_path / "dev").open() as link:
+        for byte in b"O", b"\x00":
+            pty.device.write(byte)
+            await asyncio.sleep(0)
+        assert await link.read() == b"O\x00"
+    pty.unplug()
+
+
 async def test_a_pty_nobody_reads_never_blocks_the_emulator(tmp_path: Path):
     pty = PtyPort(tmp_path / "dev")
     pty.plug()
