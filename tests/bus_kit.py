@@ -40,9 +40,10 @@ async def running_robot(
     """A bridge that is ready; cancelled and awaited at the end. Calls may take ``deadline`` seconds."""
     endpoint = endpoint or free_endpoint()
     clock = WallClock()
-    bus = Bus(clock)
+    settings = ZenohConfig(**{"gather_seconds": 0.0, "listen": (endpoint,), **config})
+    bus = Bus(clock, settings.gather_seconds)
     rpc = Rpc(clock, deadline=deadline)
-    bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,), **config), clock, rpc)
+    bridge = ZenohBridge(robot, bus, settings, clock, rpc)
     ready = asyncio.Event()
     events = bus.subscribe(EVENT, fifo(100))
     task = asyncio.create_task(bridge.run(ready.set))

@@ -26,6 +26,7 @@ class PtyPort:
         self._path = path
         self._fds: tuple[int, int] | None = None
         self._frame = bytearray()
+        self._timer: asyncio.TimerHandle | None = None
 
     def plug(self) -> None:
         """Create the pty, raw, and point the symlink at it. Needs a running loop."""
@@ -51,6 +52,9 @@ class PtyPort:
         master, slave = self._fds
         self._fds = None
         self._frame.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
         self.device.connect(None)
         asyncio.get_running_loop().remove_reader(master)
         self._path.unlink(missing_ok=True)
@@ -66,14 +70,15 @@ class PtyPort:
             self.device.take(os.read(self._fds[0], 4096))
 
     def _send(self, data: bytes) -> None:
-        if not self._frame:
-            asyncio.get_running_loop().call_later(FRAME, self._end_frame)
         self._frame += data
+        if self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(FRAME, self._end_frame)
 
     def _end_frame(self) -> None:
-        if self._fds is None:
-            return
-        # A full buffer means nobody reads: the bytes are lost, as a USB device's are.
-        with contextlib.suppress(BlockingIOError):
-            os.write(self._fds[0], self._frame)
+        assert self._fds is not None
+        self._timer = None
+        frame = bytes(self._frame)
         self._frame.clear()
+        # What a pty has no room for, of about 10 kB, is lost as a USB device's bytes are that nobody fetches in time.
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._fds[0], frame)

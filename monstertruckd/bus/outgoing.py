@@ -23,7 +23,7 @@ Sent = tuple[Topic[Any], Message, int]
 
 
 class Outgoing:
-    """Delivers rare messages at once, and with them, or after a moment, the frequent ones that wait before them.
+    """Delivers messages of no rate at once, and with them, or after a moment, the regular ones that wait before them.
 
     Args:
         seconds: rows leave a moment after the multiples of this; 0: nothing waits.

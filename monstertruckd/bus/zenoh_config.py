@@ -9,8 +9,9 @@ from pydantic import Field
 from monstertruck_schemas.base import Schema
 from monstertruckd.bus.access import access_rules
 
-HANG_UP_US: Final = 50_000
-"""A station that takes nothing for so long while another one's message to it waits is hung up on."""
+HANG_UP_US: Final = 2_000_000
+"""A station to which an answer, or another one's message that must not be lost, does not get through in this time is
+hung up on. Zenoh's own 5 s are long for those whose requests wait behind it; a large map takes its time, too."""
 
 
 class TlsConfig(Schema):
@@ -50,9 +51,7 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
     """Zenoh's own JSON configuration of the robot's session, or of a client that looks whom it would meet.
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
-    (``wait_before_drop`` 0) because a put happens on the event loop; it is deep enough for the largest message.
-    A message from one station to another that must not be lost stops all traffic, requests too, while the other one's
-    queue is full: hence ``HANG_UP_US`` instead of Zenoh's 5 s.
+    (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
     No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
     transport: dict[str, Any] = {
@@ -61,7 +60,7 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
         "link": {
             "tx": {
                 "queue": {
-                    "size": {"data": 16},
+                    "size": {"data_high": 16, "data": 16, "data_low": 16},
                     "congestion_control": {
                         "drop": {"wait_before_drop": 0},
                         "block": {"wait_before_close": HANG_UP_US},

@@ -22,7 +22,7 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import TOPICS, Topic, Writer, alive_key, rpc_key
+from monstertruck_schemas.topics import CAMERA, MAP, MAP_TILES, TOPICS, Topic, Writer, alive_key, rpc_key
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
@@ -30,6 +30,8 @@ from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 
 log = logging.getLogger(__name__)
 
+BULKY = frozenset({CAMERA.name, MAP.name, MAP_TILES.name})
+"""Topics of large messages: on a slow link all others, and answers, go first."""
 MAX_CALLS = 16
 """Remote calls served at once."""
 MAX_WAITING_CALLS = 64
@@ -65,7 +67,6 @@ class ZenohBridge:
         self._clock = clock
         self._rpc = rpc
         self._session: zenoh.Session | None = None
-        self._held: dict[str, bytes] = {}
         rpc.register("topics", self._topics)
 
     async def open(self) -> None:
@@ -184,8 +185,6 @@ class ZenohBridge:
         data: bytes,
         _at: int,
     ) -> None:
-        if topic.retained:
-            self._held[topic.name] = data
         try:
             publishers[topic.name](data)
         except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine
@@ -196,8 +195,8 @@ class ZenohBridge:
 
     def _on_get(self, topic: Topic[Any], key: str, query: zenoh.Query) -> None:
         with query:
-            if (data := self._held.get(topic.name)) is not None:
-                query.reply(key, data, encoding=wire.encoding(topic))
+            if (newest := self._bus.newest(topic)) is not None:
+                query.reply(key, wire.encode(topic, newest), encoding=wire.encoding(topic))
 
     def _serve(self, query: zenoh.Query, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
         if len(active) >= MAX_CALLS:
@@ -211,14 +210,15 @@ class ZenohBridge:
         with query:
             key = str(query.key_expr)
             name = key.removeprefix(rpc_key(self._robot, ""))
-            if self._reply_schemas(query):
+            # A reply waits for room in the queue of a station that takes nothing: beside the loop.
+            if await in_thread(partial(self._reply_schemas, query)):
                 return
             payload = b"" if query.payload is None else query.payload.to_bytes()
             success, data = await self._rpc.answer(name, payload)
             if success:
-                query.reply(key, data, encoding="application/json")
+                await in_thread(partial(query.reply, key, data, encoding="application/json"))
             else:
-                query.reply_err(data, encoding="application/json")
+                await in_thread(partial(query.reply_err, data, encoding="application/json"))
 
     def _reply_schemas(self, query: zenoh.Query) -> bool:
         """Reply with every schema the query's key expression covers; False if there is none."""
@@ -254,18 +254,23 @@ def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:
 
 
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
-    """Put function of one topic; a full queue drops the message rather than stalling the loop."""
+    """Put function of one topic; a full queue drops the message rather than stalling the loop.
+
+    Each priority has a queue of its own: what others say at Zenoh's ordinary one, and answers, are in nobody's way.
+    """
+    priority = zenoh.Priority.DATA_LOW if topic.name in BULKY else zenoh.Priority.DATA_HIGH
     if topic.retained:
         return ext.declare_advanced_publisher(
             session,
             key,
             encoding=wire.encoding(topic),
             congestion_control=zenoh.CongestionControl.DROP,
+            priority=priority,
             cache=ext.CacheConfig(max_samples=1),
             publisher_detection=True,
         ).put
     return session.declare_publisher(
-        key, encoding=wire.encoding(topic), congestion_control=zenoh.CongestionControl.DROP
+        key, encoding=wire.encoding(topic), congestion_control=zenoh.CongestionControl.DROP, priority=priority
     ).put
 
 

@@ -6,7 +6,11 @@ from pathlib import Path
 
 import zenoh
 
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.threads import ThreadHop
 from monstertruck_runtime.zenoh_threads import in_network_thread
+from monstertruck_schemas.topics import DRIVE
 from tests.bus_kit import running_robot
 from tests.unit.bus.test_zenoh_session import put, raw_session
 
@@ -31,3 +35,21 @@ async def test_messages_are_taken_in_a_network_thread_whose_state_is_kept():
     assert places == {"rx"}
     for counted in counts.values():
         assert counted == list(range(1, len(counted) + 1))
+
+
+async def test_clients_take_messages_there(monkeypatch):
+    places: set[str] = set()
+    put_in_queue = ThreadHop.put
+
+    def noted(hop: ThreadHop[bytes], item: bytes) -> None:
+        places.add(Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().partition("-")[0])
+        put_in_queue(hop, item)
+
+    monkeypatch.setattr(ThreadHop, "put", noted)
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client, asyncio.timeout(5):
+        with client.subscribe(DRIVE, fifo(10)) as messages, raw_session(robot.endpoint) as writer:
+            while not places:
+                put(writer, DRIVE.key("truck"), b"{}")
+                await asyncio.sleep(0.01)
+            assert not messages.drain()
+    assert places == {"rx"}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_drivers import pty_port
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.link import BUFFER_LIMIT, SerialPort
 from monstertruck_drivers.pty_port import PtyPort
@@ -289,22 +290,32 @@ async def test_a_vanished_pty_does_not_spin_the_loop(tmp_path: Path):
     link.close()
 
 
-async def test_what_a_device_says_within_a_usb_frame_arrives_together(tmp_path: Path):
+async def test_what_a_device_says_within_a_usb_frame_arrives_together(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(pty_port, "FRAME", 0.05)
     pty = PtyPort(tmp_path / "dev")
     pty.plug()
     async with await SerialPort(tmp_path / "dev").open() as link:
         for byte in b"O", b"\x00":
             pty.device.write(byte)
-            await asyncio.sleep(0)
+            await asyncio.sleep(0.01)
         assert await link.read() == b"O\x00"
+    pty.device.write(b"never sent")
+    pty.unplug()
+    pty.plug()
+    async with await SerialPort(tmp_path / "dev").open() as link:
+        pty.device.write(b"new")
+        await asyncio.sleep(0.04)
+        pty.device.write(b"er")
+        assert await link.read() == b"newer"
     pty.unplug()
 
 
 async def test_a_pty_nobody_reads_never_blocks_the_emulator(tmp_path: Path):
     pty = PtyPort(tmp_path / "dev")
     pty.plug()
-    for _ in range(100):
+    for _ in range(20):
         pty.device.write(b"z" * 4096)
+        await asyncio.sleep(0.003)
     async with await SerialPort(tmp_path / "dev").open() as link:
         link.discard()
         await asyncio.sleep(0.01)

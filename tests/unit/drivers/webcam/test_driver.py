@@ -14,9 +14,10 @@ from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.driver import WebcamDriver
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
+from monstertruck_drivers.webcam.packets import Kind, Packet, encode_mode
 from monstertruck_drivers.webcam.path_source import PathSource
 from monstertruck_drivers.webcam.rendered_source import RenderedSource
-from monstertruck_drivers.webcam.source import FrameSource
+from monstertruck_drivers.webcam.source import FrameSource, Mode
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -368,3 +369,24 @@ async def test_a_v4l2_camera_whose_node_vanishes():
             await asyncio.sleep(0)
         node.push(picture(seed=3), stamp=clock.now())
         await out.count(1)
+
+
+def test_a_picture_that_comes_with_the_grant_is_not_lost():
+    async def main(clock: VirtualClock) -> None:
+        port, granted = MemoryPort("camera"), Mode(160, 120, 15.0)
+        port.plug()
+
+        async def camera() -> None:
+            await port.device.read()
+            grant = Packet(Kind.GRANTED, payload=encode_mode(granted))
+            port.device.write(grant.encode() + Packet(Kind.PICTURE, 7, 1, b"picture").encode())
+
+        async with (
+            background(camera()),
+            await RenderedSource(port, clock).open(granted, 4) as stream,
+            clock.deadline(1.0),
+        ):
+            frame = await stream.next()
+        assert (frame.sequence, frame.data) == (7, b"picture")
+
+    run_virtual(main)
