@@ -7,6 +7,7 @@ import pytest
 from monstertruck_runtime.clock import MILLISECOND, VirtualClock, run_virtual
 from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTIONS
 from monstertruck_schemas import topics
+from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.validate import load_config
 from monstertruckd.sim.config import SimulatedTruckConfig
 from monstertruckd.sim.faults_drill import with_overlay
@@ -31,7 +32,7 @@ ASKED = {topics.STEERING: (20, 1), topics.STABILISER: (25, 4), topics.DRIVES[0]:
 
 
 def seen(wanted, instant):
-    """``instant`` of the messages of two seconds, by topic."""
+    """``instant`` of message and present time, for the messages of two seconds that taps get, by topic."""
     config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0]
     found = defaultdict(list)
 
@@ -39,7 +40,7 @@ def seen(wanted, instant):
         rig = VirtualRig(with_overlay(config, {"recorder": None, "map": None}), clock)
         async with rig.running():
             await clock.sleep(4.0)
-            tap = rig.bus.tap(lambda topic, message, *_: found[topic].append(instant(message)), wanted)
+            tap = rig.bus.tap(lambda topic, message, *_: found[topic].append(instant(message, clock.now())), wanted)
             await clock.sleep(2.0)
             tap.close()
 
@@ -48,7 +49,7 @@ def seen(wanted, instant):
 
 
 def test_devices_are_asked_before_the_estimates_are_made():
-    found = seen(ASKED, lambda message: message.received)
+    found = seen(ASKED, lambda message, _: message.received)
     for topic, (rate, takes) in ASKED.items():
         period = 1000 * MILLISECOND // rate
         took = sorted((instant + QUESTIONS) % period for instant in found[topic])
@@ -58,9 +59,20 @@ def test_devices_are_asked_before_the_estimates_are_made():
 
 
 def test_estimates_come_first_then_who_uses_them_then_the_gate_then_threads():
-    found = seen(PLACES, lambda message: message.stamp)
+    found = seen(PLACES, lambda message, _: message.stamp)
     for topic, (rate, ahead) in PLACES.items():
         period = 1000 * MILLISECOND // rate
         late = [(stamp + ahead) % period for stamp in found[topic]]
+        assert late, topic.name
+        assert max(late) < MILLISECOND // 10, topic.name
+
+
+def test_what_leaves_leaves_in_rows_behind_the_gate():
+    wanted = (topics.ODOMETRY, topics.SCAN, topics.CMD_DRIVES[0], topics.HEALTH)
+    found = seen(wanted, lambda _, now: now)
+    # Retained messages are told at once at the begin, what waits at the end.
+    begin, end = min(map(min, found.values())), max(map(max, found.values()))
+    for topic in wanted:
+        late = [(now - BEHIND) % (40 * MILLISECOND) for now in found[topic] if begin < now < end]
         assert late, topic.name
         assert max(late) < MILLISECOND // 10, topic.name

@@ -15,16 +15,20 @@ from tests.bus_kit import running_robot
 from tests.unit.bus.test_zenoh_session import put, raw_session
 
 
+def place() -> str:
+    """Of whose threads the present one is, by its name."""
+    return Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().partition("-")[0]
+
+
 async def test_messages_are_taken_in_a_network_thread_whose_state_is_kept():
     places: set[str] = set()
     memory = threading.local()
     counts: dict[int, list[int]] = {}
 
     def take(_: zenoh.Sample) -> None:
-        thread = threading.get_native_id()
-        places.add(Path(f"/proc/self/task/{thread}/comm").read_text().partition("-")[0])
+        places.add(place())
         memory.count = getattr(memory, "count", 0) + 1
-        counts.setdefault(thread, []).append(memory.count)
+        counts.setdefault(threading.get_native_id(), []).append(memory.count)
 
     async with running_robot() as robot:
         with raw_session(robot.endpoint) as reader, raw_session(robot.endpoint) as writer:
@@ -42,7 +46,7 @@ async def test_clients_take_messages_there(monkeypatch):
     put_in_queue = ThreadHop.put
 
     def noted(hop: ThreadHop[bytes], item: bytes) -> None:
-        places.add(Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().partition("-")[0])
+        places.add(place())
         put_in_queue(hop, item)
 
     monkeypatch.setattr(ThreadHop, "put", noted)

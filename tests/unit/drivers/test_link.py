@@ -313,7 +313,7 @@ async def test_what_a_device_says_within_a_usb_frame_arrives_together(tmp_path: 
 async def test_a_pty_nobody_reads_never_blocks_the_emulator(tmp_path: Path):
     pty = PtyPort(tmp_path / "dev")
     pty.plug()
-    for _ in range(20):
+    for _ in range(100):
         pty.device.write(b"z" * 4096)
         await asyncio.sleep(0.003)
     async with await SerialPort(tmp_path / "dev").open() as link:
