@@ -5,7 +5,8 @@
 ``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
 ``raw``: plain bytes, put and awaited in asyncio, taken as zenoh-python hands them over. ``direct``: the same, taken in
 the thread that reads the network, as the product does. ``thread``: plain bytes answered in Zenoh's own thread, no
-asyncio at all. Every end listens at HERE and dials THERE. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
+asyncio at all. Every end listens at HERE, as a robot, which sends, and dials THERE, as a station, which receives; all
+have Zenoh's threads arranged as stations have them. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
 other) on its standard input and answers with a JSON list of round trips in ns.
 """
 
@@ -25,7 +26,7 @@ import zenoh
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_runtime.zenoh_threads import in_network_thread
+from monstertruck_runtime.zenoh_threads import in_network_thread, readers_watch_links
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
 from monstertruckd.bus.local import Bus
@@ -195,4 +196,5 @@ async def in_thread(
 
 
 if __name__ == "__main__":
-    run_wall(lambda clock: run(clock, *sys.argv[1:]))
+    with readers_watch_links():  # whatever is opened first
+        run_wall(lambda clock: run(clock, *sys.argv[1:]))

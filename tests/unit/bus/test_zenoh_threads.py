@@ -1,6 +1,8 @@
 """Messages taken in the thread that reads the network."""
 
 import asyncio
+import os
+import sys
 import threading
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import zenoh
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.threads import ThreadHop
-from monstertruck_runtime.zenoh_threads import in_network_thread
+from monstertruck_runtime.zenoh_threads import VARIABLE, in_network_thread
 from monstertruck_schemas.topics import DRIVE
 from tests.bus_kit import running_robot
 from tests.unit.bus.test_zenoh_session import put, raw_session
@@ -57,3 +59,39 @@ async def test_clients_take_messages_there(monkeypatch):
                 await asyncio.sleep(0.01)
             assert not messages.drain()
     assert places == {"rx"}
+
+
+STATION = """
+import asyncio, os, sys
+from pathlib import Path
+from monstertruck_runtime.client import TruckClient
+
+async def main():
+    async with TruckClient(endpoint=sys.argv[1]):
+        names = {path.read_text().partition("-")[0] for path in Path("/proc/self/task").glob("*/comm")}
+    print("app" in names, "rx" in names, os.environ.get("ZENOH_RUNTIME"))
+
+asyncio.run(main())
+"""
+
+
+async def station(endpoint: str, **environment: str) -> str:
+    """Of a station's own process: whether threads watch links or read them, and what programs it starts inherit."""
+    command = (sys.executable, "-c", STATION, endpoint)
+    inherited = {name: value for name, value in os.environ.items() if name != VARIABLE}
+    process = await asyncio.create_subprocess_exec(
+        *command, stdout=asyncio.subprocess.PIPE, env=inherited | environment
+    )
+    answer, _ = await process.communicate()
+    return answer.decode().strip()
+
+
+async def test_a_stations_links_are_watched_by_the_threads_that_read_them():
+    async with running_robot() as robot, asyncio.timeout(20):
+        assert await station(robot.endpoint) == "False True None"
+
+
+async def test_what_the_user_says_of_zenohs_threads_stands():
+    own = "(rx: (worker_threads: 3))"
+    async with running_robot() as robot, asyncio.timeout(20):
+        assert await station(robot.endpoint, ZENOH_RUNTIME=own) == f"True True {own}"
