@@ -4,9 +4,9 @@
 
 Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them, and every
 round starts them anew, for where the system puts a process weighs as much as what it does. They are: the product
-(message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio; once
-as zenoh-python hands them over, once taken in the thread that reads the network, as the product does), the same without
-asyncio, and, where Debian's ROS 1 is installed (``apt install ros-core python3-rospy``), rospy's
+(message object in, message object awaited in asyncio), the same bytes untyped over the same way (Zenoh, asyncio: by
+zenoh-python as it comes, with its threads arranged as the product's, and taken as the product takes them, too), and,
+where Debian's ROS 1 is installed (``apt install python3-rospy python3-sensor-msgs python3-rosmaster``), rospy's
 ``sensor_msgs/LaserScan``. A round trip is two messages. The processor time is that of both processes at 100 round
 trips a second. The codec is measured alone, in processor time of many calls in a row, and for comparison once after a
 pause each. The last line is JSON.
@@ -16,6 +16,7 @@ ours), so that programs are compared, not builds of Python.
 """
 
 import argparse
+import itertools
 import json
 import os
 import select
@@ -35,7 +36,6 @@ from same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 
 from monstertruck_runtime import wire
 from monstertruck_schemas.topics import SCAN
-from monstertruckd.demo.wall import free_endpoint
 
 HERE = Path(__file__).resolve().parent
 GOALS = {
@@ -45,6 +45,7 @@ GOALS = {
     "p50_over_rospy": 1.3,
     "cpu_over_rospy": 1.3,
 }
+_ends = itertools.cycle(range(256))
 TURNS, BURST, PACED, RATE = 8, 60, 150, 100.0
 
 
@@ -98,8 +99,8 @@ def _processes(ping: list[str], echo: list[str], **options: Any) -> Iterator[Pai
 
 @contextmanager
 def zenoh_pair(kind: str) -> Iterator[Pair]:
-    """Ends of ``bus_peers``."""
-    one, other = free_endpoint(), free_endpoint()
+    """Ends of ``bus_peers``, each at an address of its own: nobody takes its port before it listens there."""
+    one, other = (f"tcp/127.1.{next(_ends)}.1:7447" for _ in range(2))
     program = [sys.executable, str(HERE / "bus_peers.py"), kind]
     with _processes([*program, "ping", one, other], [*program, "echo", other, one]) as pair:
         yield pair
@@ -168,7 +169,7 @@ def from_cold_caches(repeats: int = 200) -> dict[str, float]:
 
 def compare(rounds: int) -> dict[str, float]:
     """Medians over the rounds; ratios are those of one round."""
-    kinds = ("typed", "raw", "direct", "thread", *(("rospy",) if has_rospy() else ()))
+    kinds = ("typed", "raw", "arranged", "direct", *(("rospy",) if has_rospy() else ()))
     p50, p99, cpu = ({kind: np.empty(rounds) for kind in kinds} for _ in range(3))
     for number in range(rounds):
         with ExitStack() as stack:

@@ -1,24 +1,22 @@
 """The two ends of ``bus.py``: scans to and fro over Zenoh, as the product does it and as plain bytes.
 
-    python bus_peers.py typed|raw|direct|thread ping|echo HERE THERE
+    python bus_peers.py typed|raw|arranged|direct ping|echo HERE THERE
 
 ``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
-``raw``: plain bytes, put and awaited in asyncio, taken as zenoh-python hands them over. ``direct``: the same, taken in
-the thread that reads the network, as the product does. ``thread``: plain bytes answered in Zenoh's own thread, no
-asyncio at all. Every end listens at HERE, as a robot, which sends, and dials THERE, as a station, which receives; all
-have Zenoh's threads arranged as stations have them. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the
-other) on its standard input and answers with a JSON list of round trips in ns.
+``raw``: plain bytes, put and awaited in asyncio, by zenoh-python as it comes. ``arranged``: the same, Zenoh's threads
+arranged as stations of the product have them. ``direct``: and the bytes taken in the thread that reads the network, as
+they do. Every end listens at HERE, as a robot, which sends, and dials THERE, as a station, which receives. ``ping``
+takes lines ``COUNT RATE`` (rate 0 = one after the other) on its standard input and answers with a JSON list of round
+trips in ns.
 """
 
 import asyncio
 import json
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
-from functools import partial
+from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
 
 import numpy as np
 import zenoh
@@ -72,6 +70,7 @@ async def typed(me: str, here: str, there: str) -> AsyncIterator[tuple[Callable[
     out = bus.publisher(SCAN, Writer.DRIVER)
     ready = asyncio.Event()
     bridge = ZenohBridge(me, bus, ZenohConfig(listen=(here,)), clock, Rpc(clock))
+    await bridge.open()
     serving = asyncio.create_task(bridge.run(ready.set))
     await ready.wait()
     async with await connect(clock, OTHER[me], there) as client:
@@ -160,41 +159,15 @@ async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> N
                 await pings(lambda number: put(scan(number, time.monotonic_ns())), receive)
             while True:
                 put(await receive())
-        if kind in ("raw", "direct"):
-            inbox = Inbox()
-            take = inbox.put if kind == "raw" else in_network_thread(inbox.put)
-            send = await stack.enter_async_context(raw(me, here, there, take))
-            if me == "ping":
-                await pings(lambda _: send(payload), inbox.get)
-            while True:
-                send(await inbox.get())
-        await in_thread(stack, partial(raw, me, here, there), me, payload)
-
-
-async def in_thread(
-    stack: AsyncExitStack, session: Callable[[Callable[[zenoh.Sample], None]], object], me: str, payload: bytes
-) -> None:
-    """Both ends without asyncio: echoed in Zenoh's thread, awaited by blocking."""
-    arrived = threading.Semaphore(0)
-    sends: list[Callable[[bytes], None]] = []
-
-    def receive(sample: zenoh.Sample) -> None:
-        data = sample.payload.to_bytes()
-        if me == "echo":
-            sends[0](data)
-        else:
-            arrived.release()
-
-    sends.append(await stack.enter_async_context(session(receive)))
-    if me == "echo":
-        await asyncio.Event().wait()
-
-    async def blocking() -> None:
-        assert arrived.acquire(timeout=PATIENCE)
-
-    await pings(lambda _: sends[0](payload), blocking)
+        inbox = Inbox()
+        take = in_network_thread(inbox.put) if kind == "direct" else inbox.put
+        send = await stack.enter_async_context(raw(me, here, there, take))
+        if me == "ping":
+            await pings(lambda _: send(payload), inbox.get)
+        while True:
+            send(await inbox.get())
 
 
 if __name__ == "__main__":
-    with readers_watch_links():  # whatever is opened first
+    with nullcontext() if sys.argv[1] == "raw" else readers_watch_links():  # whatever is opened first
         run_wall(lambda clock: run(clock, *sys.argv[1:]))
