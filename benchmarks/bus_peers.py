@@ -1,13 +1,12 @@
 """The two ends of ``bus.py``: scans to and fro over Zenoh, as the product does it and as plain bytes.
 
-    python bus_peers.py typed|raw|arranged|direct ping|echo HERE THERE
+    python bus_peers.py typed|raw|direct ping|echo HERE THERE
 
 ``typed``: message object to bus, bridge and Zenoh; Zenoh to client and a message object awaited in asyncio.
-``raw``: plain bytes, put and awaited in asyncio, by zenoh-python as it comes. ``arranged``: the same, Zenoh's threads
-arranged as stations of the product have them. ``direct``: and the bytes taken in the thread that reads the network, as
-they do. Every end listens at HERE, as a robot, which sends, and dials THERE, as a station, which receives. ``ping``
-takes lines ``COUNT RATE`` (rate 0 = one after the other) on its standard input and answers with a JSON list of round
-trips in ns.
+``raw``: plain bytes, put and awaited in asyncio, taken as zenoh-python hands them over. ``direct``: the same, taken in
+the thread that reads the network, as the product does. Every end listens at HERE, as a robot, which sends, and dials
+THERE, as a station, which receives. ``ping`` takes lines ``COUNT RATE`` (rate 0 = one after the other) on its standard
+input and answers with a JSON list of round trips in ns.
 """
 
 import asyncio
@@ -16,7 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import numpy as np
 import zenoh
@@ -24,7 +23,7 @@ import zenoh
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_runtime.zenoh_threads import in_network_thread, readers_watch_links
+from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
 from monstertruckd.bus.local import Bus
@@ -169,5 +168,4 @@ async def run(_clock: WallClock, kind: str, me: str, here: str, there: str) -> N
 
 
 if __name__ == "__main__":
-    with nullcontext() if sys.argv[1] == "raw" else readers_watch_links():  # whatever is opened first
-        run_wall(lambda clock: run(clock, *sys.argv[1:]))
+    run_wall(lambda clock: run(clock, *sys.argv[1:]))

@@ -21,7 +21,7 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.station import ClientTls, session_config, station_tls
 from monstertruck_runtime.threads import ThreadHop, in_thread
-from monstertruck_runtime.zenoh_threads import in_network_thread, readers_watch_links
+from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
@@ -313,8 +313,7 @@ class TruckClient:
             tls = station_tls()
         config = session_config(self.endpoint, self._timeout, tls)
         try:
-            with readers_watch_links():
-                self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             msg = f"no robot answers at {self.endpoint} within {self._timeout} s"
             raise NotFoundError(msg) from error

@@ -1,35 +1,11 @@
-"""Which of Zenoh's threads wait for a station's link, and in which messages are taken."""
+"""In which of Zenoh's threads messages are taken."""
 
 import ctypes
-import os
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Final
+from collections.abc import Callable
 
 import zenoh
 from zenoh import handlers
-
-VARIABLE: Final = "ZENOH_RUNTIME"
-"""Where Zenoh's run-time looks, once, for how many threads do what."""
-
-
-@contextmanager
-def readers_watch_links() -> Iterator[None]:
-    """Open a process's first Zenoh session herein, and the threads that read its links also wait for their bytes.
-
-    By default another thread waits and wakes one of those, which takes a sixth of a round trip. It goes for links the
-    process dials, and is for stations only: a robot passes messages on, and while its readers wait for room in the
-    queue of one link, somebody must notice that there is room. What the user has set in the environment stands.
-    """
-    if VARIABLE in os.environ:
-        yield
-        return
-    os.environ[VARIABLE] = "(app: (handover: rx))"
-    try:
-        yield
-    finally:
-        os.environ.pop(VARIABLE, None)  # not for the programs it starts later: they may be robots
 
 
 def in_network_thread(take: Callable[[zenoh.Sample], None]) -> "handlers.Callback[zenoh.Sample]":
