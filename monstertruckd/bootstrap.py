@@ -6,6 +6,7 @@ and runs the command there. A second run finds everything in place.
 
     python3 -m monstertruckd.bootstrap demo     the truck drives a lap
     python3 -m monstertruckd.bootstrap check    lint, types, import contracts, all tests
+    python3 -m monstertruckd.bootstrap sync     all packages, nothing run
 """
 
 import hashlib

@@ -6,6 +6,7 @@ and nothing is written before the wizard has returned its result. So an interrup
 leaves the calibration as it was; the truck's stop is the gate's business, as for any operator that falls silent.
 """
 
+import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -140,7 +141,7 @@ class Guide:
 async def calibrate(
     wizard: Wizard, truck: Truck, panel: Panel, clock: Clock, config: TruckConfig, known: Mapping[WizardName, Result]
 ) -> tuple[Result, str]:
-    """Run a wizard, and have the daemon save what it found; returns that and the path of the new file.
+    """Run a wizard, and have the daemon save what it found; returns that as it is saved and the path of the new file.
 
     Raises:
         TruckError: whatever ended it; nothing was saved then.
@@ -150,4 +151,4 @@ async def calibrate(
         panel.say(f"room: {wizard.room}")
     result = await wizard.run(Guide(truck, panel, clock, config, known))
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "by": truck.source})
-    return result, str(saved["file"])
+    return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])

@@ -77,7 +77,9 @@ def register(
         result = _result(payload.get("result"))
         await offload(lambda: with_values(config, [result], "result"))
         path = await offload(lambda: store.save(result, real_time()))
-        return tell(path, f"{result.wizard} calibrated", payload.get("by"))
+        saved = (await offload(lambda: store.load(path))).results[result.wizard]
+        told = tell(path, f"{result.wizard} calibrated", payload.get("by"))
+        return told | {"result": saved.model_dump(mode="json")}
 
     async def undo(payload: dict[str, Any]) -> dict[str, Any]:
         wizard: WizardName | None = next((n for n in get_args(WizardName) if n == payload.get("wizard")), None)

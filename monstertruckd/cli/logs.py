@@ -76,6 +76,7 @@ def list_command(
 def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     """What a log holds: topics, counts, rates, attachments, damage."""
     from monstertruckd.logs import info
+    from monstertruckd.logs.recover import in_use
 
     summary = info(log)
     if json_output:
@@ -84,7 +85,8 @@ def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     size = f"{summary['size'] / 1e6:.2f} MB"
     print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
     if summary["damage"]:
-        print(f"damaged: {summary['damage']}; `monstertruckd log recover` repairs it")
+        mend = "it is being written" if in_use(log) else "`monstertruckd log recover` repairs it"
+        print(f"damaged: {summary['damage']}; {mend}")
     rows = [
         (
             name,
@@ -217,5 +219,6 @@ def needs_extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        text = f"{error.name} is not installed: it comes with the extra {name!r} (pip install 'monstertruckd[{name}]')"
+        text = f"{error.name} is not installed: it comes with the extra {name!r} "
+        text += f"(pip install 'monstertruckd[{name}]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
         raise NotFoundError(text) from None

@@ -175,6 +175,11 @@ class CommandGroup(TyperGroup):
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
             remark(str(error) or reason.text)
             raise typer.Exit(reason.exit_code) from None
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.startswith("monstertruck"):
+                raise
+            remark(f"{error.name} is not installed: an extra brings it (monstertruckd doctor names the command)")
+            raise typer.Exit(Reason.NOT_INSTALLED.exit_code) from None
         except KeyboardInterrupt:
             remark(Reason.CANCELLED.text)
             raise typer.Exit(Reason.CANCELLED.exit_code) from None

@@ -33,6 +33,19 @@ _DAMAGE: Final = (
 """What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
 
 
+def spare_log(output: Path) -> None:
+    """Make sure that what is to be written does not take the place of a log.
+
+    Raises:
+        InputError: there is a log under that name.
+    """
+    if output.is_file():
+        with output.open("rb") as file:
+            if file.read(len(MAGIC)) == MAGIC:
+                msg = f"{output}: is a log, which is not overwritten; name another file"
+                raise InputError(msg)
+
+
 @dataclass(frozen=True, slots=True)
 class LogMessage:
     """One message of a log."""

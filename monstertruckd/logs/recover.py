@@ -47,7 +47,8 @@ def in_use(path: Path) -> bool:
 def recover(source: str | Path, target: str | Path, stop: threading.Event | None = None) -> Recovery:
     """Rewrite everything up to the first error of ``source`` as a finished log ``target``.
 
-    One streaming pass; ``target`` appears complete or not at all, and may be ``source`` itself.
+    One streaming pass; ``target`` appears complete or not at all, and may be ``source`` itself, which is left as it is
+    if it is sound.
 
     Args:
         source: the damaged log.
@@ -55,7 +56,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
         stop: set by another thread, abandons the repair.
 
     Raises:
-        InputError: not a log, being written right now, or ``target`` cannot be written.
+        InputError: not a log, being written right now, or ``target`` is another file or cannot be written.
         NotFoundError: no such file.
     """
     source, target = Path(source), Path(target)
@@ -65,12 +66,19 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
         if not _lock(original):
             msg = f"{source}: is being written"
             raise InputError(msg)
+        in_place = target.exists()
+        if in_place and not target.samefile(source):
+            msg = f"{target}: exists already; name a new file"
+            raise InputError(msg)
         try:
             with part.open("wb") as output:
                 messages = _copy(reader, output, stop)
                 output.flush()
                 os.fsync(output.fileno())
-            part.replace(target)
+            if in_place and reader.damage is None and is_finished(source):
+                part.unlink()
+            else:
+                part.replace(target)
         except OSError as error:
             part.unlink(missing_ok=True)
             msg = f"{target}: cannot be written: {error.strerror}"

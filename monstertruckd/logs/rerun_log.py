@@ -20,7 +20,7 @@ from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import GateState, Grid, Odometry, Transforms
-from monstertruckd.logs.reader import LogReader
+from monstertruckd.logs.reader import LogReader, spare_log
 from monstertruckd.logs.report.curves import FIGURES, Curve, Figure
 from monstertruckd.logs.report.way import Way
 from monstertruckd.logs.selection import ALL, Progress, Selection
@@ -51,12 +51,13 @@ def convert(log: str | Path, output: str | Path, selection: Selection = ALL, pro
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, a message in it is invalid, or ``output`` cannot be written.
+        InputError: not a log, a message in it is invalid, or ``output`` cannot be written or is a log.
     """
     reader = LogReader(Path(log))
     offset = real_offset(reader)
     output = Path(output)
     try:
+        spare_log(output)
         output.parent.mkdir(parents=True, exist_ok=True)
         output.open("wb").close()
     except OSError as error:

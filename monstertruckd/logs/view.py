@@ -22,8 +22,10 @@ def show(recording: Path) -> None:
     """Show a rerun file until the viewer is closed.
 
     Raises:
-        CommandFailedError: the viewer failed, e.g. there is no display.
+        CommandFailedError: there is no display, or the viewer failed.
     """
+    if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))):
+        raise CommandFailedError("the rerun viewer needs a display, and there is none; --save writes a file instead")
     with tempfile.TemporaryDirectory(prefix="monstertruckd-view-") as folder:
         confined = environment(Path(folder))
         _run(["analytics", "disable"], confined, quiet=True)
@@ -44,5 +46,5 @@ def _run(arguments: list[str], confined: dict[str, str], *, quiet: bool = False)
     output = subprocess.DEVNULL if quiet else None
     done = subprocess.run(command, env=confined, stdout=output, stderr=output, check=False)  # noqa: S603  # our own
     if done.returncode:
-        msg = f"the rerun viewer ended with {done.returncode}; it needs a display, --save writes a file instead"
+        msg = f"the rerun viewer ended with {done.returncode}; --save writes a file instead"
         raise CommandFailedError(msg)

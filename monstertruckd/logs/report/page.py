@@ -12,6 +12,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Cause, Event, LogLevel, Severity, Stop
 from monstertruck_schemas.health import ServiceState
+from monstertruckd.logs.reader import spare_log
 from monstertruckd.logs.report.collect import Run, collect
 from monstertruckd.logs.report.drawing import SEVERITY_TONE, Lines, plots, plotted, scene, timeline
 from monstertruckd.logs.report.spans import Tone
@@ -59,11 +60,12 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, without messages, or the page cannot be written.
+        InputError: not a log, without messages, or the page cannot be written or would overwrite a log.
     """
-    run = collect(log, progress)
     file = Path(log).with_suffix(".html") if output is None else Path(output)
+    run = collect(log, progress)
     try:
+        spare_log(file)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(page(run), encoding="utf-8")
     except OSError as error:

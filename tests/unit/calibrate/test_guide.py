@@ -21,6 +21,7 @@ CONFIG = load_uncalibrated(Path(__file__).resolve().parents[3] / "configs" / "de
 RESULT = Result(
     wizard="battery", measured="test", estimates=(Estimate(name="gain", value=1.1, samples=1, meaning="test"),)
 )
+DATE = "2026-11-22T12:00:00Z"
 
 
 class Truck:
@@ -42,7 +43,7 @@ class Truck:
 
     async def call(self, rpc, payload=None):
         self.calls.append((rpc, payload))
-        return {"file": "0001.json"}
+        return {"file": "0001.json", "result": payload["result"] | {"date": DATE}}
 
 
 class Panel:
@@ -81,7 +82,7 @@ def test_the_result_is_saved_by_the_daemon_at_the_end():
         assert not truck.calls
         return guide.fit("scale", lambda: RESULT)
 
-    assert run(steps, panel, truck) == (RESULT, "0001.json")
+    assert run(steps, panel, truck) == (RESULT.model_copy(update={"date": DATE}), "0001.json")
     assert truck.calls == [("calibration_save", {"result": RESULT.model_dump(mode="json"), "by": "test"})]
     assert panel.said == ["battery: test", "room: a table", "computing: scale"]
 

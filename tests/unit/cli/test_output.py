@@ -48,6 +48,14 @@ def test_an_error_is_one_sentence_and_its_reasons_code(
     assert (streams.out, streams.err) == ("", f"{error}\n")
 
 
+def test_a_missing_package_is_one_sentence(capsys: pytest.CaptureFixture[str]):
+    def command() -> None:
+        import no_such_package  # noqa: F401
+
+    assert ending(command) == Reason.NOT_INSTALLED.exit_code
+    assert "no_such_package is not installed: an extra brings it" in capsys.readouterr().err
+
+
 def test_an_interrupt_gives_up_but_is_the_ordinary_end_of_what_runs_until_stopped():
     def finite() -> None:
         signal.raise_signal(signal.SIGTERM)

@@ -1,5 +1,6 @@
 """The commands on logs, as a user types them."""
 
+import fcntl
 import json
 from pathlib import Path
 
@@ -47,3 +48,23 @@ def test_refusals_have_a_sentence_and_an_exit_code(tmp_path, monkeypatch, argume
     done = run(*arguments)
     assert done.exit_code == code
     assert text in done.output
+
+
+@pytest.mark.parametrize("arguments", [("report", "-o"), ("view", "--save")])
+def test_no_page_and_no_recording_takes_the_place_of_a_log(tmp_path, arguments):
+    log = tmp_path / "run.mcap"
+    log.write_bytes(GOLDEN.read_bytes())
+    command, option = arguments
+    done = run(command, log, option, log)
+    assert done.exit_code == 3
+    assert "is a log, which is not overwritten" in done.output
+    assert log.read_bytes() == GOLDEN.read_bytes()
+
+
+def test_info_knows_a_log_that_is_being_written(tmp_path):
+    log = tmp_path / "run.mcap"
+    log.write_bytes(GOLDEN.read_bytes()[:-20])
+    with log.open("rb") as writer:
+        fcntl.flock(writer, fcntl.LOCK_EX)
+        assert "it is being written" in run("info", log).output
+    assert "`monstertruckd log recover` repairs it" in run("info", log).output

@@ -119,6 +119,7 @@ def test_fuzz_any_damage_reads_a_prefix(tmp_path_factory, compression, data):
     damaged.write_bytes(content[: data.draw(st.integers(8, len(content)))])
     found = [(m.topic, m.payload) for m in open_log(damaged)]
     assert len(found) <= len(whole)
+    (folder / "fixed.mcap").unlink(missing_ok=True)
     fixed = recover(damaged, folder / "fixed.mcap")
     assert [(m.topic, m.payload) for m in open_log(folder / "fixed.mcap")] == found
     assert fixed.messages == len(found)
@@ -210,6 +211,23 @@ def test_recovered_log_opens_everywhere_and_the_original_stays(cut, tmp_path):
         assert {c.topic: c.message_encoding for c in reader.get_summary().channels.values()} == {
             topic.name: wire.schema(topic).message_encoding for topic in MAKERS
         }
+
+
+def test_a_sound_log_is_left_as_it_is(tmp_path):
+    log = tmp_path / "run.mcap"
+    write(log, 20)
+    before, place = log.read_bytes(), log.stat().st_ino
+    assert recover(log, log).damage is None
+    assert (log.read_bytes(), log.stat().st_ino) == (before, place)
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def test_recovery_takes_no_other_files_place(cut, tmp_path):
+    precious = tmp_path / "precious.txt"
+    precious.write_text("notes")
+    with pytest.raises(InputError, match=r"precious\.txt: exists already"):
+        recover(cut, precious)
+    assert precious.read_text() == "notes"
 
 
 def test_recovery_leaves_the_original_when_it_cannot_write(cut, tmp_path):

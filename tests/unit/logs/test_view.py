@@ -12,13 +12,13 @@ import rerun as rr
 from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruckd.cli.logs import app, needs_extra
 from monstertruckd.logs.rerun_log import TIMELINE, convert
 from monstertruckd.logs.selection import Selection
-from monstertruckd.logs.view import environment
+from monstertruckd.logs.view import environment, show
 from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 from tests.unit.logs.test_export import grid, image, path, transforms
 from tests.unit.recorder.conftest import scan
@@ -136,6 +136,13 @@ def test_command_saves_a_recording(log, tmp_path):
     done = CliRunner().invoke(app, ["view", str(log), "--save", str(tmp_path / "x.rrd"), "--end", "0.5"])
     assert done.exit_code == 0, done.output
     assert rows(read(tmp_path / "x.rrd")["/scan"]) == 5
+
+
+def test_without_a_display_nothing_is_started(tmp_path, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(CommandFailedError, match="needs a display, and there is none; --save"):
+        show(tmp_path / "x.rrd")
 
 
 def test_missing_extra_is_named():
