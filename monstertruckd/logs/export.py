@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from monstertruck_runtime.errors import InputError
 from monstertruckd.logs.reader import LogReader
 from monstertruckd.logs.selection import ALL, Progress, Selection
+from monstertruckd.logs.unfinished import removed_on_failure
 from monstertruckd.logs.wall_time import real_offset
 
 _LOG_TIME, _REAL_TIME = "log_time", "real_time"
@@ -38,15 +39,18 @@ def export_csv(
     """
     directory = _folder(output)
     files: dict[str, Path] = {}
-    with ExitStack() as stack:
+    with removed_on_failure() as parts, ExitStack() as stack:
         writers: dict[str, Any] = {}
         for topic, row in _rows(path, directory, selection, progress):
             if topic not in writers:
                 files[topic] = directory / f"{_stem(topic)}.csv"
-                writers[topic] = csv.writer(stack.enter_context(files[topic].open("w", newline="")))
+                parts.append(_part(files[topic]))
+                writers[topic] = csv.writer(stack.enter_context(parts[-1].open("w", newline="")))
                 writers[topic].writerow(row)
             row[_REAL_TIME] = f"{np.datetime64(row[_REAL_TIME], 'ns')}Z"
             writers[topic].writerow(_cell(value) for value in row.values())
+    for file in files.values():
+        _part(file).replace(file)
     return files
 
 
@@ -79,8 +83,17 @@ def export_npz(
         for name, values in table.items():
             arrays |= _column(name, values)
         files[topic] = directory / f"{_stem(topic)}.npz"
-        np.savez_compressed(files[topic], allow_pickle=False, **arrays)
+        with removed_on_failure() as parts:
+            parts.append(_part(files[topic]))
+            with parts[-1].open("wb") as part:
+                np.savez_compressed(part, allow_pickle=False, **arrays)
+        parts[-1].replace(files[topic])
     return files
+
+
+def _part(file: Path) -> Path:
+    """Name of a file that is not complete yet."""
+    return file.with_name(file.name + ".part")
 
 
 def _folder(directory: str | Path) -> Path:

@@ -27,6 +27,7 @@ from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.logs.reader import LogReader
 from monstertruckd.logs.selection import ALL, Progress, Selection
+from monstertruckd.logs.unfinished import removed_on_failure
 from monstertruckd.logs.wall_time import real_offset
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
@@ -54,7 +55,11 @@ def export_ros2(
     directory = Path(output)
     topics: dict[str, Path] = {}
     try:
-        with Writer(directory, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
+        with (
+            removed_on_failure() as made,
+            Writer(directory, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as bag,
+        ):
+            made.append(directory)
             connections: dict[str, Any] = {}
             for entry, message in selection.of(reader, progress):
                 topic = BY_NAME[entry.topic]

@@ -18,6 +18,7 @@ from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.logs.channels import Channels
 from monstertruckd.logs.reader import LogReader
 from monstertruckd.logs.selection import ALL, Progress, Selection
+from monstertruckd.logs.unfinished import removed_on_failure
 from monstertruckd.logs.wall_time import real_offset
 
 S = TypeVar("S", bound=Schema)
@@ -43,7 +44,8 @@ def export_mcap(
     topics: dict[str, Path] = {}
     file = Path(output)
     try:
-        with file.open("xb") as stream:
+        with removed_on_failure() as made, file.open("xb") as stream:
+            made.append(file)
             writer = Writer(stream)
             _begin(writer, reader, offset)
             channels = Channels(writer)

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruckd.cli.main import app
+from monstertruckd.logs.selection import Selection
 
 GOLDEN = max((Path(__file__).parents[2] / "data" / "golden").glob("*/run.mcap"))
 
@@ -68,3 +69,24 @@ def test_info_knows_a_log_that_is_being_written(tmp_path):
         fcntl.flock(writer, fcntl.LOCK_EX)
         assert "it is being written" in run("info", log).output
     assert "`monstertruckd log recover` repairs it" in run("info", log).output
+
+
+@pytest.mark.parametrize("form", ["csv", "npz", "ros2", "mcap"])
+def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeypatch, form):
+    whole = Selection.of
+
+    def interrupted(*arguments):
+        for number, row in enumerate(whole(*arguments)):
+            if number == 500:
+                raise KeyboardInterrupt
+            yield row
+
+    monkeypatch.setattr(Selection, "of", interrupted)
+    target = tmp_path / "out"
+    if form == "csv":
+        target.mkdir()
+        (target / "sensor_scan.csv").write_text("of an earlier run")
+    assert run("export", GOLDEN, target, "--format", form).exit_code == 6
+    left = [path for path in target.rglob("*") if path.is_file() and path.suffix != ".jpeg"] if target.exists() else []
+    assert [path.read_text() for path in left] == (["of an earlier run"] if form == "csv" else [])
+    assert form in ("csv", "npz") or not target.exists()
