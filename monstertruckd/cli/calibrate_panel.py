@@ -47,6 +47,9 @@ class TerminalPanel:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._close_bar()
+        if error is None:
+            for name in (name for name, values in self._given.items() if values):
+                remark(f"--answer {name}={self._given[name][0]}: was not asked for")
 
     def say(self, text: str) -> None:
         """Show a sentence."""

@@ -155,6 +155,8 @@ def export_command(
         export = _exporter(form)
     with _reading("export", log) as done:
         files = export(log, output, selection, done)
+    if not files:
+        remark(f"{log}: no message of these topics and times")
     if json_output:
         print_json(files)
         return

@@ -78,3 +78,9 @@ async def test_no_answer_names_the_option(monkeypatch: pytest.MonkeyPatch):
 def test_an_answer_has_a_name():
     with pytest.raises(InputError, match=r"--answer 2\.0: expected NAME=VALUE"):
         TerminalPanel(["2.0"])
+
+
+def test_an_answer_nobody_asked_for_is_told(capsys):
+    with TerminalPanel(["distnace=1.98"]):
+        pass
+    assert "--answer distnace=1.98: was not asked for" in capsys.readouterr().err

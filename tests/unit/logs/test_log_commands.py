@@ -90,3 +90,9 @@ def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeyp
     left = [path for path in target.rglob("*") if path.is_file() and path.suffix != ".jpeg"] if target.exists() else []
     assert [path.read_text() for path in left] == (["of an earlier run"] if form == "csv" else [])
     assert form in ("csv", "npz") or not target.exists()
+
+
+def test_an_empty_export_is_told(tmp_path):
+    done = run("export", GOLDEN, tmp_path / "out", "--start", 5000)
+    assert done.exit_code == 0
+    assert "no message of these topics and times" in done.output
