@@ -48,8 +48,9 @@ class TerminalPanel:
     ) -> None:
         self._close_bar()
         if error is None:
-            for name in (name for name, values in self._given.items() if values):
-                remark(f"--answer {name}={self._given[name][0]}: was not asked for")
+            for name, values in self._given.items():
+                for value in values:
+                    remark(f"--answer {name}={value}: was not asked for")
 
     def say(self, text: str) -> None:
         """Show a sentence."""

@@ -2,8 +2,8 @@
 
 import csv
 import json
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
@@ -39,18 +39,14 @@ def export_csv(
     """
     directory = _folder(output)
     files: dict[str, Path] = {}
-    with removed_on_failure() as parts, ExitStack() as stack:
+    with _tables(directory, ".csv", files) as place, ExitStack() as stack:
         writers: dict[str, Any] = {}
         for topic, row in _rows(path, directory, selection, progress):
             if topic not in writers:
-                files[topic] = directory / f"{_stem(topic)}.csv"
-                parts.append(_part(files[topic]))
-                writers[topic] = csv.writer(stack.enter_context(parts[-1].open("w", newline="")))
+                writers[topic] = csv.writer(stack.enter_context(place(topic).open("w", newline="")))
                 writers[topic].writerow(row)
             row[_REAL_TIME] = f"{np.datetime64(row[_REAL_TIME], 'ns')}Z"
             writers[topic].writerow(_cell(value) for value in row.values())
-    for file in files.values():
-        _part(file).replace(file)
     return files
 
 
@@ -77,23 +73,30 @@ def export_npz(
         table = tables.setdefault(topic, {name: [] for name in row})
         for name, value in row.items():
             table[name].append(value)
-    files = {}
-    for topic, table in tables.items():
-        arrays: dict[str, NDArray[Any]] = {}
-        for name, values in table.items():
-            arrays |= _column(name, values)
-        files[topic] = directory / f"{_stem(topic)}.npz"
-        with removed_on_failure() as parts:
-            parts.append(_part(files[topic]))
-            with parts[-1].open("wb") as part:
-                np.savez_compressed(part, allow_pickle=False, **arrays)
-        parts[-1].replace(files[topic])
+    files: dict[str, Path] = {}
+    with _tables(directory, ".npz", files) as place:
+        for topic, table in tables.items():
+            arrays: dict[str, NDArray[Any]] = {}
+            for name, values in table.items():
+                arrays |= _column(name, values)
+            with place(topic).open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
     return files
 
 
-def _part(file: Path) -> Path:
-    """Name of a file that is not complete yet."""
-    return file.with_name(file.name + ".part")
+@contextmanager
+def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
+    """Says where to write a topic's table; all get their names, noted in ``files``, once all are whole."""
+    with removed_on_failure() as parts:
+
+        def place(topic: str) -> Path:
+            files[topic] = directory / f"{_stem(topic)}{suffix}"
+            parts.append(files[topic].with_name(files[topic].name + ".part"))
+            return parts[-1]
+
+        yield place
+    for part, file in zip(parts, files.values(), strict=True):
+        part.replace(file)
 
 
 def _folder(directory: str | Path) -> Path:

@@ -4,6 +4,7 @@ import fcntl
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -90,6 +91,22 @@ def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeyp
     left = [path for path in target.rglob("*") if path.is_file() and path.suffix != ".jpeg"] if target.exists() else []
     assert [path.read_text() for path in left] == (["of an earlier run"] if form == "csv" else [])
     assert form in ("csv", "npz") or not target.exists()
+
+
+def test_tables_get_their_names_together(tmp_path, monkeypatch):
+    write, written = np.savez_compressed, []
+
+    def interrupted(file, **arrays):
+        if written:
+            raise KeyboardInterrupt
+        written.append(file.name)
+        write(file, **arrays)
+
+    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    topics = ("--topic", "sensor/scan", "--topic", "state/odometry")
+    assert run("export", GOLDEN, tmp_path, "--format", "npz", *topics).exit_code == 6
+    assert written
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_empty_export_is_told(tmp_path):
