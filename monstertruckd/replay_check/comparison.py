@@ -30,14 +30,14 @@ class Greatest:
 
 @dataclass(frozen=True, slots=True)
 class First:
-    """The first output that is not the recorded one bit for bit."""
+    """The first output that is off by more than the tolerance."""
 
     topic: str
     sequence: int
     at: float
     """Seconds after the log's begin."""
     fields: tuple[str, ...]
-    """That differ; none = the header alone."""
+    """That are off by more than the tolerance; none = the header alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +102,11 @@ class TopicComparison:
         """Whether every output came again, until ``end``, ns, within the tolerance."""
         return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
+    def would_agree(self, end: int, tolerance: float) -> bool:
+        """The same with another tolerance, greater than 0."""
+        within = all(one.value <= tolerance for one in self.greatest.values())
+        return not self.judged or (within and self.missing == self.surplus(end) == 0)
+
     def _compare(self, sequence: int, recorded: _Output, again: _Output) -> None:
         self.compared += 1
         if recorded.payload == again.payload:
@@ -109,11 +114,13 @@ class TopicComparison:
             return
         at = (recorded.time - self.begin) / SECOND
         found = self._differences(recorded, again)
-        if self.first is None or at < self.first.at:
-            self.first = First(self.topic.name, sequence, at, tuple(one.field for one in found))
-        if self.tolerance == 0 or any(one.value > self.tolerance for one in found):
-            self.differing += 1
         self._keep(found, sequence, at)
+        off = tuple(one.field for one in found if one.value > self.tolerance)
+        if self.tolerance > 0 and not off:
+            return
+        self.differing += 1
+        if self.first is None or at < self.first.at:
+            self.first = First(self.topic.name, sequence, at, off)
 
     def _differences(self, recorded: _Output, again: _Output) -> list[Difference]:
         try:

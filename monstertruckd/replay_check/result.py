@@ -2,10 +2,13 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.replay_check.comparison import First, TopicComparison
+
+ROUNDING: Final = 1e-6
+"""SI units that outputs may be off where another processor's maths routines round otherwise; 1e-14 were seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +55,19 @@ class Check:
 
     @property
     def first(self) -> First | None:
-        """The first output that is not the recorded one bit for bit."""
+        """The first output that is off by more than its topic's tolerance."""
         return min((row.first for row in self.topics if row.first), key=lambda first: first.at, default=None)
 
     @property
     def agrees(self) -> bool:
         """Whether everything came again within the tolerance."""
         return all(row.agrees(self.end) for row in self.topics) and not self.unreadable
+
+    @property
+    def rounded(self) -> bool:
+        """Whether it does not agree, but would if ``ROUNDING`` were no difference."""
+        close = all(row.would_agree(self.end, ROUNDING) for row in self.topics) and not self.unreadable
+        return close and not self.agrees
 
     @property
     def reason(self) -> Reason:
@@ -75,6 +84,7 @@ class Check:
             "config": None if self.config is None else str(self.config),
             "reason": self.reason,
             "agrees": self.agrees,
+            "rounded": self.rounded,
             "duration": self.duration,
             "compared": self.compared,
             "equal": self.equal,

@@ -1,21 +1,32 @@
 """Recorded runs computed again: all of it equal, and nothing that was changed stays unfound."""
 
 import json
+from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
 from monstertruck_runtime import wire
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.cli.main import app
 from monstertruckd.logs import open_log
 from monstertruckd.replay_check import check_log
 from monstertruckd.replay_check.difference import Kind
-from tests.unit.replay_check.log_surgery import FUSION, GOALS, LEVEL, SLAM, attachments_of, changed, chunks, digit, flip
+from tests.unit.replay_check.log_surgery import (
+    FUSION,
+    GOALS,
+    LEVEL,
+    SLAM,
+    attachments_of,
+    changed,
+    chunks,
+    computed_again,
+    digit,
+    flip,
+)
 
 pytestmark = pytest.mark.timeout(120)
-
-ANOTHER_COMPUTER = 1e-6
-"""Its maths library may round otherwise than the one the stored logs were recorded on."""
 
 
 @pytest.mark.parametrize(
@@ -29,7 +40,7 @@ ANOTHER_COMPUTER = 1e-6
     ids=["level", "slam", "fusion", "goals"],
 )
 def test_a_stored_run_comes_again(log, computed):
-    check = check_log(log, tolerance=ANOTHER_COMPUTER)
+    check = computed_again(log)
     assert check.agrees, check.first
     assert check.compared >= 1000
     assert check.reason is Reason.OK
@@ -52,7 +63,7 @@ def test_a_stored_run_comes_again(log, computed):
 def test_one_flipped_byte_is_found_by_what_is_computed_from_it(tmp_path, topic, key, shown):
     number = next(e.sequence for e in open_log(LEVEL) if e.topic == topic.name and e.log_time > 4.5e9)
     log = changed(LEVEL, tmp_path / "flipped.mcap", flip(topic.name, number, digit(key)))
-    check = check_log(log)
+    check = computed_again(log)
     assert check.damage is None
     assert check.reason is Reason.REPLAY_DIFFERS
     (row,) = (row for row in check.topics if row.topic is shown)
@@ -69,16 +80,16 @@ def test_one_flipped_byte_of_a_scan_is_found_by_the_map(tmp_path):
         return payload.index(value.tobytes()) + 6
 
     log = changed(SLAM, tmp_path / "flipped.mcap", flip("sensor/scan", 30, byte_of_a_range))
-    check = check_log(log)
+    check = computed_again(log)
     assert check.reason is Reason.REPLAY_DIFFERS
     assert check.first.topic in {"health/slam", "state/scan_motion", "state/map_tiles", "state/pose"}
     odometry = next(row for row in check.topics if row.topic is topics.ODOMETRY)
-    assert odometry.equal == odometry.compared  # it rests on no scan
+    assert odometry.differing == 0  # it rests on no scan
 
 
 def test_a_byte_that_makes_a_message_unreadable_is_named(tmp_path):
     log = changed(LEVEL, tmp_path / "broken.mcap", flip("sensor/drive", 20, lambda payload: 0, bit=0x10))
-    check = check_log(log)
+    check = computed_again(log)
     (message,) = check.unreadable
     assert (message.topic, message.sequence) == ("sensor/drive", 20)
     assert check.reason is Reason.REPLAY_DIFFERS
@@ -91,7 +102,7 @@ def test_a_flipped_byte_of_the_file_is_damage(tmp_path, share):
     data[places[int(share * len(places))]] ^= 1
     log = tmp_path / "damaged.mcap"
     log.write_bytes(data)
-    check = check_log(log, tolerance=ANOTHER_COMPUTER)
+    check = computed_again(log)
     assert check.reason is Reason.LOG_DAMAGED
     assert "damaged after byte" in check.damage
     assert check.compared > 100
@@ -100,18 +111,40 @@ def test_a_flipped_byte_of_the_file_is_damage(tmp_path, share):
 
 def test_a_changed_output_is_found_as_well(tmp_path):
     log = changed(LEVEL, tmp_path / "other.mcap", flip("plan/drive", 50, digit("front", 3)))
-    check = check_log(log)
+    check = computed_again(log)
     row = next(row for row in check.topics if row.topic is topics.PLAN_DRIVE)
     assert (row.differing, row.first.sequence, row.first.fields) == (1, 50, ("front",))
     assert 0 < row.greatest[Kind.ANGLE].value < 0.01
     assert check_log(log, tolerance=0.01).agrees
 
 
+@pytest.mark.parametrize(("by", "rounded"), [(1e-9, True), (1e-5, False)])
+def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
+    def nudged(one):
+        if (one.topic, one.sequence) != ("plan/drive", 50):
+            return one
+        drive = one.decode()
+        return replace(
+            one, payload=wire.encode(topics.PLAN_DRIVE, drive.model_copy(update={"front": drive.front + by}))
+        )
+
+    log = changed(LEVEL, tmp_path / "nudged.mcap", nudged)
+    exact, close = check_log(log), computed_again(log)
+    assert not exact.agrees
+    assert exact.rounded is exact.figures()["rounded"] is rounded
+    assert close.agrees is rounded
+    assert (close.first is None) is rounded  # what is within the tolerance is no difference
+    assert not close.rounded
+    done = CliRunner().invoke(app, ["replay", str(log), "--check"])
+    assert done.exit_code == Reason.REPLAY_DIFFERS.exit_code
+    assert ("try --tolerance 1e-6" in done.output.replace("\n", " ")) is rounded
+
+
 def test_a_lost_reading_is_named(tmp_path):
     def lose(one):
         return None if (one.topic, one.sequence) == ("sensor/drive", 60) else one
 
-    check = check_log(changed(LEVEL, tmp_path / "lossy.mcap", lose))
+    check = computed_again(changed(LEVEL, tmp_path / "lossy.mcap", lose))
     assert check.lost == {"sensor/drive": 1}
     assert check.first.topic in {"state/odometry", "state/pose"}
 
@@ -120,11 +153,13 @@ def test_missing_and_extra_outputs_are_counted(tmp_path):
     def without_scans(one):
         return None if one.topic == "sensor/scan" and one.sequence > 40 else one
 
-    check = check_log(changed(SLAM, tmp_path / "blind.mcap", without_scans))
+    check = computed_again(changed(SLAM, tmp_path / "blind.mcap", without_scans))
     rows = {row.topic: row for row in check.topics}
     assert rows[topics.SLAM].missing > 20
     assert not check.agrees
-    told = check_log(changed(SLAM, tmp_path / "told.mcap", lambda one: None if one.topic == "health/slam" else one))
+    told = computed_again(
+        changed(SLAM, tmp_path / "told.mcap", lambda one: None if one.topic == "health/slam" else one)
+    )
     assert {row.topic: row for row in told.topics}[topics.SLAM].surplus(told.end) > 60
     assert not told.agrees
 
@@ -135,7 +170,7 @@ def test_another_configuration_shows_what_it_would_have_changed(tmp_path):
     del config["sim"], config["path"], config["tracker"]
     file = tmp_path / "larger.yaml"
     file.write_text(json.dumps(config))
-    check = check_log(LEVEL, file)
+    check = computed_again(LEVEL, file)
     row = next(row for row in check.topics if row.topic is topics.POSE)
     assert row.greatest[Kind.LENGTH].value == pytest.approx(0.02, rel=0.3)  # a tenth of the way
     assert row.greatest[Kind.LENGTH].at > 4.0

@@ -13,11 +13,9 @@ from monstertruckd.logs import open_log
 from monstertruckd.recorder.config import Compression, RecorderConfig
 from monstertruckd.recorder.file import Entry
 from monstertruckd.recorder.writer import LogWriter
-from monstertruckd.replay_check import check_log, parts_of
+from monstertruckd.replay_check import parts_of
 from monstertruckd.replay_check.run_log import RunLog
-from tests.unit.replay_check.log_surgery import BY_NAME, LEVEL, attachments_of, chunks, write
-
-TOLERANCE = 1e-6
+from tests.unit.replay_check.log_surgery import BY_NAME, LEVEL, attachments_of, chunks, computed_again, write
 
 
 def split(folder, seconds=2.0, **metadata):
@@ -47,17 +45,17 @@ def test_a_run_reads_like_the_log_it_was_split_from(parts):
 
 @pytest.mark.parametrize("number", [0, -1])
 def test_any_part_stands_for_its_run(parts, number):
-    check = check_log(parts[number], tolerance=TOLERANCE)
+    check = computed_again(parts[number])
     assert check.parts == tuple(parts)
     assert check.agrees
     assert check.reason is Reason.OK
     assert check.lost == {}
-    assert check.compared == check_log(LEVEL, tolerance=TOLERANCE).compared
+    assert check.compared == computed_again(LEVEL).compared
 
 
 def test_a_part_that_is_not_there_ends_the_run(parts):
     parts[1].unlink()
-    check = check_log(parts[2], tolerance=TOLERANCE)
+    check = computed_again(parts[2])
     assert check.reason is Reason.LOG_DAMAGED
     assert check.damage == f"{parts[1].name} is not there: the run is known up to it alone"
     assert check.agrees  # as far as it goes
@@ -71,7 +69,7 @@ def test_a_part_that_is_not_there_ends_the_run(parts):
 def test_without_its_first_part_a_run_cannot_be_computed(parts):
     parts[0].unlink()
     with pytest.raises(InputError, match=rf"{parts[0].name} is not there: expected the first part"):
-        check_log(parts[1])
+        computed_again(parts[1])
 
 
 def test_a_damaged_part_ends_the_run(parts):
@@ -79,7 +77,7 @@ def test_a_damaged_part_ends_the_run(parts):
     place = chunks(data)[0]
     data[place[len(place) // 2]] ^= 1
     parts[1].write_bytes(data)
-    check = check_log(parts[0], tolerance=TOLERANCE)
+    check = computed_again(parts[0])
     assert check.reason is Reason.LOG_DAMAGED
     assert check.damage.startswith(f"{parts[1].name} ends or is damaged after byte")
     assert check.agrees
@@ -89,7 +87,7 @@ def test_parts_of_other_runs_do_not_mix(parts, tmp_path):
     stranger = split(tmp_path / "others", real_offset_ns="7")[1]
     shutil.copy(stranger, parts[1])
     with pytest.raises(InputError, match=rf"{parts[1].name}: is of another run than {parts[0].name}"):
-        check_log(parts[0])
+        computed_again(parts[0])
     other = parts[0].with_name("run-000002-000.mcap")
     shutil.copy(LEVEL, other)
     assert parts_of(other) == [other]
@@ -100,4 +98,4 @@ def test_a_log_under_another_name_stands_for_itself(tmp_path):
     entries = [replace(one) for one in open_log(LEVEL)]
     log = write(tmp_path / "kept.mcap", entries, attachments_of(LEVEL))
     assert parts_of(log) == [log]
-    assert check_log(log, tolerance=TOLERANCE).parts == (log,)
+    assert computed_again(log).parts == (log,)
