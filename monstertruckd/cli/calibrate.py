@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config
-from monstertruckd.cli.output import JsonOption, print_json, print_table, remark
+from monstertruckd.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from monstertruckd.calibrate.guide import Wizard
     from monstertruckd.calibrate.record import Estimate, Result, WizardName
 
-app = typer.Typer(
-    help="Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C.",
-    no_args_is_help=True,
+app = command_group(
+    "Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C."
 )
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Take it that everything asked to be done is done.")]
@@ -86,7 +85,7 @@ def drive(
 ) -> "Wizard":
     """Which way is forward, and how far a turn of the motor goes: runs along a tape.
 
-    Asks [b]clear[/b], [b]forward[/b] and, for each run, [b]mark[/b] and [b]distance[/b] (m).
+    Asks `clear`, `forward` and, for each run, `mark` and `distance` (m).
     """
     from monstertruckd.calibrate.catalog import drive_wizard
     from monstertruckd.calibrate.drive import DriveWizard
@@ -106,7 +105,7 @@ def steering(
 ) -> "Wizard":
     """Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
 
-    Asks [b]clear[/b] and, for each string, [b]string[/b] and [b]offset[/b] (cm).
+    Asks `clear` and, for each string, `string` and `offset` (cm).
     """
     from monstertruckd.calibrate.catalog import steering_wizard
     from monstertruckd.calibrate.steering import SteeringWizard
@@ -116,7 +115,7 @@ def steering(
 
 @_wizard
 def compass() -> "Wizard":
-    """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks [b]clear[/b]."""
+    """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
     from monstertruckd.calibrate.catalog import compass_wizard
 
     return compass_wizard()
@@ -130,7 +129,7 @@ def battery(
 ) -> "Wizard":
     """Scale of the battery voltage from a multimeter; nothing moves.
 
-    Asks [b]meter[/b] (V) and [b]another[/b] (yes or no), until that is no.
+    Asks `meter` (V) and `another` (yes or no), until that is no.
     """
     from monstertruckd.calibrate.battery import BatteryWizard
     from monstertruckd.calibrate.catalog import battery_wizard

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruckd.cli.options import ConfigArgument
-from monstertruckd.cli.output import JsonOption, print_json, print_table, remark
+from monstertruckd.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
     from monstertruckd.config.migrate import Upgrade
 
-app = typer.Typer(help="Check, show and upgrade configuration files.", no_args_is_help=True)
+app = command_group("Check, show and upgrade configuration files.")
 
 Key = tuple[str | int, ...]
 

@@ -33,8 +33,8 @@ def emulate(
 ) -> None:
     """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
 
-    Faults are read from standard input, one per line: [b]unplug[/b], [b]plug[/b], [b]power-cycle[/b],
-    [b]line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE[/b], or a fault of the device itself
+    Faults are read from standard input, one per line: `unplug`, `plug`, `power-cycle`,
+    `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, or a fault of the device itself
     (an unknown word lists them).
     """
     from monstertruckd.catalog import find_kind

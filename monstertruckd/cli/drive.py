@@ -24,9 +24,9 @@ def drive(
 ) -> None:
     """Drive with the keyboard: the truck moves only while a key is held, in this terminal.
 
-    [b]Enter[/b] arms, [b]W A S D[/b] or the arrow keys drive, [b]space[/b] stops, [b]e[/b] is the emergency stop and
-    [b]r[/b] resets it, [b]1[/b] to [b]5[/b] choose front, rear, counter, crab or hybrid steering, [b]z[/b] and [b]c[/b]
-    the drift of the last, [b]x[/b] straightens the wheels, [b]+[/b] and [b]-[/b] change the speed, [b]q[/b] ends.
+    `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
+    `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
+    the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
     """
     from monstertruck_runtime.errors import InputError
     from monstertruckd.cli.drive_session import DriveSession

@@ -8,13 +8,13 @@ import typer
 
 from monstertruckd.cli.kinematics_fit import fit
 from monstertruckd.cli.kinematics_output import figure, refusals, text
-from monstertruckd.cli.output import JsonOption, print_json, print_table
+from monstertruckd.cli.output import JsonOption, command_group, print_json, print_table
 
 if TYPE_CHECKING:
     from monstertruck_kinematics.truck import Mode
     from monstertruck_kinematics.wheels import Wheel
 
-app = typer.Typer(help="Kinematics of the truck and of every wheeled-robot family.", no_args_is_help=True)
+app = command_group("Kinematics of the truck and of every wheeled-robot family.")
 app.command("fit")(fit)
 
 Png = Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")]

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.cli.options import complete_topic
-from monstertruckd.cli.output import JsonOption, print_json, print_table, progress, remark
+from monstertruckd.cli.output import JsonOption, command_group, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
     from monstertruckd.logs.selection import Progress, Selection
 
-app = typer.Typer(help="Look inside, repair and export logs (MCAP).", no_args_is_help=True)
+app = command_group("Look inside, repair and export logs (MCAP).")
 
 TopicsOption = Annotated[
     list[str] | None, typer.Option("--topic", "-t", help="Only these topics.", autocompletion=complete_topic)

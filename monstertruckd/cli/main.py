@@ -24,7 +24,7 @@ from monstertruckd.cli import (
     service,
     usb,
 )
-from monstertruckd.cli.output import CommandGroup
+from monstertruckd.cli.output import HELP_STYLE, PIPE_WIDTH, CommandGroup
 
 app = typer.Typer(
     name="monstertruckd",
@@ -32,7 +32,8 @@ app = typer.Typer(
     help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=HELP_STYLE,
+    context_settings={} if HELP_STYLE else {"terminal_width": PIPE_WIDTH},
 )
 
 

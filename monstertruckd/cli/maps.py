@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruckd.cli.options import ENDPOINT
-from monstertruckd.cli.output import JsonOption, print_json, progress, remark
+from monstertruckd.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.mapping.exchange import Estimate, WorkerOutput
     from monstertruckd.logs.scans import ScanLog
 
-app = typer.Typer(help="Build, show, save and use occupancy maps.", no_args_is_help=True)
+app = command_group("Build, show, save and use occupancy maps.")
 
 Log = Annotated[Path, typer.Argument(help="MCAP, CARMEN text (.gz), npz or URG text (.dat).", show_default=False)]
 MapPlace = Annotated[Path, typer.Argument(help="Folder of a saved map, or a map_server YAML.", show_default=False)]

@@ -35,6 +35,9 @@ PIPE_WIDTH: Final = 200
 WIDE_CELL: Final = 48
 """Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
 
+HELP_STYLE: Final = "markdown" if sys.stdout.isatty() and sys.stderr.isatty() else None
+"""Of help and usage errors: framed on terminals, bare text (None) as soon as one of the two streams is a pipe."""
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
 
@@ -161,6 +164,11 @@ def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> Non
     """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM: its ordinary ends."""
     with suppress(KeyboardInterrupt):
         run_wall(main)
+
+
+def command_group(text: str) -> typer.Typer:
+    """An empty group of commands that ``text`` describes."""
+    return typer.Typer(help=text, no_args_is_help=True, rich_markup_mode=HELP_STYLE)
 
 
 class CommandGroup(TyperGroup):

@@ -16,7 +16,6 @@ ROOT = Path(__file__).resolve().parents[3]
 EXIT_CODES = """\
 0 when it did what was asked, 2 for a wrong option or a refused configuration, 6 when Ctrl-C or SIGTERM cut it short;
 every other failure has its own code: [table](../command-line.md#exit-codes)."""
-MARKUP = {"[b]": "**", "[/b]": "**", "[i]": "*", "[/i]": "*"}
 
 
 def pages(texts: Mapping[str, tuple[str, str]]) -> list[Page]:
@@ -55,7 +54,7 @@ def _page(name: tuple[str, ...], command: Any, texts: Mapping[str, tuple[str, st
     text = join(
         f"# monstertruckd {' '.join(name)}",
         f"```text\n{usage}\n```",
-        _markdown(command.help),
+        inspect.cleandoc(command.help),
         table(("argument", "default", "what"), [(f"`{_name(p)}`", _default(p), _help(p)) for p in arguments]),
         table(("option", "default", "what"), [(_flags(p), _default(p), _help(p)) for p in options]),
         "## Exit code",
@@ -70,14 +69,7 @@ def _file(name: tuple[str, ...]) -> str:
 
 
 def _summary(command: Any) -> str:
-    return _markdown(command.help).partition("\n\n")[0]
-
-
-def _markdown(text: str | None) -> str:
-    said = inspect.cleandoc(text or "")
-    for mark, sign in MARKUP.items():
-        said = said.replace(mark, sign)
-    return said
+    return inspect.cleandoc(command.help).partition("\n\n")[0]
 
 
 def _name(parameter: Any) -> str:
@@ -106,7 +98,7 @@ def _type(parameter: Any) -> str:
 
 def _help(parameter: Any) -> str:
     limits = [f"{w} {n:g}" for w, n in (("at least", parameter.min), ("at most", parameter.max)) if n is not None]
-    return " ".join([_markdown(parameter.help), f"({', '.join(limits)})" if limits else ""]).strip()
+    return " ".join([parameter.help or "", f"({', '.join(limits)})" if limits else ""]).strip()
 
 
 def _default(parameter: Any) -> str:

@@ -2,11 +2,13 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -14,18 +16,19 @@ import typer
 from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.output import CommandGroup, finish, print_json, print_table, progress, until_stopped
+from monstertruckd.cli.main import app
+from monstertruckd.cli.output import HELP_STYLE, CommandGroup, finish, print_json, print_table, progress, until_stopped
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 def ending(command: Callable[[], None]) -> int:
     """Exit code of a command line with this one command."""
-    app = typer.Typer(cls=CommandGroup)
-    app.callback()(lambda: None)
-    app.command("do")(command)
+    line = typer.Typer(cls=CommandGroup)
+    line.callback()(lambda: None)
+    line.command("do")(command)
     with pytest.raises(SystemExit) as ended:
-        app(["do"])
+        line(["do"])
     return int(ended.value.code or 0)
 
 
@@ -99,6 +102,40 @@ def test_a_reader_that_leaves_is_no_failure():
     os.close(write)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, "")
+
+
+def called(*arguments: str, **streams: Any) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "monstertruckd", *arguments]
+    return subprocess.run(command, cwd=ROOT, text=True, timeout=30, check=False, **streams)
+
+
+def test_help_and_usage_errors_are_bare_lines_in_pipes():
+    told = called("log", "--help", capture_output=True).stdout
+    assert told.isascii()
+    report = "Write one HTML page about a log: way, states, events, signals, health, losses."
+    assert f"  report   {report}\n" in told
+    refused = called("probe", capture_output=True)
+    assert refused.returncode == 2
+    assert refused.stderr.endswith("\nError: Missing argument 'device'.\n")
+
+
+def test_help_is_framed_on_a_terminal():
+    reader, terminal = pty.openpty()
+    try:
+        assert called("log", "--help", stdin=terminal, stdout=terminal, stderr=terminal).returncode == 0
+        assert "╭" in os.read(reader, 1 << 16).decode()
+    finally:
+        os.close(reader)
+        os.close(terminal)
+
+
+def test_every_group_has_the_same_help():
+    def styles(command: Any) -> Iterator[str | None]:
+        yield command.rich_markup_mode
+        for inner in getattr(command, "commands", {}).values():
+            yield from styles(inner)
+
+    assert set(styles(typer.main.get_command(app))) == {HELP_STYLE}
 
 
 def test_finish_is_silent_about_success_only(capsys: pytest.CaptureFixture[str]):
