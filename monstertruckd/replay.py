@@ -13,6 +13,7 @@ from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.logs import open_log
+from monstertruckd.logs.wall_time import first_offset
 
 
 def replay_log(
@@ -73,7 +74,7 @@ def replay_log(
                 job.cancel()
             await asyncio.wait([waiting, task])
 
-    offset = int(reader.metadata().get("run", {}).get("real_offset_ns", 0))
+    offset = first_offset(reader.metadata().get("run", {}))
     return run_replay(main, start=start, real_offset=offset, rate=speed)
 
 

@@ -68,8 +68,8 @@ def list_command(
         ],
         right=("seconds", "messages", "MB"),
     )
-    if any(log.state is LogState.UNFINISHED for log in logs):
-        remark("`monstertruckd log recover FILE` finishes an unfinished log")
+    if any(log.state in {LogState.UNFINISHED, LogState.DAMAGED} for log in logs):
+        remark("`monstertruckd log recover FILE` finishes an unfinished log and mends a damaged one")
 
 
 @app.command("info")

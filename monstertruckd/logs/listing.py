@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.logs.reader import LogReader
+from monstertruckd.logs.reader import DAMAGE, LogReader, index_is_sound
 from monstertruckd.logs.recover import in_use, is_finished
 from monstertruckd.logs.wall_time import is_plausible, real_offset, utc
 
@@ -21,7 +20,10 @@ class LogState(StrEnum):
     WRITING = "being written"
     UNFINISHED = "unfinished"
     """Nobody writes it any more: for ``recover``."""
+    DAMAGED = "damaged"
+    """Its index, and so it is not known what else: for ``recover``, too."""
     UNREADABLE = "unreadable"
+    """No log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +55,18 @@ def list_logs(folder: Path) -> list[Listed]:
 def _look(path: Path) -> Listed:
     size = path.stat().st_size
     try:
+        reader = LogReader(path)
         if not is_finished(path):
             return Listed(path, size, LogState.WRITING if in_use(path) else LogState.UNFINISHED)
+        if not index_is_sound(path):
+            return Listed(path, size, LogState.DAMAGED)
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
         statistics = None if summary is None else summary.statistics
         if statistics is None:
             return Listed(path, size, LogState.FINISHED)
-        real = statistics.message_start_time + real_offset(LogReader(path))
-    except (McapError, InputError, OSError):
+        real = statistics.message_start_time + real_offset(reader)
+    except (*DAMAGE, InputError):
         return Listed(path, size, LogState.UNREADABLE)
     return Listed(
         path,

@@ -1,14 +1,18 @@
 """Reading MCAP logs front to back, finished or not."""
 
 import itertools
+import json
+import os
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import zstandard
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -20,7 +24,7 @@ from monstertruck_schemas.topics import BY_NAME
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
-_DAMAGE: Final = (
+DAMAGE: Final = (
     McapError,
     zstandard.ZstdError,
     struct.error,
@@ -28,9 +32,34 @@ _DAMAGE: Final = (
     RuntimeError,
     LookupError,
     MemoryError,
+    OverflowError,
     OSError,
 )
 """What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
+
+
+_END: Final = struct.Struct("<BQQQI8s")
+"""Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
+
+_FOOTER_LENGTH: Final = struct.calcsize("<QQI")
+_UNSUMMED: Final = struct.calcsize("<I8s")
+
+
+def index_is_sound(path: Path) -> bool:
+    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(-min(size, _END.size), os.SEEK_END)
+        end = file.read()
+        if len(end) < _END.size:
+            return False
+        opcode, length, start, _, checksum, magic = _END.unpack(end)
+        if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size:
+            return False
+        if not (start and checksum):
+            return True
+        file.seek(start)
+        return zlib.crc32(file.read(size - start - _UNSUMMED)) == int(checksum)
 
 
 def spare_log(output: Path) -> None:
@@ -135,11 +164,13 @@ class LogReader:
                 self.position = at = file.tell()
                 try:
                     record = next(stream, None)
-                except _DAMAGE as error:
+                except DAMAGE as error:
                     self.damage = f"ends or is damaged after byte {at} of {size} ({type(error).__name__})"
                     return
                 if record is None:
                     self.position = size
+                    if not index_is_sound(self.path):
+                        self.damage = "its index is damaged, what stands before it is sound"
                     return
                 if isinstance(record, Channel):
                     channels.add(record.id)
@@ -151,6 +182,15 @@ class LogReader:
     def preamble(self) -> Iterator[McapRecord]:
         """The records before the first message: the recorder writes attachments and metadata there."""
         return itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
+
+    def config(self) -> dict[str, Any]:
+        """The attached configuration as plain values; empty where there is none, or its bytes are no JSON object."""
+        found = (r.data for r in self.preamble() if isinstance(r, Attachment) and r.name == "config.json")
+        try:
+            values = json.loads(next(found, b"{}"))
+        except ValueError:
+            return {}
+        return values if isinstance(values, dict) else {}
 
     @property
     def size(self) -> int:

@@ -1,6 +1,5 @@
 """A log as a rerun recording: scans, map, path, frames, pictures, states, events and plots, with their layout."""
 
-import json
 import math
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from mcap.records import Attachment
 
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.errors import InputError
@@ -117,8 +115,7 @@ class Scene:
 
     def truck(self, reader: LogReader) -> None:
         """A box of the size in the log's configuration; logs without one show none."""
-        found = (r.data for r in reader.preamble() if isinstance(r, Attachment) and r.name == "config.json")
-        geometry = json.loads(next(found, b"{}")).get("geometry", {})
+        geometry = reader.config().get("geometry", {})
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:
             return

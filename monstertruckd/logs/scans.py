@@ -2,7 +2,6 @@
 
 import gzip
 import io
-import json
 import math
 import zipfile
 from collections.abc import Iterator
@@ -71,8 +70,7 @@ def read_scans(path: Path) -> ScanLog:
 
 def _mcap(path: Path) -> Iterator[ScanInput]:
     reader = open_log(path)
-    config = json.loads(reader.attachments().get("config.json", b"{}"))
-    lidar = (config.get("devices") or {}).get("lidar") or {}
+    lidar = (reader.config().get("devices") or {}).get("lidar") or {}
     at = lidar.get("mount") or {}
     mount = (float(at.get("x", 0.0)), float(at.get("y", 0.0)), float(at.get("yaw", 0.0)))
     scans: list[LaserScan] = []

@@ -21,6 +21,7 @@ from monstertruckd.bus.local import TapCallback
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage
+from monstertruckd.logs.wall_time import first_offset
 from monstertruckd.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.replay_check.comparison import TopicComparison
 from monstertruckd.replay_check.pace import PacedClock
@@ -69,7 +70,7 @@ def check_log(
         own, used = without_goals(own), without_goals(used)
     compared = outputs_of(own) | outputs_of(used)
     _refuse_the_middle(log, found, compared)
-    virtual = int(metadata.get("real_offset_ns", 0)) == 0
+    virtual = first_offset(metadata) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
     rows = {
         topic.name: TopicComparison(

@@ -28,6 +28,7 @@ from monstertruckd.logs.report.traffic import Traffic
 from monstertruckd.logs.report.way import Way
 from monstertruckd.logs.selection import Progress
 from monstertruckd.logs.trace import Trace
+from monstertruckd.logs.wall_time import first_offset
 
 _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.TRANSFORMS.name: SECOND}
 """Topics that are decoded no more often than this, ns: they come thick and cost most of the time."""
@@ -243,7 +244,7 @@ def _describe(run: Run, reader: LogReader) -> None:
             case Metadata(name="run"):
                 run.metadata = dict(record.metadata)
     if run.offset is None:
-        run.offset = int(run.metadata.get("real_offset_ns", 0))
+        run.offset = first_offset(run.metadata)
 
 
 def _decoded(entry: LogMessage) -> Message | None:

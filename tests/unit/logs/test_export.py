@@ -99,6 +99,9 @@ def test_offset_is_what_the_log_last_knew(log, tmp_path):
     writer = Writer(silent)
     writer.log.finish()
     assert real_offset(open_log(silent)) == 5
+    number = b"real_offset_ns\x01\x00\x00\x00"
+    silent.write_bytes(silent.read_bytes().replace(number + b"5", number + b"u"))
+    assert real_offset(open_log(silent)) == 0
     assert utc(MAY_2026) == "2026-05-01 01:46:40"
 
 

@@ -12,7 +12,9 @@ from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.topics import CLOCK, GATE
 from monstertruckd.cli.main import main
 from monstertruckd.logs.listing import Listed, LogState, list_logs
-from tests.unit.logs.log_kit import Writer, clock, gate
+from monstertruckd.logs.reader import LogReader
+from monstertruckd.logs.wall_time import real_offset
+from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate
 
 
 @pytest.fixture
@@ -45,6 +47,19 @@ def test_a_log_being_written_is_told_from_one_broken_off(folder: Path):
         fcntl.flock(file, fcntl.LOCK_EX)
         assert list_logs(folder)[2].state is LogState.WRITING
     assert list_logs(folder)[2].state is LogState.UNFINISHED
+
+
+def test_no_damage_of_one_log_hides_the_others(folder: Path):
+    sound = folder / "run-1.mcap"
+    whole = sound.read_bytes()
+    index = int.from_bytes(whole[-28:-20], "little")
+    damaged = folder / "run-5.mcap"
+    for place in range(index, len(whole) - 8):
+        damaged.write_bytes(whole[:place] + bytes([whole[place] ^ 0x80]) + whole[place + 1 :])
+        *others, last = list_logs(folder)
+        assert last.state is LogState.DAMAGED
+        assert len(others) == 4
+        assert real_offset(LogReader(damaged)) == MAY_2026
 
 
 def test_no_folder_is_not_no_logs(tmp_path: Path):

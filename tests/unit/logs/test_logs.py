@@ -102,6 +102,37 @@ def test_flipped_byte_ends_the_reading_there(log, master):
     assert reader.damage is not None
 
 
+@pytest.mark.parametrize("length", [1 << 40, 1 << 63])
+def test_a_length_beyond_the_file_ends_the_reading_there(log, length):
+    data = bytearray(log.read_bytes())
+    place = data.index(b"application/json") + len(b"application/json")
+    assert data[place + 8 : place + 9] == b"{"
+    data[place : place + 8] = length.to_bytes(8, "little")
+    log.write_bytes(data)
+    reader = open_log(log)
+    assert list(reader) == []
+    assert "damaged after byte" in reader.damage
+
+
+def test_a_damaged_index_is_told_and_mended(log, master):
+    data = bytearray(log.read_bytes())
+    data[data.rindex(b"jsonschema")] ^= 1
+    log.write_bytes(data)
+    reader = open_log(log)
+    assert len(list(reader)) == len(master[1])
+    assert reader.damage == info(log)["damage"] == "its index is damaged, what stands before it is sound"
+    assert recover(log, log).messages == len(master[1])
+    assert info(log)["damage"] is None
+
+
+@pytest.mark.parametrize("attached", [b"", b"{", b"[1]", b'"text"'])
+def test_a_configuration_that_is_no_object_is_none(log, attached):
+    assert open_log(log).config() == {"a": 1}
+    before = open_log(log).attachments()["config.json"]
+    log.write_bytes(log.read_bytes().replace(before, attached.ljust(len(before)), 1))
+    assert open_log(log).config() == {}
+
+
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
