@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.errors import NotFoundError
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, ViaOption, parse_pose
 from monstertruckd.cli.output import JsonOption, finish, print_json
 
@@ -38,10 +39,12 @@ def goto(
 
     places = [parse_pose(text, yaw_needed=False) for text in via or ()]
 
-    def drive(client: "TruckClient", clock: Clock) -> Coroutine[Any, Any, "Arrival"]:
-        return drive_to(client, clock, (x, y, yaw), places, arm=arm)
+    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+        if (await client.call("config")).get("planner") is None:
+            raise NotFoundError(f"robot {robot!r} has no planner: expected a section `planner` in its configuration")
+        return await drive_to(client, clock, (x, y, yaw), places, arm=arm)
 
-    _run(drive, robot, endpoint, json_output=json_output)
+    _run(main, robot, endpoint, json_output=json_output)
 
 
 def track(
