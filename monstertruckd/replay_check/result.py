@@ -65,7 +65,7 @@ class Check:
 
     @property
     def rounded(self) -> bool:
-        """Whether it does not agree, but would if ``ROUNDING`` were no difference."""
+        """Whether it does not agree, but would with the tolerance ``ROUNDING``."""
         close = all(row.would_agree(self.end, ROUNDING) for row in self.topics) and not self.unreadable
         return close and not self.agrees
 
