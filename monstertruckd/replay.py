@@ -74,7 +74,7 @@ def replay_log(
                 job.cancel()
             await asyncio.wait([waiting, task])
 
-    offset = first_offset(reader.metadata().get("run", {}))
+    offset = first_offset(log, reader.metadata().get("run", {}))
     return run_replay(main, start=start, real_offset=offset, rate=speed)
 
 

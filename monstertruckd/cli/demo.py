@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.cli.options import ConfigOption, SimulatedOption
-from monstertruckd.cli.output import JsonOption, console, finish, print_json, print_table, remark, until_stopped
+from monstertruckd.cli.output import (
+    JsonOption,
+    console,
+    finish,
+    on_terminal,
+    print_json,
+    print_table,
+    remark,
+    until_stopped,
+)
 
 if TYPE_CHECKING:
     from monstertruckd.sim.config import SimulatedTruckConfig
@@ -33,7 +42,7 @@ def demo(
 
     load_simulated(config)
     folder = _fresh(output)
-    screen = sys.stdout.isatty() and not json_output
+    screen = on_terminal(sys.stdout) and not json_output
     try:
         if fast:
             summary = run_fast_demo(config, folder, seed)

@@ -8,7 +8,7 @@ import typer
 
 from monstertruckd.cli.driving_modes import SPEEDS, SteeringMode
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption
-from monstertruckd.cli.output import until_stopped
+from monstertruckd.cli.output import on_terminal, until_stopped
 
 
 def drive(
@@ -32,7 +32,7 @@ def drive(
     from monstertruckd.cli.drive_session import DriveSession
     from monstertruckd.cli.teleop import Teleop
 
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not (on_terminal(sys.stdin) and on_terminal(sys.stdout)):
         raise InputError("drive reads keys as they are held: it needs a terminal")
     level = min(range(len(SPEEDS)), key=lambda index: abs(SPEEDS[index] - speed))
     teleop = Teleop(math.radians(angle), first_hold=hold, level=level, mode=mode)

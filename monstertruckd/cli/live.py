@@ -10,7 +10,7 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, TopicArgument
-from monstertruckd.cli.output import JsonOption, print_json, remark, until_stopped
+from monstertruckd.cli.output import JsonOption, on_terminal, print_json, remark, until_stopped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -31,7 +31,7 @@ def status(
     """Live screen of a running robot. Piped or with --once it prints the state once."""
     from monstertruckd.cli.watch import print_once, watch
 
-    if once or json_output or not sys.stdout.isatty():
+    if once or json_output or not on_terminal(sys.stdout):
         until_stopped(lambda clock: print_once(clock, robot, endpoint, json_output=json_output))
     else:
         until_stopped(lambda clock: watch(clock, robot, endpoint))
@@ -56,7 +56,7 @@ def echo(
     if row is None:
         raise NotFoundError(f"no topic {topic!r}; known: {', '.join(BY_NAME)}")
 
-    short = sys.stdout.isatty() and not json_output
+    short = on_terminal(sys.stdout) and not json_output
 
     async def main(clock: Clock) -> None:
         async with TruckClient(robot, endpoint, clock=clock) as client:

@@ -115,7 +115,7 @@ def recover_command(
     if json_output:
         print_json(asdict(done))
     else:
-        print(f"{done.path}: {done.messages} messages kept" + (f"; {done.damage}" if done.damage else ", was sound"))
+        print(f"{done.path}: {done.messages} messages kept" + (f"; it {done.damage}" if done.damage else ", was sound"))
 
 
 @app.command("report")

@@ -24,7 +24,7 @@ from monstertruckd.cli import (
     service,
     usb,
 )
-from monstertruckd.cli.output import HELP_STYLE, PIPE_WIDTH, CommandGroup
+from monstertruckd.cli.output import HELP_STYLE, HELP_WIDTH, CommandGroup
 
 app = typer.Typer(
     name="monstertruckd",
@@ -33,7 +33,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=HELP_STYLE,
-    context_settings={} if HELP_STYLE else {"terminal_width": PIPE_WIDTH},
+    context_settings=HELP_WIDTH,
 )
 
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import PurePath
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -35,8 +35,17 @@ PIPE_WIDTH: Final = 200
 WIDE_CELL: Final = 48
 """Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
 
-HELP_STYLE: Final = "markdown" if sys.stdout.isatty() and sys.stderr.isatty() else None
+
+def on_terminal(stream: TextIO | None) -> bool:
+    """Whether somebody looks at a standard stream, which is None if it was closed before the start."""
+    return stream is not None and stream.isatty()
+
+
+HELP_STYLE: Final = "markdown" if on_terminal(sys.stdout) and on_terminal(sys.stderr) else None
 """Of help and usage errors: framed on terminals, bare text (None) as soon as one of the two streams is a pipe."""
+
+HELP_WIDTH: Final = {} if on_terminal(sys.stdout) else {"terminal_width": PIPE_WIDTH}
+"""Setting of a command line: the terminal's own width, or lines nobody folds."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
@@ -79,9 +88,9 @@ def console(*, error: bool = False) -> "Console":
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    stream = sys.stderr if error else sys.stdout
-    width = None if stream.isatty() else PIPE_WIDTH
-    return PipedConsole(stderr=error, width=width, highlight=False, soft_wrap=not stream.isatty())
+    terminal = on_terminal(sys.stderr if error else sys.stdout)
+    width = None if terminal else PIPE_WIDTH
+    return PipedConsole(stderr=error, width=width, highlight=False, soft_wrap=not terminal)
 
 
 def print_table(
@@ -99,7 +108,7 @@ def print_table(
         right: headings of the columns set to the right, the numbers.
         title: a line above, on terminals only.
     """
-    if not sys.stdout.isatty():
+    if not on_terminal(sys.stdout):
         print("\n".join(_aligned(headings, rows, right)))
         return
     from rich.table import Table
@@ -139,7 +148,7 @@ def progress(what: str, total: float | None = None) -> Iterator[Callable[[float]
         what: is being done, in a word or two.
         total: amount; None = unknown.
     """
-    if not sys.stderr.isatty():
+    if not on_terminal(sys.stderr):
         yield lambda _: None
         return
     from rich.progress import Progress
@@ -201,7 +210,8 @@ class CommandGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None:
+                sys.stdout.flush()
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:

@@ -8,7 +8,7 @@ import typer
 
 from monstertruck_runtime.clock import run_wall
 from monstertruckd.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_role
-from monstertruckd.cli.output import JsonOption, console, print_json, remark
+from monstertruckd.cli.output import JsonOption, console, on_terminal, print_json, remark
 
 
 def usb(
@@ -27,7 +27,7 @@ def usb(
         remark(
             "no USB hub on this machine" if local else f"robot {robot!r} sees no USB hub; --local shows this machine's"
         )
-    elif sys.stdout.isatty():
+    elif on_terminal(sys.stdout):
         console().print(*draw(nodes), sep="\n")
     else:
         print("\n".join(plain(nodes)))

@@ -55,7 +55,7 @@ def info(path: str | Path) -> dict[str, Any]:
     return {
         "path": str(path),
         "size": Path(path).stat().st_size,
-        "damage": reader.damage,
+        "damage": reader.fault,
         "messages": sum(row["messages"] for row in heard),
         "start": start,
         "end": end,

@@ -21,9 +21,9 @@ class LogState(StrEnum):
     UNFINISHED = "unfinished"
     """Nobody writes it any more: for ``recover``."""
     DAMAGED = "damaged"
-    """Its index, and so it is not known what else: for ``recover``, too."""
+    """Its index, or what dates it: for ``info`` and ``recover``."""
     UNREADABLE = "unreadable"
-    """No log."""
+    """Not a log, or not ours to read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,25 +49,29 @@ def list_logs(folder: Path) -> list[Listed]:
     """
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder")
-    return [_look(path) for path in sorted(folder.rglob("*.mcap"))]
+    return [_look(path) for path in sorted(folder.rglob("*.mcap")) if path.is_file()]
 
 
 def _look(path: Path) -> Listed:
     size = path.stat().st_size
     try:
         reader = LogReader(path)
-        if not is_finished(path):
-            return Listed(path, size, LogState.WRITING if in_use(path) else LogState.UNFINISHED)
-        if not index_is_sound(path):
-            return Listed(path, size, LogState.DAMAGED)
+    except InputError:
+        return Listed(path, size, LogState.UNREADABLE)
+    if not is_finished(path):
+        return Listed(path, size, LogState.WRITING if in_use(path) else LogState.UNFINISHED)
+    try:
         with path.open("rb") as file:
+            if not index_is_sound(file):
+                return Listed(path, size, LogState.DAMAGED)
+            file.seek(0)
             summary = make_reader(file).get_summary()
         statistics = None if summary is None else summary.statistics
         if statistics is None:
             return Listed(path, size, LogState.FINISHED)
         real = statistics.message_start_time + real_offset(reader)
     except (*DAMAGE, InputError):
-        return Listed(path, size, LogState.UNREADABLE)
+        return Listed(path, size, LogState.DAMAGED)
     return Listed(
         path,
         size,

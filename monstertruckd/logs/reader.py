@@ -6,14 +6,14 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 
@@ -38,28 +38,46 @@ DAMAGE: Final = (
 """What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
 
 
+CONFIG: Final = "config.json"
+"""The attachment with the daemon's configuration."""
+DAMAGED: Final = ".damaged"
+"""Behind the name of an attachment whose checksum is wrong: nobody takes it for what it was, and nothing is lost."""
+
 _END: Final = struct.Struct("<BQQQI8s")
 """Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
 
 _FOOTER_LENGTH: Final = struct.calcsize("<QQI")
 _UNSUMMED: Final = struct.calcsize("<I8s")
+_HEAD: Final = struct.calcsize("<BQ")
+_DATA_END: Final = _HEAD + struct.calcsize("<I")
+_CHECKSUM: Final = struct.Struct("<I")
+_PIECE: Final = 1 << 20
 
 
-def index_is_sound(path: Path) -> bool:
-    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says."""
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(-min(size, _END.size), os.SEEK_END)
-        end = file.read()
-        if len(end) < _END.size:
-            return False
-        opcode, length, start, _, checksum, magic = _END.unpack(end)
-        if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size:
-            return False
-        if not (start and checksum):
-            return True
-        file.seek(start)
-        return zlib.crc32(file.read(size - start - _UNSUMMED)) == int(checksum)
+def index_is_sound(file: BinaryIO) -> bool:
+    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
+
+    Args:
+        file: of the log; its position is another one afterwards.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(-min(size, _END.size), os.SEEK_END)
+    end = file.read()
+    if len(end) < _END.size:
+        return False
+    opcode, length, start, _, checksum, magic = _END.unpack(end)
+    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size - _END.size:
+        return False
+    return not (start and checksum) or _checksum(file, start, size - _UNSUMMED) == checksum
+
+
+def _checksum(file: BinaryIO, begin: int, end: int) -> int:
+    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
+    file.seek(begin)
+    value = 0
+    for at in range(begin, end, _PIECE):
+        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
+    return value
 
 
 def spare_log(output: Path) -> None:
@@ -117,7 +135,9 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After an iteration to the end: why it ended early; None for a finished, sound log."""
+        """After an iteration to the end: why it ended early; None if it gave every message."""
+        self.flaws: list[str] = []
+        """What else an iteration to the end found damaged; it costs no message."""
         self.position = 0
         """Bytes an iteration has read so far, for progress bars."""
         try:
@@ -154,8 +174,8 @@ class LogReader:
                 )
 
     def records(self) -> Iterator[McapRecord]:
-        """Every MCAP record up to the first error, chunks opened; channels always precede their messages."""
-        self.damage = None
+        """Every MCAP record before the index, up to the first error, chunks opened; channels precede their messages."""
+        self.damage, self.flaws = None, []
         channels: set[int] = set()
         size = self.size
         with self.path.open("rb") as file:
@@ -167,30 +187,58 @@ class LogReader:
                 except DAMAGE as error:
                     self.damage = f"ends or is damaged after byte {at} of {size} ({type(error).__name__})"
                     return
-                if record is None:
-                    self.position = size
-                    if not index_is_sound(self.path):
-                        self.damage = "its index is damaged, what stands before it is sound"
-                    return
                 if isinstance(record, Channel):
                     channels.add(record.id)
                 elif isinstance(record, McapMessage) and record.channel_id not in channels:
                     self.damage = f"message of an unknown channel before byte {at} of {size}"
                     return
+                elif isinstance(record, Attachment):
+                    record = self._checked(record, file, at)
+                elif record is None or isinstance(record, DataEnd):
+                    if file.tell() - at != _DATA_END:  # a longer one was something else before its first byte flipped
+                        self.damage = f"ends or is damaged after byte {at} of {size} (DataEnd)"
+                        return
+                    self.position = size
+                    if not index_is_sound(file):
+                        self.flaws.append("has a damaged index")
+                    return
                 yield record
+
+    def _checked(self, record: Attachment, file: BinaryIO, at: int) -> Attachment:
+        """An attachment that begins at byte ``at`` by another name if its checksum, which mcap skips, is wrong."""
+        end = file.tell()
+        found = _checksum(file, at + _HEAD, end - _CHECKSUM.size)
+        (expected,) = _CHECKSUM.unpack(file.read(_CHECKSUM.size))
+        if expected in (0, found):
+            return record
+        self.flaws.append(f"holds a damaged {record.name}")
+        return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
 
     def preamble(self) -> Iterator[McapRecord]:
         """The records before the first message: the recorder writes attachments and metadata there."""
         return itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
 
     def config(self) -> dict[str, Any]:
-        """The attached configuration as plain values; empty where there is none, or its bytes are no JSON object."""
-        found = (r.data for r in self.preamble() if isinstance(r, Attachment) and r.name == "config.json")
+        """The attached configuration as plain values; empty where there is none.
+
+        Raises:
+            InputError: it is damaged, or no JSON object.
+        """
+        found = {record.name: record.data for record in self.preamble() if isinstance(record, Attachment)}
+        if CONFIG + DAMAGED in found:
+            raise InputError(f"{self.path}: {CONFIG} in it is damaged")
         try:
-            values = json.loads(next(found, b"{}"))
-        except ValueError:
-            return {}
-        return values if isinstance(values, dict) else {}
+            values = json.loads(found.get(CONFIG, b"{}"))
+        except ValueError as error:
+            raise InputError(f"{self.path}: {CONFIG}: {error}") from None
+        if not isinstance(values, dict):
+            raise InputError(f"{self.path}: {CONFIG}: expected an object")
+        return values
+
+    @property
+    def fault(self) -> str | None:
+        """All that an iteration to the end found wrong, to be read behind the log's name; None for a sound log."""
+        return ", ".join([*self.flaws, *([] if self.damage is None else [self.damage])]) or None
 
     @property
     def size(self) -> int:

@@ -27,7 +27,7 @@ class Recovery:
     """The repaired file."""
     messages: int
     damage: str | None
-    """Where the original ended; None when it was sound."""
+    """What was wrong with the original; None when it was sound."""
 
 
 def is_finished(path: Path) -> bool:
@@ -75,7 +75,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
                 messages = _copy(reader, output, stop)
                 output.flush()
                 os.fsync(output.fileno())
-            if in_place and reader.damage is None and is_finished(source):
+            if in_place and reader.fault is None and is_finished(source):
                 part.unlink()
             else:
                 part.replace(target)
@@ -86,7 +86,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
         except BaseException:
             part.unlink(missing_ok=True)
             raise
-    return Recovery(target, messages, reader.damage)
+    return Recovery(target, messages, reader.fault)
 
 
 def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -115,7 +116,9 @@ class Scene:
 
     def truck(self, reader: LogReader) -> None:
         """A box of the size in the log's configuration; logs without one show none."""
-        geometry = reader.config().get("geometry", {})
+        geometry: dict[str, Any] = {}
+        with suppress(InputError):
+            geometry = reader.config().get("geometry", {})
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:
             return

@@ -5,15 +5,16 @@ by hours. What the log last knew of the offset dates all of it, its first messag
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import CLOCK
 from monstertruckd.logs.reader import DAMAGE, LogReader, index_is_sound
 
@@ -22,33 +23,39 @@ _PLAUSIBLE: Final = 946_684_800 * SECOND
 
 
 def real_offset(reader: LogReader) -> int:
-    """Real (UNIX) minus daemon time, ns, as the log last knew it; 0 if it never did."""
-    try:
-        newest = _newest_by_index(reader.path)
-    except DAMAGE:
-        newest = _newest_readable(reader)
+    """Real (UNIX) minus daemon time, ns, as the log last knew it; 0 if it never did.
+
+    Raises:
+        InputError: what the log says of it is no number.
+    """
+    newest = _newest_clock(reader)
     if newest is not None:
         return wire.decode(CLOCK, newest).offset
-    return first_offset(reader.metadata().get("run", {}))
+    return first_offset(reader.path, reader.metadata().get("run", {}))
 
 
-def first_offset(metadata: Mapping[str, str]) -> int:
-    """Real minus daemon time, ns, when the run began; 0 if that is not in its metadata, or no number."""
+def first_offset(log: Path, metadata: Mapping[str, str]) -> int:
+    """Real minus daemon time, ns, when a run began, by its metadata; 0 if that does not say.
+
+    Raises:
+        InputError: it says something else than a number.
+    """
+    text = metadata.get("real_offset_ns", "0")
     try:
-        return int(metadata.get("real_offset_ns", 0))
+        return int(text)
     except ValueError:
-        return 0
+        raise InputError(f"{log}: metadata run: real_offset_ns is {text!r}, expected a whole number") from None
 
 
-def _newest_by_index(path: Path) -> bytes | None:
-    if not index_is_sound(path):
-        raise McapError
-    with path.open("rb") as file:
-        last = next(make_reader(file, validate_crcs=True).iter_messages(topics=CLOCK.name, reverse=True), None)
-    return None if last is None else last[2].data
-
-
-def _newest_readable(reader: LogReader) -> bytes | None:
+def _newest_clock(reader: LogReader) -> bytes | None:
+    """Payload of the last clock message: by the index, or by reading through where there is none to rely on."""
+    with reader.path.open("rb") as file, suppress(*DAMAGE):
+        sound = index_is_sound(file)
+        file.seek(0)
+        log = make_reader(file, validate_crcs=True)
+        if sound and (summary := log.get_summary()) is not None and summary.chunk_indexes:
+            last = next(log.iter_messages(topics=CLOCK.name, reverse=True), None)
+            return None if last is None else last[2].data
     newest: bytes | None = None
     for message in reader:
         newest = message.payload if message.topic == CLOCK.name else newest

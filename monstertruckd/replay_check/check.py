@@ -70,7 +70,7 @@ def check_log(
         own, used = without_goals(own), without_goals(used)
     compared = outputs_of(own) | outputs_of(used)
     _refuse_the_middle(log, found, compared)
-    virtual = first_offset(metadata) == 0
+    virtual = first_offset(log, metadata) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
     rows = {
         topic.name: TopicComparison(

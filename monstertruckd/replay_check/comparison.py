@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
-from monstertruckd.replay_check.difference import Difference, Kind, differences
+from monstertruckd.replay_check.difference import Difference, Kind, differences, same_header
 
 UNREADABLE: Final = "not readable"
 
@@ -66,6 +66,8 @@ class TopicComparison:
     equal: int = 0
     differing: int = 0
     """Differ by more than the tolerance."""
+    headers: int = 0
+    """Differ in their stamps or number."""
     greatest: dict[Kind, Greatest] = field(default_factory=dict)
     first: First | None = None
     _count: int = 0
@@ -102,10 +104,10 @@ class TopicComparison:
         """Whether every output came again, until ``end``, ns, within the tolerance."""
         return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
-    def would_agree(self, end: int, tolerance: float) -> bool:
-        """The same with another tolerance, greater than 0."""
-        within = all(one.value <= tolerance for one in self.greatest.values())
-        return not self.judged or (within and self.missing == self.surplus(end) == 0)
+    def within(self, end: int, limit: float) -> bool:
+        """Whether every output came again, until ``end``, ns, with its header, and no field is off by more."""
+        close = all(one.value <= limit for one in self.greatest.values())
+        return not self.judged or (close and self.headers == self.missing == self.surplus(end) == 0)
 
     def _compare(self, sequence: int, recorded: _Output, again: _Output) -> None:
         self.compared += 1
@@ -113,7 +115,7 @@ class TopicComparison:
             self.equal += 1
             return
         at = (recorded.time - self.begin) / SECOND
-        found = self._differences(recorded, again)
+        found = self._differences(recorded.payload, again.payload)
         self._keep(found, sequence, at)
         off = tuple(one.field for one in found if one.value > self.tolerance)
         if self.tolerance > 0 and not off:
@@ -122,12 +124,13 @@ class TopicComparison:
         if self.first is None or at < self.first.at:
             self.first = First(self.topic.name, sequence, at, off)
 
-    def _differences(self, recorded: _Output, again: _Output) -> list[Difference]:
+    def _differences(self, recorded: bytes, again: bytes) -> list[Difference]:
         try:
-            before = wire.decode(self.topic, recorded.payload)
+            before, after = wire.decode(self.topic, recorded), wire.decode(self.topic, again)
         except InputError:
             return [Difference(Kind.TEXT, UNREADABLE, math.inf)]
-        return differences(before, wire.decode(self.topic, again.payload))
+        self.headers += not same_header(before, after)
+        return differences(before, after)
 
     def _keep(self, found: Iterable[Difference], sequence: int, at: float) -> None:
         for one in found:

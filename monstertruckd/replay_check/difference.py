@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
 
@@ -38,8 +38,14 @@ class Difference:
 
 
 def differences(before: Message, after: Message) -> list[Difference]:
-    """Every field in which two messages differ, but for their headers."""
-    return [found for found in _walk("", before, after) if not found.value <= 0]
+    """Every field in which two messages differ, but for their headers; NaN is infinitely far from any number."""
+    found = (replace(one, value=math.inf) if math.isnan(one.value) else one for one in _walk("", before, after))
+    return [one for one in found if one.value > 0]
+
+
+def same_header(before: Message, after: Message) -> bool:
+    """Whether stamps and number are the same."""
+    return all(getattr(before, name) == getattr(after, name) for name in HEADER)
 
 
 def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
@@ -78,9 +84,15 @@ def _figure(name: str, a: Any, b: Any) -> Iterator[Difference]:
 
 def _number(name: str, a: float, b: float) -> Difference:
     last = name.rpartition(".")[2]
-    if last in ANGLES:
-        return Difference(Kind.ANGLE, name, abs(wrap_angle(b - a)))
-    return Difference(Kind.LENGTH if last in LENGTHS else Kind.NUMBER, name, 0.0 if a == b else abs(b - a))
+    kind = Kind.ANGLE if last in ANGLES else Kind.LENGTH if last in LENGTHS else Kind.NUMBER
+    if _same(a, b):
+        return Difference(kind, name, 0.0)
+    return Difference(kind, name, abs(wrap_angle(b - a) if kind is Kind.ANGLE else b - a))
+
+
+def _same(a: Any, b: Any) -> Any:
+    """Equal, or NaN both; of arrays for each element."""
+    return (a == b) | ((a != a) & (b != b))  # NaN alone differs from itself
 
 
 def _text(name: str, a: object, b: object) -> Difference:
@@ -90,7 +102,8 @@ def _text(name: str, a: object, b: object) -> Difference:
 def _array(name: str, a: Any, b: Any) -> Difference:
     if a.shape != b.shape:
         return Difference(Kind.TEXT, name, math.inf)
-    off = np.abs(b[a != b].astype(np.float64) - a[a != b])
+    other = ~_same(a, b)
+    off = np.abs(b[other].astype(np.float64) - a[other])
     return Difference(Kind.NUMBER, name, float(off.max()) if off.size else 0.0)
 
 

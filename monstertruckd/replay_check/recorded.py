@@ -16,10 +16,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage
+from monstertruckd.logs.reader import CONFIG, DAMAGED
 from monstertruckd.replay_check.goals import GoalRecord
 from monstertruckd.replay_check.run_log import RunLog
 
-CONFIG: Final = "config.json"
 SIMULATION: Final = "sim"
 """Section of the world behind emulated devices; the robot does not know it."""
 
@@ -97,10 +97,12 @@ def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:
     """The configuration the log was recorded with.
 
     Raises:
-        InputError: it is not attached.
+        InputError: it is not attached, or damaged.
         ConfigError: this version refuses it.
     """
     data = attachments.get(CONFIG)
+    if CONFIG + DAMAGED in attachments:
+        raise InputError(f"{log}: {CONFIG} in it is damaged")
     if data is None:
         raise InputError(f"{log}: {CONFIG} is not attached: expected a log that the daemon recorded")
     try:

@@ -8,7 +8,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.replay_check.comparison import First, TopicComparison
 
 ROUNDING: Final = 1e-6
-"""SI units that outputs may be off where another processor's maths routines round otherwise; 1e-14 were seen."""
+"""SI units: what another processor's maths routines, which round otherwise, are off by is far less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ class Check:
 
     @property
     def rounded(self) -> bool:
-        """Whether it does not agree, but would with the tolerance ``ROUNDING``."""
-        close = all(row.would_agree(self.end, ROUNDING) for row in self.topics) and not self.unreadable
+        """Whether it does not agree, but nothing is off by more than ``ROUNDING``."""
+        close = all(row.within(self.end, ROUNDING) for row in self.topics) and not self.unreadable
         return close and not self.agrees
 
     @property

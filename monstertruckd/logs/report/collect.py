@@ -222,7 +222,7 @@ def collect(path: str | Path, progress: Progress | None = None) -> Run:
     if run.messages == 0:
         msg = f"{path}: holds no messages" + (f"; {reader.damage}" if reader.damage else "")
         raise InputError(msg)
-    run.damage = reader.damage
+    run.damage = reader.fault
     _describe(run, reader)
     for traffic in run.traffic.values():
         traffic.count_to(run.end)
@@ -244,7 +244,7 @@ def _describe(run: Run, reader: LogReader) -> None:
             case Metadata(name="run"):
                 run.metadata = dict(record.metadata)
     if run.offset is None:
-        run.offset = first_offset(run.metadata)
+        run.offset = first_offset(reader.path, run.metadata)
 
 
 def _decoded(entry: LogMessage) -> Message | None:

@@ -1,11 +1,14 @@
 """The habit all commands share: values, tables, progress and ends."""
 
+import fcntl
 import json
 import os
 import pty
 import signal
+import struct
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.cli.main import app
 from monstertruckd.cli.output import HELP_STYLE, CommandGroup, finish, print_json, print_table, progress, until_stopped
+from monstertruckd.logs.listing import LogState, list_logs
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -127,6 +131,29 @@ def test_help_is_framed_on_a_terminal():
     finally:
         os.close(reader)
         os.close(terminal)
+
+
+def test_help_has_the_width_of_the_terminal_it_stands_on():
+    reader, terminal = pty.openpty()
+    try:
+        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 70, 0, 0))
+        bare = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
+        called("log", "--help", env=bare, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
+        lines = os.read(reader, 1 << 16).decode().splitlines()
+        assert max(map(len, lines)) <= 70
+        assert lines[0].isascii()
+    finally:
+        os.close(reader)
+        os.close(terminal)
+
+
+def test_nothing_is_lost_without_a_standard_output(tmp_path: Path):
+    (tmp_path / "cut.mcap").write_bytes((ROOT / "tests/data/replay/level.mcap").read_bytes()[:-9])
+    command = f"exec {sys.executable} -m monstertruckd log recover {tmp_path}/cut.mcap >&-"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    (log,) = list_logs(tmp_path)
+    assert log.state is LogState.FINISHED
 
 
 def test_every_group_has_the_same_help():

@@ -101,7 +101,8 @@ def test_offset_is_what_the_log_last_knew(log, tmp_path):
     assert real_offset(open_log(silent)) == 5
     number = b"real_offset_ns\x01\x00\x00\x00"
     silent.write_bytes(silent.read_bytes().replace(number + b"5", number + b"u"))
-    assert real_offset(open_log(silent)) == 0
+    with pytest.raises(InputError, match=r"silent\.mcap: metadata run: real_offset_ns is 'u', expected a whole number"):
+        real_offset(open_log(silent))
     assert utc(MAY_2026) == "2026-05-01 01:46:40"
 
 

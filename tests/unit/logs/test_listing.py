@@ -62,6 +62,14 @@ def test_no_damage_of_one_log_hides_the_others(folder: Path):
         assert real_offset(LogReader(damaged)) == MAY_2026
 
 
+def test_what_dates_a_log_may_be_damaged_or_a_name_lead_nowhere(folder: Path):
+    number = b"real_offset_ns\x01\x00\x00\x00"
+    undated = folder / "box/run-2.mcap"
+    undated.write_bytes(undated.read_bytes().replace(number + b"5", number + b"u"))
+    (folder / "gone.mcap").symlink_to(folder / "nothing")
+    assert [log.state for log in list_logs(folder)] == ["damaged", "finished", "unfinished", "unreadable"]
+
+
 def test_no_folder_is_not_no_logs(tmp_path: Path):
     assert list_logs(tmp_path) == []
     with pytest.raises(NotFoundError, match="no such folder"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -23,6 +24,7 @@ from monstertruck_schemas.sensor import Attitude, Vector3
 from monstertruckd.logs import export_csv, export_npz, info, open_log, recover, recover_directory
 from monstertruckd.recorder.file import Entry, LogFile
 from tests.unit.recorder.conftest import scan, steering
+from tests.unit.replay_check.log_surgery import chunks
 
 
 def compass(now, seq):
@@ -120,17 +122,67 @@ def test_a_damaged_index_is_told_and_mended(log, master):
     log.write_bytes(data)
     reader = open_log(log)
     assert len(list(reader)) == len(master[1])
-    assert reader.damage == info(log)["damage"] == "its index is damaged, what stands before it is sound"
-    assert recover(log, log).messages == len(master[1])
+    assert reader.damage is None
+    assert reader.fault == info(log)["damage"] == "has a damaged index"
+    assert recover(log, log).damage == "has a damaged index"
     assert info(log)["damage"] is None
 
 
-@pytest.mark.parametrize("attached", [b"", b"{", b"[1]", b'"text"'])
-def test_a_configuration_that_is_no_object_is_none(log, attached):
+def test_no_damage_of_an_index_makes_messages(tmp_path):
+    source, damaged = tmp_path / "source.mcap", tmp_path / "damaged.mcap"
+    write(source, 1)
+    whole = source.read_bytes()
+    messages = list(open_log(source))
+    for place in range(int.from_bytes(whole[-28:-20], "little"), len(whole)):
+        for bit in (0x01, 0x80):
+            damaged.write_bytes(whole[:place] + bytes([whole[place] ^ bit]) + whole[place + 1 :])
+            reader = open_log(damaged)
+            assert list(reader) == messages
+            assert reader.fault == "has a damaged index"
+
+
+def test_what_turned_into_an_end_is_none(log, master):
+    data = bytearray(log.read_bytes())
+    first, *_ = chunks(data)
+    assert data[first.start - 9] == Opcode.CHUNK
+    data[first.start - 9] = Opcode.DATA_END
+    log.write_bytes(data)
+    reader = open_log(log)
+    assert list(reader) == []
+    assert "damaged after byte" in reader.damage
+
+
+def test_a_damaged_attachment_is_told_kept_and_not_used(log, master):
     assert open_log(log).config() == {"a": 1}
-    before = open_log(log).attachments()["config.json"]
-    log.write_bytes(log.read_bytes().replace(before, attached.ljust(len(before)), 1))
-    assert open_log(log).config() == {}
+    log.write_bytes(log.read_bytes().replace(b'"a": 1', b'"a": 2', 1))
+    reader = open_log(log)
+    assert len(list(reader)) == len(master[1])
+    assert (reader.damage, reader.fault) == (None, "holds a damaged config.json")
+    for _ in range(2):
+        with pytest.raises(InputError, match=rf"{log.name}: config\.json in it is damaged"):
+            open_log(log).config()
+        assert b'"a": 2' in open_log(log).attachments()["config.json.damaged"]
+        assert recover(log, log).messages == len(master[1])
+    assert info(log)["damage"] is None
+
+
+@pytest.mark.parametrize("attached", ["text", [1]])
+def test_a_configuration_is_an_object(tmp_path, attached):
+    file = tmp_path / "log.mcap"
+    LogFile(file, "lz4", 1 << 20, {"config": attached}, {}, SECOND).finish()
+    with pytest.raises(InputError, match=r"config\.json: expected an object"):
+        open_log(file).config()
+    LogFile(tmp_path / "bare.mcap", "lz4", 1 << 20, {}, {}, SECOND).finish()
+    assert open_log(tmp_path / "bare.mcap").config() == {}
+
+
+def test_a_log_that_is_removed_is_read_to_its_end(log, master):
+    reader = open_log(log)
+    messages = iter(reader)
+    next(messages)
+    log.unlink()
+    assert len(list(messages)) == len(master[1]) - 1
+    assert reader.fault is None
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])

@@ -50,6 +50,17 @@ def test_transforms_are_named_by_their_frame():
     }
 
 
+def test_no_number_is_infinitely_far_from_one_and_equal_to_its_like():
+    number = StabiliserCommand(**HEADER, pitch=0.1, roll=0.2)
+    none = number.model_copy(update={"pitch": math.nan})
+    assert differences(number, none) == differences(none, number) == [Difference(Kind.ANGLE, "pitch", math.inf)]
+    assert differences(none, none.model_copy()) == []
+    row = odometry(1, 0)
+    hole = row.model_copy(update={"pose_covariance": np.where(np.arange(9) == 3, math.nan, row.pose_covariance)})
+    assert found(row, hole) == {(Kind.NUMBER, "pose_covariance"): math.inf}
+    assert differences(hole, hole.model_copy(update={"pose_covariance": hole.pose_covariance.copy()})) == []
+
+
 def test_what_cannot_be_subtracted_is_text():
     state = {"cross_track": 0.0, "heading_error": 0.0, "along": 1.0, "length": 2.0}
     before = TrackerState(**HEADER, path="a", outcome=Reason.DRIVING, **state)

@@ -1,12 +1,14 @@
 """Recorded runs computed again: all of it equal, and nothing that was changed stays unfound."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
 
 from monstertruck_runtime import wire
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.cli.main import app
@@ -42,6 +44,7 @@ pytestmark = pytest.mark.timeout(120)
 def test_a_stored_run_comes_again(log, computed):
     check = computed_again(log)
     assert check.agrees, check.first
+    assert not any(row.headers for row in check.topics)
     assert check.compared >= 1000
     assert check.reason is Reason.OK
     assert {topic.name for topic in computed} <= {row.topic.name for row in check.topics if row.compared}
@@ -118,17 +121,22 @@ def test_a_changed_output_is_found_as_well(tmp_path):
     assert check_log(log, tolerance=0.01).agrees
 
 
-@pytest.mark.parametrize(("by", "rounded"), [(1e-9, True), (1e-5, False)])
-def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
-    def nudged(one):
+def with_drive(log, target, change):
+    """``log`` with the 50th message of ``plan/drive`` as ``change`` gives it back."""
+
+    def altered(one):
         if (one.topic, one.sequence) != ("plan/drive", 50):
             return one
-        drive = one.decode()
-        return replace(
-            one, payload=wire.encode(topics.PLAN_DRIVE, drive.model_copy(update={"front": drive.front + by}))
-        )
+        return replace(one, payload=wire.encode(topics.PLAN_DRIVE, change(one.decode())))
 
-    log = changed(LEVEL, tmp_path / "nudged.mcap", nudged)
+    return changed(log, target, altered)
+
+
+@pytest.mark.parametrize(("by", "rounded"), [(1e-9, True), (1e-5, False)])
+def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
+    log = with_drive(
+        LEVEL, tmp_path / "nudged.mcap", lambda drive: drive.model_copy(update={"front": drive.front + by})
+    )
     exact, close = check_log(log), computed_again(log)
     assert not exact.agrees
     assert exact.rounded is exact.figures()["rounded"] is rounded
@@ -138,6 +146,32 @@ def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
     done = CliRunner().invoke(app, ["replay", str(log), "--check"])
     assert done.exit_code == Reason.REPLAY_DIFFERS.exit_code
     assert ("try --tolerance 1e-6" in done.output.replace("\n", " ")) is rounded
+
+
+def test_another_stamp_is_no_rounding(tmp_path):
+    log = with_drive(LEVEL, tmp_path / "late.mcap", lambda drive: drive.model_copy(update={"stamp": drive.stamp + 1}))
+    check = check_log(log)
+    assert not check.agrees
+    assert not check.rounded
+    assert check.first.fields == ()
+    assert [row.topic for row in check.topics if row.headers] == [topics.PLAN_DRIVE]
+
+
+@pytest.mark.parametrize("log", [LEVEL, SLAM], ids=["level", "slam"])
+def test_a_command_that_is_no_number_agrees_with_nothing(tmp_path, log):
+    nan = with_drive(log, tmp_path / "nan.mcap", lambda drive: drive.model_copy(update={"front": math.nan}))
+    check = computed_again(nan)
+    assert not check.agrees
+    assert not check.rounded
+    assert (check.first.topic, check.first.sequence, check.first.fields) == ("plan/drive", 50, ("front",))
+
+
+def test_a_damaged_configuration_is_not_computed_with(tmp_path):
+    log = tmp_path / "damaged.mcap"
+    data = LEVEL.read_bytes()
+    log.write_bytes(data.replace(b'"wheel_radius"', b'"wheel_radiuS"', 1))
+    with pytest.raises(InputError, match=r"damaged\.mcap: config\.json in it is damaged"):
+        check_log(log)
 
 
 def test_a_lost_reading_is_named(tmp_path):

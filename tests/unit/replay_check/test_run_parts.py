@@ -66,6 +66,16 @@ def test_a_part_that_is_not_there_ends_the_run(parts):
     assert f"{parts[1].name} is not there" in done.output.replace("\n", " ")
 
 
+def test_a_damaged_index_ends_no_run(parts):
+    data = bytearray(parts[1].read_bytes())
+    data[data.rindex(b"jsonschema")] ^= 1
+    parts[1].write_bytes(data)
+    check = computed_again(parts[0])
+    assert check.agrees
+    assert check.damage is None
+    assert check.compared == computed_again(LEVEL).compared
+
+
 def test_without_its_first_part_a_run_cannot_be_computed(parts):
     parts[0].unlink()
     with pytest.raises(InputError, match=rf"{parts[0].name} is not there: expected the first part"):
