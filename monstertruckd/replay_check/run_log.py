@@ -54,7 +54,7 @@ class RunLog:
         self._reader = self._readers[0]
         first = _identity(self._reader)
         for reader in self._readers[1:]:
-            if _identity(reader) != first and reader.damage is None:
+            if not _alike(_identity(reader), first) and reader.damage is None:
                 raise InputError(f"{reader.path}: is of another run than {self._reader.path.name}")
 
     @property
@@ -95,6 +95,11 @@ class RunLog:
         if named is None or int(named[2]) == number:
             return None
         return f"run-{named[1]}-{number:03d}.mcap"
+
+
+def _alike(one: Identity, other: Identity) -> bool:
+    """Whether two parts say the same of themselves, as far as both say it: what is damaged says nothing."""
+    return one[0] == other[0] and all(one[1][name] == other[1][name] for name in one[1].keys() & other[1].keys())
 
 
 def _identity(reader: LogReader) -> Identity:

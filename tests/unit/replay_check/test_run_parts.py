@@ -76,6 +76,13 @@ def test_a_damaged_index_ends_no_run(parts):
     assert check.compared == computed_again(LEVEL).compared
 
 
+def test_a_damaged_attachment_of_a_later_part_ends_no_run(parts):
+    parts[1].write_bytes(parts[1].read_bytes().replace(b'"wheel_radius"', b'"wheel_radiuS"', 1))
+    check = computed_again(parts[0])
+    assert check.agrees
+    assert check.compared == computed_again(LEVEL).compared
+
+
 def test_without_its_first_part_a_run_cannot_be_computed(parts):
     parts[0].unlink()
     with pytest.raises(InputError, match=rf"{parts[0].name} is not there: expected the first part"):
