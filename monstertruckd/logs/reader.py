@@ -37,7 +37,6 @@ DAMAGE: Final = (
 )
 """What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
 
-
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
 DAMAGED: Final = ".damaged"
@@ -190,7 +189,7 @@ class LogReader:
                 if isinstance(record, Channel):
                     channels.add(record.id)
                 elif isinstance(record, McapMessage) and record.channel_id not in channels:
-                    self.damage = f"message of an unknown channel before byte {at} of {size}"
+                    self.damage = f"holds a message of an unknown channel before byte {at} of {size}"
                     return
                 elif isinstance(record, Attachment):
                     record = self._checked(record, file, at)
