@@ -44,7 +44,7 @@ def on_terminal(stream: TextIO | None) -> bool:
 HELP_STYLE: Final = "markdown" if on_terminal(sys.stdout) and on_terminal(sys.stderr) else None
 """Of help and usage errors: framed on terminals, bare text (None) as soon as one of the two streams is a pipe."""
 
-HELP_WIDTH: Final = {} if on_terminal(sys.stdout) else {"terminal_width": PIPE_WIDTH}
+HELP_WIDTH: Final = {"max_content_width" if on_terminal(sys.stdout) else "terminal_width": PIPE_WIDTH}
 """Setting of a command line: the terminal's own width, or lines nobody folds."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
@@ -137,7 +137,8 @@ def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
 
 def remark(text: str) -> None:
     """Say something beside the result."""
-    print(text, file=sys.stderr, flush=True)
+    if sys.stderr is not None:  # print() would take standard output in its place
+        print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager

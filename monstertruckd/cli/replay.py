@@ -108,14 +108,14 @@ def _amount(one: "Greatest") -> str:
     from monstertruckd.replay_check.difference import Kind
 
     match one.kind:
+        case _ if math.isinf(one.value):
+            return f"other {one.field}"
         case Kind.LENGTH:
             return f"{one.value * 100:.2g} cm"
         case Kind.ANGLE:
             return f"{math.degrees(one.value):.2g}°"
-        case Kind.NUMBER:
-            return f"{one.field} {one.value:.2g}"
         case _:
-            return f"other {one.field}"
+            return f"{one.field} {one.value:.2g}"
 
 
 def _verdict(result: "Check") -> str:

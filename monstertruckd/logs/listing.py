@@ -21,7 +21,7 @@ class LogState(StrEnum):
     UNFINISHED = "unfinished"
     """Nobody writes it any more: for ``recover``."""
     DAMAGED = "damaged"
-    """Its index, or what dates it: for ``info`` and ``recover``."""
+    """Its index: for ``recover``, too."""
     UNREADABLE = "unreadable"
     """Not a log, or not ours to read."""
 
@@ -69,8 +69,8 @@ def _look(path: Path) -> Listed:
         statistics = None if summary is None else summary.statistics
         if statistics is None:
             return Listed(path, size, LogState.FINISHED)
-        real = statistics.message_start_time + real_offset(reader)
-    except (*DAMAGE, InputError):
+        real = statistics.message_start_time + _offset(reader)
+    except DAMAGE:
         return Listed(path, size, LogState.DAMAGED)
     return Listed(
         path,
@@ -80,3 +80,10 @@ def _look(path: Path) -> Listed:
         duration=(statistics.message_end_time - statistics.message_start_time) / SECOND,
         messages=statistics.message_count,
     )
+
+
+def _offset(reader: LogReader) -> int:
+    try:
+        return real_offset(reader)
+    except InputError:
+        return 0

@@ -5,17 +5,20 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import zstandard
-from mcap.exceptions import McapError
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema, Statistics
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import breakup_chunk
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError, NotFoundError
@@ -47,10 +50,18 @@ _END: Final = struct.Struct("<BQQQI8s")
 
 _FOOTER_LENGTH: Final = struct.calcsize("<QQI")
 _UNSUMMED: Final = struct.calcsize("<I8s")
-_HEAD: Final = struct.calcsize("<BQ")
-_DATA_END: Final = _HEAD + struct.calcsize("<I")
+_HEAD: Final = struct.Struct("<BQ")
+"""Of a record: opcode, length of the content."""
 _CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
+_PRIVATE: Final = 0x80
+"""Opcodes from here on are anybody's; below, those that are no part of the data section come of damage."""
+_PLAIN: Final[dict[int, Any]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
 
 
 def index_is_sound(file: BinaryIO) -> bool:
@@ -77,6 +88,32 @@ def _checksum(file: BinaryIO, begin: int, end: int) -> int:
     for at in range(begin, end, _PIECE):
         value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
     return value
+
+
+def _frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
+    """Opcode, head and content of the next record.
+
+    Raises:
+        EndOfFile: it is not all there.
+    """
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise EndOfFile
+    opcode, length = _HEAD.unpack(head)
+    if length > size - file.tell():
+        raise EndOfFile
+    return opcode, head, file.read(length)
+
+
+def _statistics(file: BinaryIO, size: int) -> Statistics | None:
+    """Of a sound index that begins where ``file`` stands; None if it has none."""
+    while True:
+        opcode, _, content = _frame(file, size)
+        if opcode == Opcode.STATISTICS:
+            found: Statistics = Statistics.read(ReadDataStream(BytesIO(content)))
+            return found
+        if opcode == Opcode.FOOTER:
+            return None
 
 
 def spare_log(output: Path) -> None:
@@ -134,7 +171,7 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After an iteration to the end: why it ended early; None if it gave every message."""
+        """After an iteration to the end: why it did not give every message; None if it did, as far as can be told."""
         self.flaws: list[str] = []
         """What else an iteration to the end found damaged; it costs no message."""
         self.position = 0
@@ -175,43 +212,79 @@ class LogReader:
     def records(self) -> Iterator[McapRecord]:
         """Every MCAP record before the index, up to the first error, chunks opened; channels precede their messages."""
         self.damage, self.flaws = None, []
-        channels: set[int] = set()
         size = self.size
         with self.path.open("rb") as file:
-            stream = StreamReader(file, validate_crcs=True, record_size_limit=size).records
-            while True:
-                self.position = at = file.tell()
-                try:
-                    record = next(stream, None)
-                except DAMAGE as error:
-                    self.damage = f"ends or is damaged after byte {at} of {size} ({type(error).__name__})"
-                    return
+            try:
+                yield from self._records(file, size)
+            except DAMAGE as error:
+                why = str(error) if type(error) is McapError else type(error).__name__
+                self.damage = f"ends or is damaged after byte {self.position} of {size} ({why})"
+
+    def _records(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
+        """The same, with one of ``DAMAGE`` at the first error; begins at ``position`` at that moment."""
+        channels: set[int] = set()
+        given: Counter[type[McapRecord]] = Counter()
+        self.position = 0
+        summed = zlib.crc32(file.read(len(MAGIC)))
+        while True:
+            self.position = file.tell()
+            opcode, head, content = _frame(file, size)
+            if opcode == Opcode.DATA_END:
+                self._end(file, size, content, summed, given)
+                self.position = size
+                return
+            summed = zlib.crc32(content, zlib.crc32(head, summed))
+            for record in self._opened(opcode, content):
                 if isinstance(record, Channel):
                     channels.add(record.id)
                 elif isinstance(record, McapMessage) and record.channel_id not in channels:
-                    self.damage = f"holds a message of an unknown channel before byte {at} of {size}"
-                    return
-                elif isinstance(record, Attachment):
-                    record = self._checked(record, file, at)
-                elif record is None or isinstance(record, DataEnd):
-                    if file.tell() - at != _DATA_END:  # a longer one was something else before its first byte flipped
-                        self.damage = f"ends or is damaged after byte {at} of {size} (DataEnd)"
-                        return
-                    self.position = size
-                    if not index_is_sound(file):
-                        self.flaws.append("has a damaged index")
-                    return
+                    raise McapError(f"message of an unknown channel {record.channel_id}")
+                given[type(record)] += 1
                 yield record
 
-    def _checked(self, record: Attachment, file: BinaryIO, at: int) -> Attachment:
-        """An attachment that begins at byte ``at`` by another name if its checksum, which mcap skips, is wrong."""
-        end = file.tell()
-        found = _checksum(file, at + _HEAD, end - _CHECKSUM.size)
-        (expected,) = _CHECKSUM.unpack(file.read(_CHECKSUM.size))
-        if expected in (0, found):
+    def _opened(self, opcode: int, content: bytes) -> Iterable[McapRecord]:
+        """What a record of the data section holds."""
+        stream = ReadDataStream(BytesIO(content))
+        match opcode:
+            case Opcode.CHUNK:
+                return breakup_chunk(Chunk.read(stream), validate_crc=True)
+            case Opcode.MESSAGE:
+                return (McapMessage.read(stream, len(content)),)
+            case Opcode.ATTACHMENT:
+                return (self._checked(Attachment.read(stream), content),)
+            case Opcode.HEADER | Opcode.SCHEMA | Opcode.CHANNEL | Opcode.METADATA:
+                return (_PLAIN[opcode].read(stream),)
+        if opcode != Opcode.MESSAGE_INDEX and opcode < _PRIVATE:
+            self.flaws.append(f"holds a damaged record at byte {self.position}")
+        return ()
+
+    def _checked(self, record: Attachment, content: bytes) -> Attachment:
+        """An attachment, by another name if its checksum, which mcap skips, is wrong."""
+        (expected,) = _CHECKSUM.unpack(content[-_CHECKSUM.size :])
+        if expected in (0, zlib.crc32(content[: -_CHECKSUM.size])):
             return record
         self.flaws.append(f"holds a damaged {record.name}")
         return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
+
+    def _end(
+        self, file: BinaryIO, size: int, content: bytes, summed: int, given: Mapping[type[McapRecord], int]
+    ) -> None:
+        """Hold what was given against the end of the data section and the index behind it."""
+        (expected,) = _CHECKSUM.unpack(content)  # of another length it was another record before its first byte flipped
+        if expected not in (0, summed):
+            raise McapError("checksum of the data section")
+        begin = file.tell()
+        if not index_is_sound(file):
+            self.flaws.append("has a damaged index")
+            return
+        file.seek(begin)
+        told = _statistics(file, size)
+        if told is None:
+            return
+        if given[McapMessage] != told.message_count:
+            self.damage = f"holds {given[McapMessage]} of {told.message_count} messages"
+        if (given[Attachment], given[Metadata]) != (told.attachment_count, told.metadata_count):
+            self.flaws.append("lacks an attachment or metadata")
 
     def preamble(self) -> Iterator[McapRecord]:
         """The records before the first message: the recorder writes attachments and metadata there."""

@@ -105,9 +105,9 @@ class TopicComparison:
         return not self.judged or self.differing == self.missing == self.surplus(end) == 0
 
     def within(self, end: int, limit: float) -> bool:
-        """Whether every output came again, until ``end``, ns, with its header, and no field is off by more."""
-        close = all(one.value <= limit for one in self.greatest.values())
-        return not self.judged or (close and self.headers == self.missing == self.surplus(end) == 0)
+        """Whether it agrees or, with every output and header as recorded, no field is off by more than ``limit``."""
+        close = self.headers == 0 and all(one.value <= limit for one in self.greatest.values())
+        return self.agrees(end) or (close and self.missing == self.surplus(end) == 0)
 
     def _compare(self, sequence: int, recorded: _Output, again: _Output) -> None:
         self.compared += 1

@@ -1,7 +1,7 @@
 """How far two messages of one topic are apart, in words an operator knows: metres, angles, other numbers, else text."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
@@ -51,8 +51,8 @@ def same_header(before: Message, after: Message) -> bool:
 def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
     match a, b:
         case Pose2D(), Pose2D():
-            yield Difference(Kind.LENGTH, name, math.hypot(b.x - a.x, b.y - a.y))
-            yield Difference(Kind.ANGLE, f"{name}.yaw", abs(wrap_angle(b.yaw - a.yaw)))
+            yield Difference(Kind.LENGTH, name, _distance((a.x, a.y), (b.x, b.y)))
+            yield Difference(Kind.ANGLE, f"{name}.yaw", _turn(a.yaw, b.yaw))
         case (Transform(), Transform()) | (Grid(), Grid()) | (Path(), Path()):
             yield from _figure(name, a, b)
         case Schema(), Schema() if type(a) is type(b):
@@ -85,9 +85,19 @@ def _figure(name: str, a: Any, b: Any) -> Iterator[Difference]:
 def _number(name: str, a: float, b: float) -> Difference:
     last = name.rpartition(".")[2]
     kind = Kind.ANGLE if last in ANGLES else Kind.LENGTH if last in LENGTHS else Kind.NUMBER
+    return Difference(kind, name, _turn(a, b) if kind is Kind.ANGLE else _distance((a,), (b,)))
+
+
+def _turn(a: float, b: float) -> float:
+    """Between two angles, rad; infinite if one of them alone is no finite number."""
     if _same(a, b):
-        return Difference(kind, name, 0.0)
-    return Difference(kind, name, abs(wrap_angle(b - a) if kind is Kind.ANGLE else b - a))
+        return 0.0
+    return abs(wrap_angle(b - a)) if math.isfinite(b - a) else math.inf
+
+
+def _distance(a: Sequence[float], b: Sequence[float]) -> float:
+    """Between two points; coordinates that are the same, or NaN both, are no distance."""
+    return math.hypot(*(0.0 if _same(one, other) else other - one for one, other in zip(a, b, strict=True)))
 
 
 def _same(a: Any, b: Any) -> Any:
@@ -109,9 +119,9 @@ def _array(name: str, a: Any, b: Any) -> Difference:
 
 def _transform(name: str, a: Transform, b: Transform) -> Iterator[Difference]:
     yield _text(f"{name}.frames", (a.parent, a.child), (b.parent, b.child))
-    yield Difference(Kind.LENGTH, f"{a.child}.translation", math.dist(a.translation, b.translation))
+    yield Difference(Kind.LENGTH, f"{a.child}.translation", _distance(a.translation, b.translation))
     x, y, z, w = multiply(conjugate(a.rotation), b.rotation)
-    turned = 0.0 if a.rotation == b.rotation else 2 * math.atan2(math.hypot(x, y, z), abs(w))
+    turned = 0.0 if all(map(_same, a.rotation, b.rotation)) else 2 * math.atan2(math.hypot(x, y, z), abs(w))
     yield Difference(Kind.ANGLE, f"{a.child}.rotation", turned)
 
 
@@ -123,9 +133,9 @@ def _path(a: Path, b: Path) -> Iterator[Difference]:
     one, other = (np.reshape(path.poses, (-1, 3)) for path in (a, b))
     apart = np.hypot(*(one[:, None, :2] - other[None, :, :2]).transpose(2, 0, 1))
     near, back = apart.argmin(axis=1), apart.argmin(axis=0)
-    turned = np.concatenate((one[:, 2] - other[near, 2], other[:, 2] - one[back, 2]))
-    yield Difference(Kind.LENGTH, "poses", float(max(apart.min(axis=1).max(), apart.min(axis=0).max())))
-    yield Difference(Kind.ANGLE, "poses.yaw", max(abs(wrap_angle(angle)) for angle in turned.tolist()))
+    pairs = zip([*one[:, 2], *other[:, 2]], [*other[near, 2], *one[back, 2]], strict=True)
+    yield Difference(Kind.LENGTH, "poses", float(np.max([apart.min(axis=1).max(), apart.min(axis=0).max()])))
+    yield Difference(Kind.ANGLE, "poses.yaw", max(_turn(float(a), float(b)) for a, b in pairs))
     ways = (path.directions[np.flatnonzero(np.diff(path.directions, prepend=0.0))].tolist() for path in (a, b))
     yield _text("directions", *ways)
     yield _text("name", (a.name, a.closed), (b.name, b.closed))

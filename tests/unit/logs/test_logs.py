@@ -128,6 +128,17 @@ def test_a_damaged_index_is_told_and_mended(log, master):
     assert info(log)["damage"] is None
 
 
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_no_flipped_bit_changes_messages_untold(tmp_path, compression):
+    source, damaged = tmp_path / "source.mcap", tmp_path / "damaged.mcap"
+    write(source, 2, compression)
+    whole, messages = source.read_bytes(), list(open_log(source))
+    for place in range(8, len(whole), 11):
+        damaged.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
+        reader = open_log(damaged)
+        assert list(reader) == messages or reader.damage is not None, place
+
+
 def test_no_damage_of_an_index_makes_messages(tmp_path):
     source, damaged = tmp_path / "source.mcap", tmp_path / "damaged.mcap"
     write(source, 1)
@@ -141,15 +152,59 @@ def test_no_damage_of_an_index_makes_messages(tmp_path):
             assert reader.fault == "has a damaged index"
 
 
-def test_what_turned_into_an_end_is_none(log, master):
-    data = bytearray(log.read_bytes())
-    first, *_ = chunks(data)
-    assert data[first.start - 9] == Opcode.CHUNK
-    data[first.start - 9] = Opcode.DATA_END
-    log.write_bytes(data)
-    reader = open_log(log)
+def test_what_turned_into_an_end_is_none(tmp_path):
+    file = tmp_path / "log.mcap"
+    log = LogFile(file, "none", 1 << 20, {}, {}, 0)
+    log.add(Entry(t.COMPASS, 0, 0, 0, wire.encode(t.COMPASS, compass(0, 0))))
+    log.finish()
+    data = bytearray(file.read_bytes())
+    (chunk,) = chunks(data)
+    assert data[chunk.start - 9] == Opcode.CHUNK
+    assert data[chunk.start : chunk.start + 4] == bytes(4)  # as if it were no checksum
+    data[chunk.start - 9] = Opcode.DATA_END
+    file.write_bytes(data)
+    reader = open_log(file)
     assert list(reader) == []
     assert "damaged after byte" in reader.damage
+
+
+@pytest.mark.parametrize("opcode", [0x86, Opcode.MESSAGE_INDEX, Opcode.SUMMARY_OFFSET, 0x46])
+def test_a_lost_chunk_is_counted(log, master, opcode):
+    data = bytearray(log.read_bytes())
+    _, chunk, *_ = chunks(data)
+    data[chunk.start - 9] = opcode
+    log.write_bytes(data)
+    reader = open_log(log)
+    kept, whole = len(list(reader)), len(master[1])
+    assert 0 < kept < whole
+    assert reader.damage == f"holds {kept} of {whole} messages"
+    assert recover(log, log).messages == kept
+
+
+@pytest.mark.parametrize(("opcode", "content"), [(Opcode.ATTACHMENT, b"config.json"), (Opcode.METADATA, b"robot")])
+def test_a_lost_attachment_costs_no_message(log, master, opcode, content):
+    data = bytearray(log.read_bytes())
+    place = data.rindex(bytes([opcode]), 0, data.index(content) - 8)
+    data[place] ^= 0x40
+    log.write_bytes(data)
+    reader = open_log(log)
+    assert len(list(reader)) == len(master[1])
+    assert reader.damage is None
+    assert reader.fault == f"holds a damaged record at byte {place}, lacks an attachment or metadata"
+    assert open_log(log).attachments().keys() <= {"config.json"}  # nothing else is blamed
+
+
+def test_records_of_others_are_no_damage(log, master):
+    """Opcodes from 0x80 on are free for anybody's use."""
+    private = bytes([0x80]) + (4).to_bytes(8, "little") + b"ours"
+    data = log.read_bytes()
+    first, *_ = chunks(bytearray(data))
+    head = 8 + 9 + int.from_bytes(data[9:17], "little")
+    log.write_bytes(data[:head] + private + data[head : first.start - 9] + private + data[first.start - 9 :])
+    reader = open_log(log)
+    assert len(list(reader)) == len(master[1])
+    assert reader.fault == "has a damaged index"  # it was moved, and so it is one
+    assert reader.config() == {"a": 1}
 
 
 def test_a_damaged_attachment_is_told_kept_and_not_used(log, master):
@@ -240,7 +295,7 @@ def test_message_without_its_channel_counts_as_damage(tmp_path):
         writer.add_message(7, 1, b"x", 1)
     reader = open_log(file)
     assert list(reader) == []
-    assert "unknown channel" in reader.damage
+    assert "message of an unknown channel" in reader.damage
 
 
 def test_foreign_topic_is_readable_but_not_decoded(tmp_path):

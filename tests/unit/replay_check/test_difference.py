@@ -55,6 +55,15 @@ def test_no_number_is_infinitely_far_from_one_and_equal_to_its_like():
     none = number.model_copy(update={"pitch": math.nan})
     assert differences(number, none) == differences(none, number) == [Difference(Kind.ANGLE, "pitch", math.inf)]
     assert differences(none, none.model_copy()) == []
+    endless = number.model_copy(update={"pitch": math.inf})
+    assert differences(number, endless) == [Difference(Kind.ANGLE, "pitch", math.inf)]
+    place = odometry(1, 0)
+    turned = place.model_copy(update={"pose": Pose2D.model_construct(x=math.nan, y=0.0, yaw=math.nan)})
+    assert found(place, turned) == {(Kind.LENGTH, "pose"): math.inf, (Kind.ANGLE, "pose.yaw"): math.inf}
+    assert differences(turned, turned.model_copy()) == []
+    way = Path(**HEADER, poses=np.zeros(9), directions=np.ones(3), name="way")
+    lost = way.model_copy(update={"poses": np.array([0, 0, 0, 0, 0, 0, 0, 0, math.nan])})
+    assert found(way, lost) == {(Kind.ANGLE, "poses.yaw"): math.inf}
     row = odometry(1, 0)
     hole = row.model_copy(update={"pose_covariance": np.where(np.arange(9) == 3, math.nan, row.pose_covariance)})
     assert found(row, hole) == {(Kind.NUMBER, "pose_covariance"): math.inf}

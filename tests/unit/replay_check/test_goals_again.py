@@ -122,20 +122,23 @@ def test_another_deformation_shows_where_it_begins(tmp_path):
     assert rows[topics.PATH].first.sequence > 0  # the routes are the same, but nothing comes into their way
 
 
-def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
-    def late(one):
-        message = one.decode() if one.topic in {"plan/goal", "plan/drive"} else None
-        if message is None or (one.topic == "plan/drive" and message.source != "goals"):
-            return one
-        by = 200_000 if one.topic == "plan/goal" else 250_000
-        later = {"stamp": message.stamp + by, "received": message.received + by}
-        payload = wire.encode(BY_NAME[one.topic], message.model_copy(update=later))
-        return replace(one, log_time=one.log_time + 300_000, stamp=later["stamp"], payload=payload)
+def late(one):
+    """A message as a daemon on the wall clock would have stamped it, in the middle of its tick."""
+    message = one.decode() if one.topic in {"plan/goal", "plan/drive"} else None
+    if message is None or (one.topic == "plan/drive" and message.source != "goals"):
+        return one
+    by = 200_000 if one.topic == "plan/goal" else 250_000
+    later = {"stamp": message.stamp + by, "received": message.received + by}
+    payload = wire.encode(BY_NAME[one.topic], message.model_copy(update=later))
+    return replace(one, log_time=one.log_time + 300_000, stamp=later["stamp"], payload=payload)
 
+
+def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
     messages = [late(one) for one in open_log(GOALS)]
     log = write(tmp_path / "wall.mcap", messages, attachments_of(GOALS), real_offset_ns="7")
     check = check_log(log)
     rows = rows_of(check)
+    assert rows[topics.PLAN_DRIVE].headers > 0
     assert check.reason is Reason.OK
     assert not rows[topics.GOAL].judged
     assert rows[topics.TRACKER].tolerance == rows[topics.PLAN_DRIVE].tolerance == 0.02
@@ -144,6 +147,20 @@ def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
         assert row.compared > 0
         assert row.missing == row.surplus(check.end) == 0
     assert all(one.value <= ROUNDING for one in rows[topics.PATH].greatest.values())  # stamps alone
+
+
+def test_last_digits_of_a_run_of_the_wall_clock_are_told_as_such(tmp_path):
+    def nudged(one):
+        if (one.topic, one.sequence) != ("state/odometry", 100):
+            return one
+        odometry = one.decode()
+        pose = odometry.pose.model_copy(update={"x": odometry.pose.x + 1e-9})
+        return replace(one, payload=wire.encode(topics.ODOMETRY, odometry.model_copy(update={"pose": pose})))
+
+    messages = [nudged(late(one)) for one in open_log(GOALS)]
+    check = check_log(write(tmp_path / "wall.mcap", messages, attachments_of(GOALS), real_offset_ns="7"))
+    assert not check.agrees
+    assert check.rounded
 
 
 def test_a_lost_call_ends_in_other_reports_not_in_a_hang(tmp_path):
