@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import os
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,11 +10,10 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
@@ -24,36 +21,13 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-
-DAMAGE: Final = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    RuntimeError,
-    LookupError,
-    MemoryError,
-    OverflowError,
-    OSError,
-)
-"""What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
+from monstertruckd.logs.framing import CHECKSUM, DAMAGE, MAGIC, index_is_sound, read_frame, read_statistics
 
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
 DAMAGED: Final = ".damaged"
 """Behind the name of an attachment whose checksum is wrong: nobody takes it for what it was, and nothing is lost."""
 
-_END: Final = struct.Struct("<BQQQI8s")
-"""Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
-
-_FOOTER_LENGTH: Final = struct.calcsize("<QQI")
-_UNSUMMED: Final = struct.calcsize("<I8s")
-_HEAD: Final = struct.Struct("<BQ")
-"""Of a record: opcode, length of the content."""
-_CHECKSUM: Final = struct.Struct("<I")
-_PIECE: Final = 1 << 20
 _PRIVATE: Final = 0x80
 """Opcodes from here on are anybody's; below, those that are no part of the data section come of damage."""
 _PLAIN: Final[dict[int, Any]] = {
@@ -62,58 +36,6 @@ _PLAIN: Final[dict[int, Any]] = {
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
-
-
-def index_is_sound(file: BinaryIO) -> bool:
-    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
-
-    Args:
-        file: of the log; its position is another one afterwards.
-    """
-    size = file.seek(0, os.SEEK_END)
-    file.seek(-min(size, _END.size), os.SEEK_END)
-    end = file.read()
-    if len(end) < _END.size:
-        return False
-    opcode, length, start, _, checksum, magic = _END.unpack(end)
-    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size - _END.size:
-        return False
-    return not (start and checksum) or _checksum(file, start, size - _UNSUMMED) == checksum
-
-
-def _checksum(file: BinaryIO, begin: int, end: int) -> int:
-    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
-    file.seek(begin)
-    value = 0
-    for at in range(begin, end, _PIECE):
-        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
-    return value
-
-
-def _frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
-    """Opcode, head and content of the next record.
-
-    Raises:
-        EndOfFile: it is not all there.
-    """
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        raise EndOfFile
-    opcode, length = _HEAD.unpack(head)
-    if length > size - file.tell():
-        raise EndOfFile
-    return opcode, head, file.read(length)
-
-
-def _statistics(file: BinaryIO, size: int) -> Statistics | None:
-    """Of a sound index that begins where ``file`` stands; None if it has none."""
-    while True:
-        opcode, _, content = _frame(file, size)
-        if opcode == Opcode.STATISTICS:
-            found: Statistics = Statistics.read(ReadDataStream(BytesIO(content)))
-            return found
-        if opcode == Opcode.FOOTER:
-            return None
 
 
 def spare_log(output: Path) -> None:
@@ -228,7 +150,7 @@ class LogReader:
         summed = zlib.crc32(file.read(len(MAGIC)))
         while True:
             self.position = file.tell()
-            opcode, head, content = _frame(file, size)
+            opcode, head, content = read_frame(file, size)
             if opcode == Opcode.DATA_END:
                 self._end(file, size, content, summed, given)
                 self.position = size
@@ -260,8 +182,8 @@ class LogReader:
 
     def _checked(self, record: Attachment, content: bytes) -> Attachment:
         """An attachment, by another name if its checksum, which mcap skips, is wrong."""
-        (expected,) = _CHECKSUM.unpack(content[-_CHECKSUM.size :])
-        if expected in (0, zlib.crc32(content[: -_CHECKSUM.size])):
+        (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
+        if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
             return record
         self.flaws.append(f"holds a damaged {record.name}")
         return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
@@ -270,7 +192,7 @@ class LogReader:
         self, file: BinaryIO, size: int, content: bytes, summed: int, given: Mapping[type[McapRecord], int]
     ) -> None:
         """Hold what was given against the end of the data section and the index behind it."""
-        (expected,) = _CHECKSUM.unpack(content)  # of another length it was another record before its first byte flipped
+        (expected,) = CHECKSUM.unpack(content)  # of another length it was another record before its first byte flipped
         if expected not in (0, summed):
             raise McapError("checksum of the data section")
         begin = file.tell()
@@ -278,7 +200,7 @@ class LogReader:
             self.flaws.append("has a damaged index")
             return
         file.seek(begin)
-        told = _statistics(file, size)
+        told = read_statistics(file, size)
         if told is None:
             return
         if given[McapMessage] != told.message_count:

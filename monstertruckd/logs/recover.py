@@ -12,7 +12,8 @@ from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
 
 from monstertruck_runtime.errors import InputError, TruckError
-from monstertruckd.logs.reader import MAGIC, LogReader
+from monstertruckd.logs.framing import MAGIC
+from monstertruckd.logs.reader import LogReader
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from mcap.records import Attachment
 
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.logs import LogMessage, open_log
-from monstertruckd.logs.reader import MAGIC
+from monstertruckd.logs.framing import MAGIC
 from monstertruckd.recorder.file import Entry, LogFile
 from monstertruckd.replay_check import check_log
 from monstertruckd.replay_check.result import ROUNDING
