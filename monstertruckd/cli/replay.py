@@ -19,7 +19,7 @@ CHECK = "Compute the log's outputs again from its sensors and compare them."
 CONFIG = "With --check: compute with this configuration and show what it would have changed."
 TOLERANCE = "With --check: greatest difference that agrees, in m, rad and so on; 0 = equal bit for bit."
 
-ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise: try --tolerance 1e-6"
+ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise"
 
 
 def replay(
@@ -87,7 +87,7 @@ def _show(result: "Check") -> None:
         fields = ", ".join(first.fields) or "header"
         print(f"first difference: {first.topic} number {first.sequence} at {first.at:.2f} s: {fields}")
     if result.rounded:
-        remark(ROUNDED)
+        remark(f"{ROUNDED}: try --tolerance {result.sufficient:g}")
     for message in result.unreadable:
         remark(f"{message.topic} number {message.sequence} at {message.at:.2f} s was left out: {message.error}")
     if result.left_out is not None:

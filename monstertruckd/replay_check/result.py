@@ -70,6 +70,11 @@ class Check:
         return close and not self.agrees
 
     @property
+    def sufficient(self) -> float:
+        """Tolerance, SI units, with which a check that is ``rounded`` agrees."""
+        return max([ROUNDING, *(row.tolerance for row in self.topics if row.judged)])
+
+    @property
     def reason(self) -> Reason:
         """How the check ended; another configuration may change what it likes."""
         if self.damage is not None:

@@ -161,6 +161,8 @@ def test_last_digits_of_a_run_of_the_wall_clock_are_told_as_such(tmp_path):
     check = check_log(write(tmp_path / "wall.mcap", messages, attachments_of(GOALS), real_offset_ns="7"))
     assert not check.agrees
     assert check.rounded
+    assert check.sufficient == 0.02
+    assert check_log(check.log, tolerance=check.sufficient).agrees
 
 
 def test_a_lost_call_ends_in_other_reports_not_in_a_hang(tmp_path):

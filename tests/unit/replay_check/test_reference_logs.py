@@ -145,7 +145,7 @@ def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
     assert not close.rounded
     done = CliRunner().invoke(app, ["replay", str(log), "--check"])
     assert done.exit_code == Reason.REPLAY_DIFFERS.exit_code
-    assert ("try --tolerance 1e-6" in done.output.replace("\n", " ")) is rounded
+    assert ("try --tolerance 1e-06" in done.output.replace("\n", " ")) is rounded
 
 
 def test_another_stamp_is_no_rounding(tmp_path):
