@@ -4,6 +4,7 @@ import os
 import struct
 import zlib
 from io import BytesIO
+from pathlib import Path
 from typing import BinaryIO, Final
 
 import zstandard
@@ -36,6 +37,14 @@ _HEAD: Final = struct.Struct("<BQ")
 """Of a record: opcode, length of the content."""
 CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
+
+
+def is_finished(path: Path) -> bool:
+    """Whether the file ends as a finished log does."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(-min(size, len(MAGIC)), os.SEEK_END)
+        return size > len(MAGIC) and file.read() == MAGIC
 
 
 def index_is_sound(file: BinaryIO) -> bool:

@@ -8,9 +8,9 @@ from mcap.reader import make_reader
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.logs.framing import DAMAGE, index_is_sound
+from monstertruckd.logs.framing import DAMAGE, index_is_sound, is_finished
 from monstertruckd.logs.reader import LogReader
-from monstertruckd.logs.recover import in_use, is_finished
+from monstertruckd.logs.recover import in_use
 from monstertruckd.logs.wall_time import is_plausible, real_offset, utc
 
 

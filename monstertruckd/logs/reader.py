@@ -18,7 +18,7 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.logs.framing import CHECKSUM, DAMAGE, MAGIC, index_is_sound, read_frame, read_statistics
@@ -213,21 +213,8 @@ class LogReader:
         return itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
 
     def config(self) -> dict[str, Any]:
-        """The attached configuration as plain values; empty where there is none.
-
-        Raises:
-            InputError: it is damaged, or no JSON object.
-        """
-        found = {record.name: record.data for record in self.preamble() if isinstance(record, Attachment)}
-        if CONFIG + DAMAGED in found:
-            raise InputError(f"{self.path}: {CONFIG} in it is damaged")
-        try:
-            values = json.loads(found.get(CONFIG, b"{}"))
-        except ValueError as error:
-            raise InputError(f"{self.path}: {CONFIG}: {error}") from None
-        if not isinstance(values, dict):
-            raise InputError(f"{self.path}: {CONFIG}: expected an object")
-        return values
+        """The attached configuration as plain values; empty where there is none. Raises as ``attached_config`` does."""
+        return attached_config(self.path, self.attachments()) or {}
 
     @property
     def fault(self) -> str | None:
@@ -240,12 +227,33 @@ class LogReader:
         return self.path.stat().st_size
 
     def attachments(self) -> dict[str, bytes]:
-        """Attached files by name."""
-        return {record.name: record.data for record in self.records() if isinstance(record, Attachment)}
+        """Attached files of the preamble, by name."""
+        return {record.name: record.data for record in self.preamble() if isinstance(record, Attachment)}
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name."""
-        return {record.name: dict(record.metadata) for record in self.records() if isinstance(record, Metadata)}
+        """Metadata records of the preamble, by name."""
+        return {record.name: dict(record.metadata) for record in self.preamble() if isinstance(record, Metadata)}
+
+
+def attached_config(log: Path, attachments: Mapping[str, bytes]) -> dict[str, Any] | None:
+    """The daemon's configuration among what is attached to ``log``, as plain values; None where there is none.
+
+    Raises:
+        InputError: it is damaged.
+        ConfigError: it is no JSON object.
+    """
+    if CONFIG + DAMAGED in attachments:
+        raise InputError(f"{log}: {CONFIG} in it is damaged")
+    data = attachments.get(CONFIG)
+    if data is None:
+        return None
+    try:
+        values = json.loads(data)
+    except ValueError as error:
+        raise ConfigError(f"{log}: {CONFIG}: {error}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{log}: {CONFIG}: expected an object")
+    return values
 
 
 def open_log(path: str | Path) -> LogReader:

@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
 
 from monstertruck_runtime.errors import InputError, TruckError
-from monstertruckd.logs.framing import MAGIC
+from monstertruckd.logs.framing import is_finished
 from monstertruckd.logs.reader import LogReader
 
 log = logging.getLogger(__name__)
@@ -29,14 +29,6 @@ class Recovery:
     messages: int
     damage: str | None
     """What was wrong with the original; None when it was sound."""
-
-
-def is_finished(path: Path) -> bool:
-    """Whether the file ends as a finished log does."""
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(-min(size, len(MAGIC)), os.SEEK_END)
-        return size > len(MAGIC) and file.read() == MAGIC
 
 
 def in_use(path: Path) -> bool:
@@ -76,7 +68,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
                 messages = _copy(reader, output, stop)
                 output.flush()
                 os.fsync(output.fileno())
-            if in_place and reader.fault is None and is_finished(source):
+            if in_place and reader.fault is None:
                 part.unlink()
             else:
                 part.replace(target)

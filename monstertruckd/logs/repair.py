@@ -9,7 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from monstertruckd.logs.recover import in_use, is_finished, recover_directory
+from monstertruckd.logs.framing import is_finished
+from monstertruckd.logs.recover import in_use, recover_directory
 
 NICENESS = 15
 

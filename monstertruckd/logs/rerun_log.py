@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from monstertruck_planners.collision import scan_points
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
@@ -117,7 +117,7 @@ class Scene:
     def truck(self, reader: LogReader) -> None:
         """A box of the size in the log's configuration; logs without one show none."""
         geometry: dict[str, Any] = {}
-        with suppress(InputError):
+        with suppress(InputError, ConfigError):
             geometry = reader.config().get("geometry", {})
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:

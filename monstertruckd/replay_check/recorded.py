@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.logs import LogMessage
-from monstertruckd.logs.reader import CONFIG, DAMAGED
+from monstertruckd.logs.reader import CONFIG, attached_config
 from monstertruckd.replay_check.goals import GoalRecord
 from monstertruckd.replay_check.run_log import RunLog
 
@@ -100,17 +100,9 @@ def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:
         InputError: it is not attached, or damaged.
         ConfigError: this version refuses it.
     """
-    data = attachments.get(CONFIG)
-    if CONFIG + DAMAGED in attachments:
-        raise InputError(f"{log}: {CONFIG} in it is damaged")
-    if data is None:
+    values = attached_config(log, attachments)
+    if values is None:
         raise InputError(f"{log}: {CONFIG} is not attached: expected a log that the daemon recorded")
-    try:
-        values = json.loads(data)
-    except ValueError as error:
-        raise ConfigError(f"{log}: {CONFIG}: {error}") from None
-    if not isinstance(values, dict):
-        raise ConfigError(f"{log}: {CONFIG}: expected an object")
     values.pop(SIMULATION, None)
     try:
         return TruckConfig.model_validate_json(json.dumps(values))
