@@ -143,7 +143,7 @@ class LogReader:
                 self.damage = f"ends or is damaged after byte {self.position} of {size} ({why})"
 
     def _records(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
-        """The same, with one of ``DAMAGE`` at the first error; begins at ``position`` at that moment."""
+        """The same, but raises one of ``DAMAGE`` at the first error, whose record begins at ``position``."""
         channels: set[int] = set()
         given: Counter[type[McapRecord]] = Counter()
         self.position = 0
