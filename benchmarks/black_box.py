@@ -25,9 +25,9 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virt
 from monstertruck_schemas.topics import BY_NAME, TOPICS
 from monstertruckd.config.validate import load_config
 from monstertruckd.recorder import BlackBox, BlackBoxConfig
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
 SAMPLE = 4.0

@@ -23,6 +23,7 @@ import zenoh
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.memory import settle
 from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
@@ -30,8 +31,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.demo.wall import connect
-from monstertruckd.memory import settle
+from monstertruckd.tools.demo.wall import connect
 
 BEAMS = 682
 RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)

@@ -21,12 +21,12 @@ from time import process_time
 import numpy as np
 
 from monstertruck_runtime.errors import TruckError
-from monstertruckd.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
-from monstertruckd.calibrate.drive import DriveWizard
-from monstertruckd.calibrate.steering import SteeringWizard
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.calibration import Verdict, hidden, run_session, verdicts
-from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
+from monstertruckd.tools.calibrate.drive import DriveWizard
+from monstertruckd.tools.calibrate.steering import SteeringWizard
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.calibration_kit import Verdict, hidden, run_session, verdicts
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"

@@ -28,7 +28,7 @@ from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.demo.wall import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
 
 FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
 GOAL = 0.5

@@ -16,8 +16,8 @@ from time import perf_counter
 import numpy as np
 
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "drill.json"

@@ -24,11 +24,11 @@ from rich.table import Table
 
 from monstertruck_runtime.clock import run_virtual
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults import Expect, Reaction, Scenario
-from monstertruckd.sim.faults_drill import measure
-from monstertruckd.sim.faults_goals import COLUMNS, GOALS, cells, shortcomings
-from monstertruckd.sim.faults_scenarios import SCENARIOS
+from monstertruckd.tools.drill.goal_scenarios import COLUMNS, GOALS, cells, shortcomings
+from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario
+from monstertruckd.tools.drill.scenarios import SCENARIOS
+from monstertruckd.tools.drill.stages import measure
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "faults.json"

@@ -36,8 +36,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.demo.operator import MOVING, drive_lap
-from monstertruckd.demo.wall import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.simulation.operator import MOVING, drive_lap
 
 HERE = Path(__file__).resolve().parent
 FULL = HERE.parent / "configs" / "full.yaml"

@@ -21,11 +21,11 @@ import numpy as np
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas.req import Order
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.drill_faults import hubs_of
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.drill.faults import hubs_of
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[1]
 WARM = 1 / 6

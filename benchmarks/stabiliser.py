@@ -18,12 +18,12 @@ from monstertruck_estimation.scan_tilt import plane_tilt
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
+from monstertruck_sim.robot import TrueJoints
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator, drive_lap
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
-from monstertruckd.sim.robot import TrueJoints
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator, drive_lap
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[1]
 RAMP = ROOT / "configs" / "ramp.yaml"

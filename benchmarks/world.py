@@ -30,8 +30,8 @@ from numba import njit
 from numpy.typing import NDArray
 from same_python import go_on_in_the_systems_python
 
-from monstertruck_drivers.world.raycast import cast_rays, clearance
-from monstertruckd.demo.fast import run_fast_demo
+from monstertruck_sim.world.raycast import cast_rays, clearance
+from monstertruckd.tools.demo.fast import run_fast_demo
 
 ROOT = Path(__file__).resolve().parents[1]
 CELLS, RESOLUTION = 1000, 0.05

@@ -1,6 +1,6 @@
 """``python -m monstertruckd``."""
 
-from monstertruckd.cli.main import main
+from monstertruckd.tools.cli.main import main
 
 if __name__ == "__main__":
     main()

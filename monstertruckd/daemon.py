@@ -14,6 +14,11 @@ from typing import Any
 import numpy as np
 
 from monstertruck_drivers.link import Port
+from monstertruck_planners.goals import rpc as goal_rpc
+from monstertruck_planners.goals.service import GoalService
+from monstertruck_runtime.actors.placement import Places
+from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
+from monstertruck_runtime.actors.remote import RemoteDesk
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import latest
@@ -26,32 +31,27 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd.autonomy import Body, build_estimation, build_planners, calibration
+from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners, calibration
+from monstertruckd.assembly.cabling import Cabling, Computer
+from monstertruckd.assembly.devices import build_drivers, build_monitors
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.cabling import Cabling, Computer
-from monstertruckd.calibrate import rpc as calibration_rpc
+from monstertruckd.config.calibration import rpc as calibration_rpc
 from monstertruckd.config.truck import SHAFTS, TruckConfig
 from monstertruckd.config.validate import resolved
 from monstertruckd.config.yaml_tree import Tree
-from monstertruckd.devices import build_drivers, build_monitors
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
-from monstertruckd.goals import rpc as goal_rpc
-from monstertruckd.goals.service import GoalService
-from monstertruckd.health import ClockService, HealthBoard, MeterService
-from monstertruckd.journal import published
-from monstertruckd.notify import notify_from, status_line
+from monstertruckd.host.health import ClockService, HealthBoard, MeterService
+from monstertruckd.host.journal import published
+from monstertruckd.host.notify import notify_from, status_line
+from monstertruckd.host.stall import StallWatch
+from monstertruckd.host.versions import running_versions
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
-from monstertruckd.stall import StallWatch
-from monstertruckd.versions import running_versions
-from monstertruckd.workers.placement import Places
-from monstertruckd.workers.remote import RPC as REMOTE_STEP
-from monstertruckd.workers.remote import RemoteDesk
 
 ACTUATORS = (*SHAFTS, "steering")
 SENSORS = ("lidar", "compass", "stabiliser", "camera")

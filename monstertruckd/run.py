@@ -10,13 +10,13 @@ from pathlib import Path
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import PortBusyError
+from monstertruck_runtime.memory import settle
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.calibrate.apply import store_of
+from monstertruckd.config.calibration.apply import store_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
-from monstertruckd.logging_queue import start_logging
-from monstertruckd.memory import settle
+from monstertruckd.host.logging_queue import start_logging
 
 log = logging.getLogger(__name__)
 

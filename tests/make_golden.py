@@ -13,9 +13,9 @@ import yaml
 
 from monstertruckd import __version__
 from monstertruckd.config.yaml_tree import load_tree
-from monstertruckd.demo.fast import run_fast_demo
-from monstertruckd.logs import info
-from monstertruckd.logs.report.collect import collect
+from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.report.collect import collect
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = ROOT / "tests" / "data" / "golden"

@@ -20,12 +20,12 @@ from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Order, Role
 from monstertruckd.config.validate import load_config
 from monstertruckd.config.yaml_tree import load_tree
-from monstertruckd.demo.fast import run_fast_demo
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.demo.wall import write_overlay
-from monstertruckd.logs import info
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.demo.wall import write_overlay
+from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "tests" / "data" / "replay"

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from monstertruck_drivers.world.obstacles import Disc
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
@@ -28,11 +27,12 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_sim.world.obstacles import Disc
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 from navigation_parts import Options, Part
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -11,10 +11,10 @@ import time
 
 import numpy as np
 
-from monstertruck_planners.deform.api import Session
-from monstertruck_planners.deform.catalog import make_deformer
-from monstertruck_planners.deform.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.deform.window import Window
+from monstertruck_planners.local.api import Session
+from monstertruck_planners.local.catalog import make_deformer
+from monstertruck_planners.local.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
+from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from navigation_parts import Options, Part

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from monstertruck_planners.deform.config import DeformConfig, RsbandConfig, TebConfig
+from monstertruck_planners.local.config import DeformConfig, RsbandConfig, TebConfig
 from navigation_parts import Options, Part
 from navigation_parts.deformation import CARS, drive, told
 from navigation_parts.deformation_world import unseen

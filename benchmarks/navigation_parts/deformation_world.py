@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monstertruck_drivers.world.raycast import cast_rays, clearance
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import DistanceField, Footprint, clearance_to_points
-from monstertruck_planners.deform.api import Guide
-from monstertruck_planners.deform.window import Window
+from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, moved
+from monstertruck_sim.world.raycast import cast_rays, clearance
 
 RES = 0.02
 SIZE = (7.0, 5.0)

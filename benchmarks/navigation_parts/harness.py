@@ -17,10 +17,10 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Pose, Setup
-from monstertruck_planners.manage.mission import apart
-from monstertruck_planners.manage.planning import PlanningStep
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.goals.mission import apart
+from monstertruck_planners.goals.planning import PlanningStep
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import build_tracker

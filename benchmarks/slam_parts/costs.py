@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from monstertruck_estimation.mapping.config import GridConfig
-from monstertruck_estimation.mapping.estimator import MappingEstimator, prepared
-from monstertruck_estimation.mapping.grid import OccupancyGrid
 from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.estimator import MappingEstimator, prepared
+from monstertruck_estimation.slam.grid import OccupancyGrid
+from monstertruck_estimation.slam.settings import GridConfig
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.validate import load_config
-from monstertruckd.logs.scans import read_scans
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.logs.scans import read_scans
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[2]
 ROUNDS = 400

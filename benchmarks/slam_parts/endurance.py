@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_drivers.world.raycast import cast_rays, clearance
-from monstertruck_estimation.mapping.config import SlamConfig
-from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInput
+from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput
 from monstertruck_estimation.slam.se2 import between, compose
+from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.slam.step import EstimationWorker
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import OCCUPIED, load_map
-from monstertruckd.workers.estimation import EstimationWorker
+from monstertruck_sim.world.raycast import cast_rays, clearance
 from slam_parts.world_drives import ROOMS
 
 MAP = Path(__file__).resolve().parents[2] / "configs" / "worlds" / "rooms.yaml"

@@ -30,20 +30,20 @@ from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.mapping.config import GridConfig, SlamConfig
-from monstertruck_estimation.mapping.estimator import MappingEstimator, mapper_config, prepared
-from monstertruck_estimation.mapping.exchange import ScanInput
-from monstertruck_estimation.mapping.grid import OccupancyGrid
-from monstertruck_estimation.mapping.storage import load
+from monstertruck_estimation.slam.estimator import MappingEstimator, mapper_config, prepared
+from monstertruck_estimation.slam.exchange import ScanInput
+from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.se2 import between, compose, interpolate, transform, wrap
+from monstertruck_estimation.slam.settings import GridConfig, SlamConfig
+from monstertruck_estimation.slam.step import front_of
+from monstertruck_estimation.slam.storage import load
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
-from monstertruckd.workers.estimation import front_of
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "recorded-urg.yaml"

@@ -16,23 +16,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.world.config import TruckConfig
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
-from monstertruck_estimation.mapping.config import GridConfig
-from monstertruck_estimation.mapping.estimator import Estimator, MappingEstimator, prepared
-from monstertruck_estimation.mapping.exchange import Estimate, Moved, ScanInput
-from monstertruck_estimation.mapping.localise import LocalisingEstimator
-from monstertruck_estimation.mapping.storage import load, save
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Reckoner
 from monstertruck_estimation.scan_tilt import Track, plane_slopes, plane_tilt
 from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.estimator import Estimator, MappingEstimator, prepared
+from monstertruck_estimation.slam.exchange import Estimate, Moved, ScanInput
+from monstertruck_estimation.slam.localise import LocalisingEstimator
 from monstertruck_estimation.slam.se2 import between, compose, interpolate, inverse
+from monstertruck_estimation.slam.settings import GridConfig
+from monstertruck_estimation.slam.storage import load, save
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import Standing
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
+from monstertruck_sim.world.config import TruckConfig
 from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 
 Array = NDArray[np.float64]

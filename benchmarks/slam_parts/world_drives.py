@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.base import CompassReading
-from monstertruck_drivers.world.config import MotorConfig, TruckConfig, WorldConfig
-from monstertruck_drivers.world.noise import generator
-from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback, Vector3
+from monstertruck_sim.world.config import MotorConfig, TruckConfig, WorldConfig
+from monstertruck_sim.world.noise import generator
+from monstertruck_sim.world.world import World
 
 Array = NDArray[np.float64]
 Route = tuple[tuple[float, float], ...]

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from monstertruckd.calibrate.apply import calibrated
+from monstertruckd.config.calibration.apply import calibrated
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.validate import load_config
 from monstertruckd.config.yaml_tree import Tree, load_tree
@@ -26,7 +26,7 @@ def load_uncalibrated(path: Path) -> tuple[TruckConfig, Tree]:
     model: type[TruckConfig] = TruckConfig
     if "sim" in load_tree(path).data:
         # Only a simulated run may load the world.
-        from monstertruckd.sim.config import SimulatedTruckConfig  # noqa: PLC0415
+        from monstertruckd.tools.simulation.config import SimulatedTruckConfig  # noqa: PLC0415
 
         model = SimulatedTruckConfig
     return load_config(path, model)

@@ -18,12 +18,12 @@ from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_estimation.fusion.config import AnyOdometry
-from monstertruck_estimation.mapping.config import SlamConfig
 from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_estimation.slam.settings import SlamConfig
 from monstertruck_kinematics.chassis import Chassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
-from monstertruck_planners.manage.config import DRIVEN, PlannerConfig
+from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
-from monstertruckd.logs.channels import Channels
+from monstertruckd.recorder.channels import Channels
 from monstertruckd.recorder.config import Compression
 
 NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")

@@ -15,10 +15,10 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
-from monstertruckd.logs.repair import start_repair
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.file import Entry, disk_reason
+from monstertruckd.recorder.repair import start_repair
 from monstertruckd.recorder.writer import LogWriter
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.logs.recover import in_use
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.file import Entry, LogFile, LogFolder
+from monstertruckd.recorder.recover import in_use
 
 log = logging.getLogger(__name__)
 

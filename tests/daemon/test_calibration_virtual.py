@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.obstacles import Box
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import ConfigError, InputError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -17,18 +16,19 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.calibrate.apply import store_of
-from monstertruckd.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
-from monstertruckd.calibrate.drive import DriveWizard
-from monstertruckd.calibrate.guide import calibrate
-from monstertruckd.calibrate.record import Estimate, Result, WizardName
-from monstertruckd.calibrate.steering import SteeringWizard
+from monstertruck_sim.world.obstacles import Box
+from monstertruckd.config.calibration.apply import store_of
+from monstertruckd.config.calibration.record import Estimate, Result, WizardName
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.calibration import LocalTruck, Session, SimulatedOperator, hidden, run_session, verdicts
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
+from monstertruckd.tools.calibrate.drive import DriveWizard
+from monstertruckd.tools.calibrate.guide import calibrate
+from monstertruckd.tools.calibrate.steering import SteeringWizard
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
+from tests.calibration_kit import LocalTruck, Session, SimulatedOperator, hidden, run_session, verdicts
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
 

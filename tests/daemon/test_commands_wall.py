@@ -12,7 +12,7 @@ import yaml
 
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
-from monstertruckd.demo.wall import free_endpoint
+from monstertruckd.tools.demo.wall import free_endpoint
 from tests.daemon.wall_kit import DEMO, ROOT, Robot, command, end
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]

@@ -13,19 +13,19 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import write_request
-from monstertruck_drivers.world.obstacles import Disc
-from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.world.obstacles import Disc
+from monstertruck_sim.world.world import World
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.drill import Drill, Outcome, Report
-from monstertruckd.sim.drill_faults import Kind, Menu
-from monstertruckd.sim.drill_observer import Observer, Violation
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.faults import Kind, Menu
+from monstertruckd.tools.drill.observer import Observer, Violation
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

@@ -9,13 +9,13 @@ import yaml
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.fast import run_fast_demo
-from monstertruckd.demo.summary import GOAL_CLOSING
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults import Expect, Reaction, Scenario
-from monstertruckd.sim.faults_drill import measure
-from monstertruckd.sim.faults_goals import shortcomings
-from monstertruckd.sim.faults_scenarios import SCENARIOS
+from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.demo.summary import GOAL_CLOSING
+from monstertruckd.tools.drill.goal_scenarios import shortcomings
+from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario
+from monstertruckd.tools.drill.scenarios import SCENARIOS
+from monstertruckd.tools.drill.stages import measure
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -39,7 +39,7 @@ def test_a_fault_ends_as_it_should(name: str):
 
 
 def test_a_worker_that_really_hangs_is_killed_and_driving_goes_on(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("monstertruckd.map_service.TARGET", "tests.worker_kit:Hanging")
+    monkeypatch.setattr("monstertruckd.recorder.picture.TARGET", "tests.worker_kit:Hanging")
     scenario = BY_NAME["map worker hangs"]
     assert shortcomings(scenario, drill(scenario)) == []
 

@@ -11,9 +11,9 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 

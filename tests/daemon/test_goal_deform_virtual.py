@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.obstacles import Box
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.world.obstacles import Box
 from tests.daemon.goal_kit import Trip, assert_at, travel
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]

@@ -9,9 +9,9 @@ from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTION
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.validate import load_config
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.faults_drill import with_overlay
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.rig import VirtualRig
 from tests.daemon.goal_kit import CONFIGS
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(60)]

@@ -15,8 +15,10 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.demo.wall import free_endpoint
-from monstertruckd.logs import info, open_log, recover
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recover import recover
+from monstertruckd.tools.demo.wall import free_endpoint
+from monstertruckd.tools.logs.info import info
 from tests.daemon.wall_kit import ROOT, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_planners.manage.exchange import DeformAnswer, PlanAnswer
+from monstertruck_planners.goals.exchange import DeformAnswer, PlanAnswer
+from monstertruck_planners.track.placed import TARGET as TRACKER
+from monstertruck_runtime.actors.codec import to_json
+from monstertruck_runtime.actors.placement import Placement, Places
+from monstertruck_runtime.actors.remote import RPC, RemoteDesk
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruckd.goals.build import DEFORMER
-from monstertruckd.goals.build import TARGET as PLANNER
-from monstertruckd.placed_tracker import TARGET as TRACKER
-from monstertruckd.workers.codec import to_json
-from monstertruckd.workers.placement import Placement, Places
-from monstertruckd.workers.remote import RPC, RemoteDesk
+from monstertruckd.assembly.goals import DEFORMER
+from monstertruckd.assembly.goals import TARGET as PLANNER
 from tests.bus_kit import running_robot
 from tests.unit.workers.step_kit import deform_tasks, numbers, plan_task, track_inputs
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from monstertruckd.replay_check import check_log
+from monstertruckd.tools.replay_check import check_log
 from tests.make_replay_logs import RUNS, record
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from monstertruck_schemas import topics
-from monstertruckd.replay_check import check_log
+from monstertruckd.tools.replay_check import check_log
 from tests.daemon.wall_kit import ROOT, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]

@@ -16,9 +16,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import Lap, LocalOperator, drive_lap
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from monstertruck_drivers.world.built_in import BUILT_IN
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import OCCUPIED
@@ -14,10 +13,11 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.health import Standing
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Grid, Odometry, Transforms
+from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 

@@ -11,7 +11,7 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

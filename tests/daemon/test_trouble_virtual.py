@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import Iron
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
@@ -14,10 +13,11 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import OdometryHealth, Standing
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_sim.world.config import Iron
 from monstertruckd.config.validate import load_config
-from monstertruckd.demo.operator import LocalOperator
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 

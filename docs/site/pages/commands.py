@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import typer
 
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 from pages.markdown import Page, join, table
 
 ROOT = Path(__file__).resolve().parents[3]

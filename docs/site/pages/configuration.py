@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from monstertruckd.catalog import KINDS
-from monstertruckd.sim.config import SimulatedTruckConfig
+from monstertruck_drivers.catalog import KINDS
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from pages.markdown import Page, join
 from pages.models import Definitions, Json, label, plain
 

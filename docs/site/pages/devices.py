@@ -7,8 +7,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 
+from monstertruck_drivers.catalog import KINDS, Kind
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.catalog import KINDS, Kind
 from monstertruckd.config.yaml_tree import load_tree
 from pages.markdown import Page, join, prose, raised, section, table
 from pages.models import Definitions, label, plain

@@ -14,8 +14,8 @@ from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.history import History
 from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
 from monstertruck_estimation.fusion.slip import Change, SlipWatch
-from monstertruck_estimation.mapping.correction import Correction
 from monstertruck_estimation.odometry import MEMORY, Estimate
+from monstertruck_estimation.slam.correction import Correction
 from monstertruck_estimation.slam.se2 import compose, inverse
 from monstertruck_estimation.wheel_motion import Roll, WheelMotion, way_covariance
 from monstertruck_kinematics.chassis import Chassis

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.errors import ConfigError
-from monstertruckd.calibrate.apply import store_of, value_at
-from monstertruckd.calibrate.record import Estimate, Result, WizardName
-from monstertruckd.cli.main import main
+from monstertruckd.config.calibration.apply import store_of, value_at
+from monstertruckd.config.calibration.record import Estimate, Result, WizardName
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.validate import resolved
+from monstertruckd.tools.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.calibrate.battery import GROUND, BatteryWizard, Reading
+from monstertruckd.tools.calibrate.battery import GROUND, BatteryWizard, Reading
 
 WIZARD = BatteryWizard(meter_share=0.005, meter_digits=0.02)
 

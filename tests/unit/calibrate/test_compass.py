@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.calibrate.compass import LINEARITY, Circle, result_of
+from monstertruckd.tools.calibrate.compass import LINEARITY, Circle, result_of
 
 HARD = np.array((6.0, -4.0))
 SOFT = np.array(((1.1, 0.06), (0.06, 0.93)))

@@ -12,10 +12,10 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel
-from monstertruckd.calibrate.guide import Guide, Wizard, calibrate
-from monstertruckd.calibrate.record import Estimate, Result
-from monstertruckd.calibrate.steps import Collect, Confirm, Number
+from monstertruckd.config.calibration.record import Estimate, Result
 from monstertruckd.config.load import load_uncalibrated
+from monstertruckd.tools.calibrate.guide import Guide, Wizard, calibrate
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
 
 CONFIG = load_uncalibrated(Path(__file__).resolve().parents[3] / "configs" / "demo.yaml")[0]
 RESULT = Result(

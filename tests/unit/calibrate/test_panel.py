@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.calibrate.steps import Confirm, Number
-from monstertruckd.cli.calibrate_panel import TerminalPanel
+from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
 DISTANCE = Number("distance", "how far, m?", 0.2, 20.0)
 READY = Confirm("ready", "ready?")

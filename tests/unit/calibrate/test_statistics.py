@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monstertruckd.calibrate.statistics import Interval, correlation_factor, mean_interval, student
+from monstertruckd.tools.calibrate.statistics import Interval, correlation_factor, mean_interval, student
 
 
 @pytest.mark.parametrize(("freedom", "expected"), [(1, 12.706), (3, 3.182), (30, 2.042), (60, 2.000), (1000, 1.962)])

@@ -8,8 +8,8 @@ import pytest
 from monstertruck_kinematics.chassis import TruckChassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
-from monstertruckd.calibrate.steering import Reach, _directions, _rough
-from monstertruckd.calibrate.steering_model import Leg, Maps, SteeringModel, half_widths
+from monstertruckd.tools.calibrate.steering import Reach, _directions, _rough
+from monstertruckd.tools.calibrate.steering_model import Leg, Maps, SteeringModel, half_widths
 
 CHASSIS = build_chassis("truck", drivetrain=DriveTrain())
 assert isinstance(CHASSIS, TruckChassis)

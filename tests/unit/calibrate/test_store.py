@@ -7,8 +7,8 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
-from monstertruckd.calibrate.record import Estimate, Result
-from monstertruckd.calibrate.store import CalibrationStore
+from monstertruckd.config.calibration.record import Estimate, Result
+from monstertruckd.config.calibration.store import CalibrationStore
 
 NOON = 1_795_262_400 * SECOND
 

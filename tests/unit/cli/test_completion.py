@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd.cli.options import complete_config, complete_device, complete_role, complete_topic
+from monstertruckd.tools.cli.options import complete_config, complete_device, complete_role, complete_topic
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -29,7 +29,7 @@ def test_configurations_of_the_folder(monkeypatch: pytest.MonkeyPatch):
 def test_a_shell_gets_them():
     asked = {"_MONSTERTRUCKD_COMPLETE": "complete_bash", "COMP_WORDS": "monstertruckd echo state/g", "COMP_CWORD": "2"}
     done = subprocess.run(
-        [sys.executable, "-c", "from monstertruckd.cli.main import app; app(prog_name='monstertruckd')"],
+        [sys.executable, "-c", "from monstertruckd.tools.cli.main import app; app(prog_name='monstertruckd')"],
         cwd=ROOT,
         env={"PATH": "/usr/bin", **asked},
         capture_output=True,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.cli.main import main
 from monstertruckd.config import migrate
+from monstertruckd.tools.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[3]
 SHIPPED = sorted((ROOT / "configs").glob("*.yaml"))

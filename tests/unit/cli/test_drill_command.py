@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from monstertruckd.cli import drill as command
-from monstertruckd.cli.main import main
-from monstertruckd.sim.drill import Drill, Outcome, Report
-from monstertruckd.sim.drill_faults import Kind
-from monstertruckd.sim.drill_observer import Violation
+from monstertruckd.tools.cli import drill as command
+from monstertruckd.tools.cli.main import main
+from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.faults import Kind
+from monstertruckd.tools.drill.observer import Violation
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
 SAFE = Outcome("stall: lidar", Kind.STALL, True, stop_bytes_s=0.27, standstill_s=0.56, metres=0.07, recovered_s=0.9)

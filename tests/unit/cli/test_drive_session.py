@@ -4,7 +4,7 @@ import errno
 import io
 
 from monstertruck_runtime.clock import WallClock
-from monstertruckd.cli.drive_session import DriveSession
+from monstertruckd.tools.cli.drive_session import DriveSession
 
 
 class Gone(io.StringIO):

@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 
 
 class Unplanned:

@@ -5,10 +5,10 @@ from rich.console import Console
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.cli.drive_screen import Stream, draw
-from monstertruckd.cli.live import shortened
-from monstertruckd.cli.screen import ScreenState
-from monstertruckd.cli.teleop import Teleop, Wish
+from monstertruckd.tools.cli.drive_screen import Stream, draw
+from monstertruckd.tools.cli.live import shortened
+from monstertruckd.tools.cli.teleop import Teleop, Wish
+from monstertruckd.tools.status.screen import ScreenState
 
 
 def test_long_lists_and_texts_are_cut_and_say_so():

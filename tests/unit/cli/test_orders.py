@@ -16,8 +16,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, GATE, Topic
-from monstertruckd.cli import orders
-from monstertruckd.cli.answer import Answer, give
+from monstertruckd.tools.cli import orders
+from monstertruckd.tools.cli.answer import Answer, give
 
 HEADER = {"stamp": 1, "received": 1, "seq": 0}
 

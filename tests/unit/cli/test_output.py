@@ -19,9 +19,17 @@ import typer
 from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
-from monstertruckd.cli.output import HELP_STYLE, CommandGroup, finish, print_json, print_table, progress, until_stopped
-from monstertruckd.logs.listing import LogState, list_logs
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.output import (
+    HELP_STYLE,
+    CommandGroup,
+    finish,
+    print_json,
+    print_table,
+    progress,
+    until_stopped,
+)
+from monstertruckd.tools.logs.listing import LogState, list_logs
 
 ROOT = Path(__file__).resolve().parents[3]
 

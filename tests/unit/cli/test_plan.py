@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_runtime.map_files import WorldMap, save_map
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
-from monstertruckd.cli.screen import ScreenState, draw
-from monstertruckd.cli.watch import plain
+from monstertruckd.tools.status.screen import ScreenState, draw
+from monstertruckd.tools.status.watch import plain
 
 HEADER = {"stamp": 10**9, "received": 10**9, "seq": 0}
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 
 TRUCK = Path(__file__).resolve().parents[3] / "configs" / "truck.yaml"
 
@@ -45,7 +45,7 @@ def test_a_port_that_no_rule_makes_is_pointed_out(tmp_path: Path):
 
 
 def test_who_may_not_install_is_told_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from monstertruckd.install import apply
+    from monstertruckd.tools.install import apply
 
     def refuse(path: Path, _: str, **_options: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
-from monstertruckd.cli.driving_modes import SPEEDS, SteeringMode
-from monstertruckd.cli.keys import KeyReader
-from monstertruckd.cli.teleop import MODE_KEYS, STEPS, Teleop, Wish, axles
+from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
+from monstertruckd.tools.cli.keys import KeyReader
+from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, Wish, axles
 
 START = 5 * SECOND
 

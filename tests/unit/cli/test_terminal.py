@@ -12,7 +12,7 @@ from typing import IO
 
 import pytest
 
-from monstertruckd.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input, when_readable
+from monstertruckd.tools.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input, when_readable
 
 
 @pytest.fixture

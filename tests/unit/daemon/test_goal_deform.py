@@ -9,9 +9,10 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.deform.config import RsbandConfig
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.deform import Deformation, told_of
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup
+from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -19,7 +20,6 @@ from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.goals.deform import Deformation, told_of
 
 POSES = np.column_stack((np.linspace(0.0, 2.0, 21), np.zeros(21), np.zeros(21)))
 ROUTE = PlanAnswer(Reason.OK, "", POSES, np.ones(21), ("counter",) * 21, 2.0, 2.0)

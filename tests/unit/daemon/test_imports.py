@@ -27,13 +27,15 @@ def test_neither_world_nor_heavy_libraries(tmp_path: Path):
         timeout=30,
     )
     loaded = set(done.stdout.split())
-    assert not {name for name in loaded if name.startswith(("monstertruck_drivers.world", "monstertruckd.sim"))}
+    assert not {
+        name for name in loaded if name.startswith(("monstertruck_sim.world", "monstertruckd.tools.simulation"))
+    }
     assert not loaded & {"scipy", "numba", "kiss_icp", "matplotlib", "PIL"}
 
 
 def test_help_is_light():
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, monstertruckd.cli.main; print(*sys.modules)"],
+        [sys.executable, "-c", "import sys, monstertruckd.tools.cli.main; print(*sys.modules)"],
         capture_output=True,
         text=True,
         check=True,

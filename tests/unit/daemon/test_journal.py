@@ -12,8 +12,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import LogLevel
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.journal import DEPTH, published
-from monstertruckd.logging_queue import LONGEST
+from monstertruckd.host.journal import DEPTH, published
+from monstertruckd.host.logging_queue import LONGEST
 
 log = logging.getLogger("monstertruckd.test")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd import logging_queue
-from monstertruckd.logging_queue import (
+from monstertruckd.host import logging_queue
+from monstertruckd.host.logging_queue import (
     DEPTH,
     LONGEST,
     LossyQueueHandler,

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd.memory import give_back
+from monstertruck_runtime.memory import give_back
 
 SETTLED = """
 import gc, re
 from pathlib import Path
-from monstertruckd.memory import settle
+from monstertruck_runtime.memory import settle
 kept = [[] for _ in range(200_000)]
 settle()
 print(gc.get_freeze_count(), re.search(r"AnonHugePages: *([0-9]+)", Path("/proc/self/smaps_rollup").read_text())[1])

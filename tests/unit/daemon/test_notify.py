@@ -15,7 +15,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
-from monstertruckd.notify import NotifyService, notify_from, notify_socket, status_line, watchdog_seconds
+from monstertruckd.host.notify import NotifyService, notify_from, notify_socket, status_line, watchdog_seconds
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
 

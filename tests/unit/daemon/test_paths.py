@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.track.line import MAX_POSES
+from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
@@ -18,7 +19,6 @@ from monstertruck_schemas.req import PathRequest, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, GATE, PATH, REQ_PATH, Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.paths import PathService, load_path
 from tests.unit.planners.kit import path, straight
 
 ROUTE = path(straight(1.0))

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.clock import WallClock
-from monstertruckd import stall
-from monstertruckd.stall import StallWatch
+from monstertruckd.host import stall
+from monstertruckd.host.stall import StallWatch
 
 pytestmark = pytest.mark.wall
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd import __version__, versions
+from monstertruckd import __version__
+from monstertruckd.host import versions
 
 
 def test_versions_of_everything_a_log_may_have_to_be_explained_by():

@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = (

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd.cli.driving_modes import SPEEDS, SteeringMode
-from monstertruckd.cli.robot import reasons
+from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
+from monstertruckd.tools.cli.robot import reasons
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "command-line.md").read_text()
 

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 from tests.unit.docs.command_lines import (
     FOREIGN,
     INSTEAD,

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_drivers.catalog import KINDS
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.catalog import KINDS
-from monstertruckd.cli.main import app
+from monstertruckd.tools.cli.main import app
 from tests.unit.docs.command_lines import commands_of
 
 ROOT = Path(__file__).resolve().parents[3]

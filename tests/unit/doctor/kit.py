@@ -12,13 +12,13 @@ from monstertruck_drivers.host_health.emulator import HostEmulator
 from monstertruck_drivers.link_quality.emulator import NetworkEmulator
 from monstertruck_drivers.usb.tree import DEVICES
 from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_sim.computer import EmulatedComputer
 from monstertruckd.config.load import load_truck
-from monstertruckd.doctor.accounts import Account
-from monstertruckd.doctor.finding import Finding, Level
-from monstertruckd.doctor.patient import Patient
-from monstertruckd.install.apply import install
-from monstertruckd.install.plan import plan
-from monstertruckd.sim.computer import EmulatedComputer
+from monstertruckd.tools.doctor.accounts import Account
+from monstertruckd.tools.doctor.finding import Finding, Level
+from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.install.apply import install
+from monstertruckd.tools.install.plan import plan
 from tests.unit.install.kit import PROGRAM, TRUCK
 
 NODES = ("ttyUSB0", "ttyACM0", "ttyUSB1", "ttyUSB2", "ttyACM1", "video0")

@@ -12,14 +12,14 @@ from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import PortBusyError
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.computer import EmulatedComputer
+from monstertruck_sim.robot import SimulatedRobot
 from monstertruckd.config.load import load_config
-from monstertruckd.doctor import handshakes as module
-from monstertruckd.doctor.finding import Finding, Level
-from monstertruckd.doctor.handshakes import handshakes
-from monstertruckd.doctor.patient import Patient
-from monstertruckd.sim.computer import EmulatedComputer
-from monstertruckd.sim.config import SimulatedTruckConfig
-from monstertruckd.sim.robot import SimulatedRobot
+from monstertruckd.tools.doctor import handshakes as module
+from monstertruckd.tools.doctor.finding import Finding, Level
+from monstertruckd.tools.doctor.handshakes import handshakes
+from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.unit.doctor.kit import Ward, see
 from tests.unit.install.kit import PROGRAM, ROOT
 

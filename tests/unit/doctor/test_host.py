@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.doctor.access import access
-from monstertruckd.doctor.finding import Level
-from monstertruckd.doctor.host import calendar, condition, link
+from monstertruckd.tools.doctor.access import access
+from monstertruckd.tools.doctor.finding import Level
+from monstertruckd.tools.doctor.host import calendar, condition, link
 from tests.unit.doctor.kit import NOW, Ward, bad, see
 
 NTP = "sudo timedatectl set-ntp true"

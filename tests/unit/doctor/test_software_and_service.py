@@ -4,12 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.doctor.accounts import Account, account_of
-from monstertruckd.doctor.finding import Level
-from monstertruckd.doctor.patient import Patient, admit
-from monstertruckd.doctor.service import rights, rules, service
-from monstertruckd.doctor.software import configuration, packages, python
-from monstertruckd.install.plan import RULES, UNIT
+from monstertruckd.tools.doctor.accounts import Account, account_of
+from monstertruckd.tools.doctor.finding import Level
+from monstertruckd.tools.doctor.patient import Patient, admit
+from monstertruckd.tools.doctor.service import rights, rules, service
+from monstertruckd.tools.doctor.software import configuration, packages, python
+from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.doctor.kit import Ward, bad, see
 from tests.unit.install.kit import PROGRAM, ROOT, TRUCK
 

@@ -6,8 +6,8 @@ import pytest
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.truck import PortConfig
-from monstertruckd.doctor.finding import Level
-from monstertruckd.doctor.wiring import wiring
+from monstertruckd.tools.doctor.finding import Level
+from monstertruckd.tools.doctor.wiring import wiring
 from tests.unit.doctor.kit import Ward, bad, see
 from tests.unit.install.kit import TRUCK
 

@@ -2,7 +2,7 @@
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import run_virtual
-from monstertruckd.sim.console import set_line_fault
+from monstertruck_sim.console import set_line_fault
 
 
 def test_the_next_writes_end_half_way_and_single_bytes_do_not_count():

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from monstertruckd.install.plan import Plan, plan
-from monstertruckd.install.unit import Program
+from monstertruckd.tools.install.plan import Plan, plan
+from monstertruckd.tools.install.unit import Program
 
 ROOT = Path(__file__).resolve().parents[3]
 TRUCK = ROOT / "configs" / "truck.yaml"

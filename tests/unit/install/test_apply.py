@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, NotFoundError, NotPermittedError
-from monstertruckd.install import apply
-from monstertruckd.install.apply import Change, Report, install, run_command, uninstall
-from monstertruckd.install.configuration import files_of
-from monstertruckd.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
+from monstertruckd.tools.install import apply
+from monstertruckd.tools.install.apply import Change, Report, install, run_command, uninstall
+from monstertruckd.tools.install.configuration import files_of
+from monstertruckd.tools.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
 from tests.unit.install.kit import ROOT, TRUCK, settings, truck_plan
 
 

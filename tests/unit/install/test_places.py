@@ -8,9 +8,9 @@ import pytest
 
 from monstertruck_runtime import small_files
 from monstertruck_runtime.errors import InputError
-from monstertruckd.install import apply
-from monstertruckd.install.apply import Change, install, uninstall
-from monstertruckd.install.plan import RULES, UNIT
+from monstertruckd.tools.install import apply
+from monstertruckd.tools.install.apply import Change, install, uninstall
+from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.install.kit import TRUCK, truck_plan
 
 INSTALLED = "etc/monstertruckd/truck.yaml"

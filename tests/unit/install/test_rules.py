@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from monstertruckd.config.load import load_truck
-from monstertruckd.install.rules import rules_text
+from monstertruckd.tools.install.rules import rules_text
 from tests.unit.install.kit import TRUCK
 
 UDEVADM = shutil.which("udevadm")

@@ -11,9 +11,9 @@ import yaml
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.load import load_truck
-from monstertruckd.install.plan import plan
-from monstertruckd.install.shipped import filled
-from monstertruckd.install.unit import Program, unit_text
+from monstertruckd.tools.install.plan import plan
+from monstertruckd.tools.install.shipped import filled
+from monstertruckd.tools.install.unit import Program, unit_text
 from tests.unit.install.kit import PROGRAM, ROOT, TRUCK, settings, text_of, truck_plan
 
 ANALYZE = shutil.which("systemd-analyze")

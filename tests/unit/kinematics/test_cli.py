@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from monstertruck_kinematics.motion import integrate
 from monstertruck_kinematics.skid_steer import SkidSteer
 from monstertruck_runtime.errors import InputError
-from monstertruckd.cli.kinematics import app
+from monstertruckd.tools.cli.kinematics import app
 
 
 def run(*arguments):

@@ -9,8 +9,10 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_schemas import topics as t
-from monstertruckd.logs import info, open_log, recover
 from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recover import recover
+from monstertruckd.tools.logs.info import info
 from tests.unit.logs.run_kit import compass, write
 from tests.unit.replay_check.log_surgery import chunks
 

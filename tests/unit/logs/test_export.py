@@ -19,11 +19,12 @@ from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Battery, BatteryLevel, CompressedImage
 from monstertruck_schemas.state import Grid, Transform, Transforms
-from monstertruckd.logs import export_csv, export_npz, open_log
-from monstertruckd.logs.ros2 import export_ros2
-from monstertruckd.logs.selection import Selection
-from monstertruckd.logs.wall_mcap import export_mcap
-from monstertruckd.logs.wall_time import real_offset, utc
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.logs.export import export_csv, export_npz
+from monstertruckd.tools.logs.ros2 import export_ros2
+from monstertruckd.tools.logs.selection import Selection
+from monstertruckd.tools.logs.wall_mcap import export_mcap
+from monstertruckd.tools.logs.wall_time import real_offset, utc
 from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 from tests.unit.recorder.conftest import scan
 

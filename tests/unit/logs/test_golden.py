@@ -12,12 +12,15 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from monstertruckd.config.load import load_truck
-from monstertruckd.demo.wall import free_endpoint
-from monstertruckd.logs import export_csv, export_npz, info, open_log, recover
-from monstertruckd.logs.report import report
-from monstertruckd.logs.ros2 import export_ros2
-from monstertruckd.logs.wall_mcap import export_mcap
-from monstertruckd.replay import replay_log
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recover import recover
+from monstertruckd.tools.demo.wall import free_endpoint
+from monstertruckd.tools.logs.export import export_csv, export_npz
+from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.replay import replay_log
+from monstertruckd.tools.logs.report import report
+from monstertruckd.tools.logs.ros2 import export_ros2
+from monstertruckd.tools.logs.wall_mcap import export_mcap
 
 RELEASES = sorted((Path(__file__).parents[2] / "data" / "golden").iterdir())
 pytestmark = pytest.mark.parametrize("release", RELEASES, ids=lambda folder: folder.name)

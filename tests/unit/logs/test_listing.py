@@ -10,10 +10,10 @@ import pytest
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.topics import CLOCK, GATE
-from monstertruckd.cli.main import main
-from monstertruckd.logs.listing import Listed, LogState, list_logs
-from monstertruckd.logs.reader import LogReader
-from monstertruckd.logs.wall_time import real_offset
+from monstertruckd.recorder.reader import LogReader
+from monstertruckd.tools.cli.main import main
+from monstertruckd.tools.logs.listing import Listed, LogState, list_logs
+from monstertruckd.tools.logs.wall_time import real_offset
 from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate
 
 

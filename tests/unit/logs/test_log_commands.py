@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from monstertruckd.cli.main import app
-from monstertruckd.logs.selection import Selection
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.logs.selection import Selection
 
 GOLDEN = max((Path(__file__).parents[2] / "data" / "golden").glob("*/run.mcap"))
 

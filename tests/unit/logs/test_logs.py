@@ -14,8 +14,11 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
-from monstertruckd.logs import export_csv, export_npz, info, open_log, recover, recover_directory
 from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recover import recover, recover_directory
+from monstertruckd.tools.logs.export import export_csv, export_npz
+from monstertruckd.tools.logs.info import info
 from tests.unit.logs.run_kit import MAKERS, write
 
 

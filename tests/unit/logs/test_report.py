@@ -17,10 +17,10 @@ from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, Grid
-from monstertruckd.logs.report import report
-from monstertruckd.logs.report.collect import collect
-from monstertruckd.logs.report.page import page
 from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.tools.logs.report import report
+from monstertruckd.tools.logs.report.collect import collect
+from monstertruckd.tools.logs.report.page import page
 from tests.unit.logs.log_kit import Writer, clock, gate, odometry
 from tests.unit.recorder.conftest import scan
 
@@ -141,7 +141,7 @@ def test_page_tells_what_the_journal_warned_of(tmp_path):
         for level in LogLevel:
             header = {"stamp": number * SECOND, "received": number * SECOND, "seq": number}
             text = f"{level} <{number}>"
-            writer.put(t.LOG, LogRecord(**header, level=level, name="monstertruckd.stall", text=text))
+            writer.put(t.LOG, LogRecord(**header, level=level, name="monstertruckd.host.stall", text=text))
     writer.log.finish()
     shown = report(file).file.read_text()
     assert "warning &lt;0&gt;" in shown

@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.logs.scans import read_scans
+from monstertruckd.tools.logs.scans import read_scans
 
 URG = Path(__file__).resolve().parents[2] / "data" / "urg04lx_exp2.dat.gz"
 

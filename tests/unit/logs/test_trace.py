@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.logs.report.spans import Span, Tone, Track, drawn
-from monstertruckd.logs.report.svg import clock_text, line, time_ticks, value_axis
-from monstertruckd.logs.trace import Trace
+from monstertruckd.tools.logs.report.spans import Span, Tone, Track, drawn
+from monstertruckd.tools.logs.report.svg import clock_text, line, time_ticks, value_axis
+from monstertruckd.tools.logs.trace import Trace
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(4, 50))

@@ -15,10 +15,10 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import LogLevel, LogRecord
-from monstertruckd.cli.logs import app, needs_extra
-from monstertruckd.logs.rerun_log import TIMELINE, convert
-from monstertruckd.logs.selection import Selection
-from monstertruckd.logs.view import environment, show
+from monstertruckd.tools.cli.logs import app, needs_extra
+from monstertruckd.tools.logs.rerun_log import TIMELINE, convert
+from monstertruckd.tools.logs.selection import Selection
+from monstertruckd.tools.logs.view import environment, show
 from tests.unit.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 from tests.unit.logs.test_export import grid, image, path, transforms
 from tests.unit.recorder.conftest import scan

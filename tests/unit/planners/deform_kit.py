@@ -3,7 +3,7 @@
 import numpy as np
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.deform.api import Guide
+from monstertruck_planners.local.api import Guide
 
 RES = 0.04
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.collision import DiscFootprint, Footprint, clearance_to_points
-from monstertruck_planners.deform import bubbles
-from monstertruck_planners.deform.api import Guide
-from monstertruck_planners.deform.band import cover_of, rules_of, stretch
-from monstertruck_planners.deform.config import BandConfig
+from monstertruck_planners.local import bubbles
+from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.band import cover_of, rules_of, stretch
+from monstertruck_planners.local.config import BandConfig
 from monstertruck_runtime.errors import InputError
 from tests.unit.planners.deform_kit import RES, line, window
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from monstertruck_planners.deform import bubbles
-from monstertruck_planners.deform.api import Memory
-from monstertruck_planners.deform.catalog import make_deformer
-from monstertruck_planners.deform.config import RsbandConfig, TebConfig
-from monstertruck_planners.deform.local import Surveyor
+from monstertruck_planners.local import bubbles
+from monstertruck_planners.local.api import Memory
+from monstertruck_planners.local.catalog import make_deformer
+from monstertruck_planners.local.config import RsbandConfig, TebConfig
+from monstertruck_planners.local.planner import Surveyor
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.deform_kit import drivable, line, window

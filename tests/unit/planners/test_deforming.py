@@ -7,10 +7,10 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.deform.config import RsbandConfig
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.deforming import DeformStep
-from monstertruck_planners.manage.exchange import DeformAnswer, DeformTask, Setup, Way
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.deforming import DeformStep
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, Way
+from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason

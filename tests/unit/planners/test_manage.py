@@ -9,13 +9,13 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, clearance_to_points
-from monstertruck_planners.manage import mission as machine
-from monstertruck_planners.manage.config import EscapeConfig, PlannerConfig
-from monstertruck_planners.manage.escape import blocked_sides, escape, placed, seen_from
-from monstertruck_planners.manage.exchange import PlanAnswer, PlanTask, Setup
-from monstertruck_planners.manage.lookout import blocked, cut, way_ahead
-from monstertruck_planners.manage.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
-from monstertruck_planners.manage.planning import PlanningStep
+from monstertruck_planners.goals import mission as machine
+from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
+from monstertruck_planners.goals.escape import blocked_sides, escape, placed, seen_from
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
+from monstertruck_planners.goals.lookout import blocked, cut, way_ahead
+from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
+from monstertruck_planners.goals.planning import PlanningStep
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D

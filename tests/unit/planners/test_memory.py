@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monstertruck_planners.manage.memory import BESIDE, THROUGH, ObstacleMemory, seen_through
+from monstertruck_planners.goals.memory import BESIDE, THROUGH, ObstacleMemory, seen_through
 
 HERE = np.zeros(2)
 

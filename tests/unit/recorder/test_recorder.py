@@ -16,10 +16,11 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, run_virtual, run_wall
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.logs import open_log, recover_directory
 from monstertruckd.recorder import LogDigest, Recorder, RecorderConfig
 from monstertruckd.recorder import file as file_module
 from monstertruckd.recorder import writer as writer_module
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recover import recover_directory
 from tests.unit.recorder.conftest import drive, scan, steering
 
 

@@ -10,11 +10,11 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment
 
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.logs import LogMessage, open_log
-from monstertruckd.logs.framing import MAGIC
 from monstertruckd.recorder.file import Entry, LogFile
-from monstertruckd.replay_check import check_log
-from monstertruckd.replay_check.result import ROUNDING
+from monstertruckd.recorder.framing import MAGIC
+from monstertruckd.recorder.reader import LogMessage, open_log
+from monstertruckd.tools.replay_check import check_log
+from monstertruckd.tools.replay_check.result import ROUNDING
 
 REPLAY = Path(__file__).resolve().parents[2] / "data" / "replay"
 LEVEL, SLAM, FUSION, GOALS = (REPLAY / f"{name}.mcap" for name in ("level", "slam", "fusion", "goals"))

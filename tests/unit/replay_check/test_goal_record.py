@@ -7,7 +7,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
-from monstertruckd.replay_check.goals import Call, GoalRecord, Told
+from monstertruckd.tools.replay_check.goals import Call, GoalRecord, Told
 
 PERIOD = SECOND // 10
 GOAL = Pose2D(x=1.0, y=2.0, yaw=0.0)

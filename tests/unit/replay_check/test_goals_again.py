@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from monstertruck_runtime import wire
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
-from monstertruckd.logs import open_log
-from monstertruckd.replay_check import check_log
-from monstertruckd.replay_check.difference import Kind
-from monstertruckd.replay_check.result import ROUNDING
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.replay_check import check_log
+from monstertruckd.tools.replay_check.difference import Kind
+from monstertruckd.tools.replay_check.result import ROUNDING
 from tests.unit.replay_check.log_surgery import (
     BY_NAME,
     GOALS,

@@ -2,10 +2,10 @@
 
 import asyncio
 
+from monstertruck_runtime.actors.agenda import agenda_of, use_agenda
 from monstertruck_runtime.clock import SECOND, VirtualLoop
 from monstertruck_runtime.schedule import Schedule
-from monstertruckd.replay_check.pace import Pace, PacedClock, RecordedTurns
-from monstertruckd.workers.agenda import agenda_of, use_agenda
+from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
 
 
 def run(main, start=SECOND):

@@ -11,10 +11,10 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
-from monstertruckd.logs import open_log
-from monstertruckd.replay_check import check_log
-from monstertruckd.replay_check.difference import Kind
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.replay_check import check_log
+from monstertruckd.tools.replay_check.difference import Kind
 from tests.unit.replay_check.log_surgery import (
     FUSION,
     GOALS,

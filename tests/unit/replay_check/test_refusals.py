@@ -7,9 +7,9 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
-from monstertruckd.logs import open_log
-from monstertruckd.replay_check import check_log
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.replay_check import check_log
 from tests.unit.replay_check.log_surgery import LEVEL, SLAM, attachments_of, changed, digit, flip, write
 
 

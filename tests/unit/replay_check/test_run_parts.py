@@ -8,13 +8,13 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.cli.main import app
-from monstertruckd.logs import open_log
 from monstertruckd.recorder.config import Compression, RecorderConfig
 from monstertruckd.recorder.file import Entry
+from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.writer import LogWriter
-from monstertruckd.replay_check import parts_of
-from monstertruckd.replay_check.run_log import RunLog
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.replay_check import parts_of
+from monstertruckd.tools.replay_check.run_log import RunLog
 from tests.unit.replay_check.log_surgery import BY_NAME, LEVEL, attachments_of, chunks, computed_again, write
 
 

@@ -15,9 +15,21 @@ from mcap.records import Schema as McapSchema
 from mcap_protobuf.decoder import DecoderFactory
 from pydantic import BaseModel
 
-from monstertruck_runtime import foxglove, foxglove_layouts, foxglove_scan, wire
+from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.protobuf import DELIMITED, FIXED32, FIXED64, VARINT, Layout, delimited, read_varint, varint
+from monstertruck_runtime.wire import foxglove
+from monstertruck_runtime.wire import layouts as foxglove_layouts
+from monstertruck_runtime.wire import scan as foxglove_scan
+from monstertruck_runtime.wire.protobuf import (
+    DELIMITED,
+    FIXED32,
+    FIXED64,
+    VARINT,
+    Layout,
+    delimited,
+    read_varint,
+    varint,
+)
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity

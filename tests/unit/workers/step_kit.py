@@ -6,17 +6,17 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.deform.config import RsbandConfig
-from monstertruck_planners.manage.config import PlannerConfig
-from monstertruck_planners.manage.exchange import DeformTask, PlanTask, Setup, Way
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.exchange import DeformTask, PlanTask, Setup, Way
+from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.track.config import LqrConfig
+from monstertruck_planners.track.step import TrackInput, TrackSetup
+from monstertruck_runtime.actors.codec import from_json
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
-from monstertruckd.workers.codec import from_json
-from monstertruckd.workers.tracking import TrackInput, TrackSetup
 
 BODY, TRUCK = Footprint(), FourWheelSteering()
 HEAD = {"stamp": 5, "received": 5, "seq": 0}

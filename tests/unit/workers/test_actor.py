@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
-from monstertruckd.workers.actor import WorkerActor
 
 ROOT = Path(__file__).parents[3]
 
@@ -157,7 +157,7 @@ async def test_a_worker_ends_with_its_killed_parent(tmp_path: Path):
         textwrap.dedent("""
         import asyncio
         from monstertruck_runtime.clock import WallClock
-        from monstertruckd.workers.actor import WorkerActor
+        from monstertruck_runtime.actors.actor import WorkerActor
 
         async def main():
             worker = WorkerActor("w", "tests.worker_kit:Counter", WallClock(), latency=1, deadline=99)

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
+from monstertruck_runtime.actors.agenda import agenda_of
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruckd.workers.agenda import agenda_of
 
 
 def test_turns_due_together_are_taken_in_the_order_of_waiting_and_cancelled_ones_are_skipped():

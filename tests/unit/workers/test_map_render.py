@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import WorkerError
-from monstertruckd.workers.actor import WorkerActor
-from monstertruckd.workers.map_render import STYLES, MapRenderer
-from monstertruckd.workers.occupancy import OccupancyRaster
+from monstertruckd.recorder.occupancy import OccupancyRaster
+from monstertruckd.recorder.picture_worker import STYLES, MapRenderer
 
 
 def cell_at(raster: OccupancyRaster, x: float, y: float) -> float:
@@ -113,7 +113,7 @@ def test_narrow_maps_leave_room_for_the_texts():
 
 async def test_in_its_worker_process():
     worker = WorkerActor(
-        "map", "monstertruckd.workers.map_render:MapRenderer", WallClock(), latency=0.05, deadline=20.0
+        "map", "monstertruckd.recorder.picture_worker:MapRenderer", WallClock(), latency=0.05, deadline=20.0
     )
     async with worker:
         points = np.array([[1.0, 0.0], [0.0, 1.0]])

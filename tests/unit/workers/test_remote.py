@@ -9,16 +9,17 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from monstertruck_planners.manage.exchange import PlanAnswer
-from monstertruck_planners.manage.planning import PlanningStep
+from monstertruck_planners.goals.exchange import PlanAnswer
+from monstertruck_planners.goals.planning import PlanningStep
+from monstertruck_planners.track.step import TrackingWorker, TrackInput
+from monstertruck_runtime.actors import codec
+from monstertruck_runtime.actors import server as plan_server
+from monstertruck_runtime.actors.codec import from_json, to_json
+from monstertruck_runtime.actors.remote import RemoteDesk
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.workers import codec, plan_server
-from monstertruckd.workers.codec import from_json, to_json
-from monstertruckd.workers.remote import RemoteDesk
-from monstertruckd.workers.tracking import TrackingWorker, TrackInput
 from tests.unit.workers.step_kit import numbers, plan_task, track_inputs
 
 

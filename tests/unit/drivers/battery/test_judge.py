@@ -7,10 +7,10 @@ import pytest
 
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.battery.judge import CELL_VOLTS, BatteryJudge, charge_of
-from monstertruck_drivers.world.battery import Battery
-from monstertruck_drivers.world.config import BatteryConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import BatteryLevel
+from monstertruck_sim.world.battery import Battery
+from monstertruck_sim.world.config import BatteryConfig
 
 L = BatteryLevel
 

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from monstertruck_drivers.base import RangeSource
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
-from monstertruck_drivers.world.config import WorldConfig
-from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import WallClock
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World
 from tests.unit.drivers.hokuyo_urg.rig import Pattern
 
 T = TypeVar("T")

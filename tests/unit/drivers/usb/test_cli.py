@@ -15,9 +15,9 @@ from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree
-from monstertruckd.cli import usb as commands
-from monstertruckd.cli.find_port import config_line, find_cable, write_port
-from monstertruckd.cli.usb_tree import draw, plain
+from monstertruckd.tools.cli import usb as commands
+from monstertruckd.tools.cli.find_port import config_line, find_cable, write_port
+from monstertruckd.tools.cli.usb_tree import draw, plain
 from tests.unit.drivers.usb.rig import PORTS, Bench, emulated_truck, play
 
 NODES = (
@@ -88,20 +88,20 @@ def fake_client(tree: UsbTree | None) -> type:
 
 def test_usb_asks_the_robot(monkeypatch: pytest.MonkeyPatch):
     tree = UsbTree(stamp=0, received=0, seq=0, nodes=NODES)
-    monkeypatch.setattr("monstertruckd.cli.usb_tree.TruckClient", fake_client(tree))
+    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.TruckClient", fake_client(tree))
     result = CliRunner().invoke(app(), ["usb", "--json"])
     assert [UsbNode.model_validate(row, strict=False) for row in json.loads(result.stdout)] == list(NODES)
     result = CliRunner().invoke(app(), ["usb"])
     assert result.stdout.splitlines() == plain(NODES), "piped, it is the table"
 
-    monkeypatch.setattr("monstertruckd.cli.usb_tree.TruckClient", fake_client(None))
+    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.TruckClient", fake_client(None))
     result = CliRunner().invoke(app(), ["usb"])
     assert isinstance(result.exception, NotFoundError)
 
 
 def test_usb_shows_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     machine, _ = emulated_truck(tmp_path)
-    monkeypatch.setattr("monstertruckd.cli.usb_tree.Sysfs", lambda: machine.sysfs)
+    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.Sysfs", lambda: machine.sysfs)
     result = CliRunner().invoke(app(), ["usb", "--local"])
     assert len(result.stdout.splitlines()) == 10
     assert (
@@ -239,7 +239,7 @@ def test_find_port_prints_the_line_and_writes_it(tmp_path: Path, monkeypatch: py
         assert isinstance(machine.sysfs, Sysfs)
         return PORTS["lidar"]
 
-    monkeypatch.setattr("monstertruckd.cli.find_port.find_cable", found)
+    monkeypatch.setattr("monstertruckd.tools.cli.find_port.find_cable", found)
     file = tmp_path / "truck.yaml"
     file.write_text(CONFIG)
     result = CliRunner().invoke(app(), ["find-port", "lidar", "--wait", "5", "--write", str(file)])
@@ -267,7 +267,7 @@ def test_a_machine_without_hubs_says_so(monkeypatch: pytest.MonkeyPatch):
     async def nothing(*_: Any) -> tuple[UsbNode, ...]:
         return ()
 
-    monkeypatch.setattr("monstertruckd.cli.usb_tree.local_tree", nothing)
+    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.local_tree", nothing)
     result = CliRunner().invoke(app(), ["usb", "--local"])
     assert (result.exit_code, result.stdout) == (0, "")
     assert result.stderr == "no USB hub on this machine\n"

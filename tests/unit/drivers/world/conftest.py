@@ -5,11 +5,11 @@ from math import degrees
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import ServoConfig, WorldConfig
-from monstertruck_drivers.world.world import World
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
+from monstertruck_sim.world.config import ServoConfig, WorldConfig
+from monstertruck_sim.world.world import World
 
 SECOND = 1_000_000_000
 RPM_PER_SPEED = 644 / (2 * np.pi * 0.075) * 60

@@ -5,7 +5,6 @@ from math import hypot, pi, tan
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_drivers.world.config import ServoConfig, TruckConfig
 from monstertruck_schemas.body import (
     AckermannBody,
     DifferentialBody,
@@ -15,6 +14,7 @@ from monstertruck_schemas.body import (
     SynchroBody,
     TricycleBody,
 )
+from monstertruck_sim.world.config import ServoConfig, TruckConfig
 
 EXACT = ServoConfig(channel=1, dead_band_us=0, resolution_us=0.001)
 IDEAL = {

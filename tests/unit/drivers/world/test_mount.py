@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import SinusoidTilt, WorldConfig
-from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND
+from monstertruck_sim.world.config import SinusoidTilt, WorldConfig
+from monstertruck_sim.world.world import World
 
 
 class Joints:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.noise import COMPASS, CURRENT, SlowNoise, WhiteNoise
+from monstertruck_sim.world.noise import COMPASS, CURRENT, SlowNoise, WhiteNoise
 
 INDICES = [0, 1, 511, 512, 40_000]
 

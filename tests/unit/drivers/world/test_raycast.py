@@ -6,7 +6,7 @@ from timeit import timeit
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.raycast import cast_rays, clearance, grid_penetration
+from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
 
 NO_DISCS, NO_SEGMENTS = np.zeros((0, 3)), np.zeros((0, 4))
 

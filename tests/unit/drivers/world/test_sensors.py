@@ -5,9 +5,9 @@ from math import degrees, pi, radians
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import BatteryConfig, CompassConfig, Iron, LidarConfig, SinusoidTilt
-from monstertruck_drivers.world.obstacles import Box, Disc
-from monstertruck_drivers.world.sensors import FAILED, NO_RETURN, TOO_NEAR
+from monstertruck_sim.world.config import BatteryConfig, CompassConfig, Iron, LidarConfig, SinusoidTilt
+from monstertruck_sim.world.obstacles import Box, Disc
+from monstertruck_sim.world.sensors import FAILED, NO_RETURN, TOO_NEAR
 
 ANGLES = (np.arange(769) - 384) * 2 * pi / 1024
 WALLS = [(-2.05, -2.05, 2.05, -2.0), (-2.05, 2.0, 2.05, 2.05), (-2.05, -2, -2, 2), (2.0, -2, 2.05, 2)]

@@ -2,9 +2,9 @@
 
 import pytest
 
-from monstertruck_drivers.world.config import WorldConfig
-from monstertruck_drivers.world.world import World
 from monstertruck_runtime.clock import SECOND
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World
 
 
 class Pulses:

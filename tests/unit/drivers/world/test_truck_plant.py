@@ -5,15 +5,15 @@ from math import atan, cos, degrees, hypot, pi, radians, sin
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.battery import Battery, rest_voltage
-from monstertruck_drivers.world.config import (
+from monstertruck_sim.world.battery import Battery, rest_voltage
+from monstertruck_sim.world.config import (
     BatteryConfig,
     MotorConfig,
     ServoConfig,
     SinusoidTilt,
     TruckConfig,
 )
-from monstertruck_drivers.world.obstacles import Box, Disc
+from monstertruck_sim.world.obstacles import Box, Disc
 
 IDEAL = TruckConfig(front_slip_angle=0, rear_slip_angle=0, slip_per_newton=0)
 ROLLED_PER_TURN = 2 * pi * 0.075 / 644

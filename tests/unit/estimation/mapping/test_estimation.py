@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_estimation.mapping import storage
-from monstertruck_estimation.mapping.config import SlamConfig
-from monstertruck_estimation.mapping.correction import Correction
-from monstertruck_estimation.mapping.estimator import levelled
-from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInput, WorkerOutput
-from monstertruck_estimation.mapping.time_offset import find_offset
 from monstertruck_estimation.scan_tilt import plane_slopes, plane_tilt
+from monstertruck_estimation.slam import step as estimation
+from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.correction import Correction
+from monstertruck_estimation.slam.estimator import levelled
+from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.slam.step import EstimationWorker
+from monstertruck_estimation.slam.time_offset import find_offset
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import Standing
-from monstertruckd.workers import estimation
-from monstertruckd.workers.estimation import EstimationWorker
 
 ANGLES = np.linspace(-2.1, 2.1, 400)
 WALLS = np.array(

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.mapping.increments import Increments
 from monstertruck_estimation.slam.frontend import Match, Verdict, rejected
+from monstertruck_estimation.slam.increments import Increments
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))
 

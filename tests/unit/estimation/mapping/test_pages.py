@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from monstertruck_estimation.mapping.painter import PAGE, Pages
+from monstertruck_estimation.slam.painter import PAGE, Pages
 
 
 def test_scans_are_remembered_as_they_came():

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_drivers.world.config import WorldConfig
-from monstertruck_drivers.world.world import World
-from monstertruck_estimation.mapping.config import SlamConfig
-from monstertruck_estimation.mapping.exchange import ScanInput, Start, WorkerInput
-from monstertruck_estimation.mapping.surfaces import surfaces_of
+from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput
+from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.slam.step import EstimationWorker
+from monstertruck_estimation.slam.surfaces import surfaces_of
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import Standing
-from monstertruckd.workers.estimation import EstimationWorker
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World
 
 ROOMS = Path(__file__).parents[4] / "configs" / "worlds" / "rooms.yaml"
 STEP = 0.05

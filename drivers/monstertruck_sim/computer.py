@@ -1,0 +1,131 @@
+"""The emulated computer of a simulated truck: hubs, ports and nodes as its configuration names them."""
+
+import asyncio
+from collections.abc import Mapping
+from pathlib import Path
+
+from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
+from monstertruck_drivers.host_health.readings import Disk
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.emulated import EmulatedUsb
+from monstertruck_drivers.usb.tree import ancestors
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+from monstertruckd.assembly.cabling import Computer
+from monstertruckd.config.truck import Devices
+
+IDENTITIES = {
+    "hokuyo_urg": ("15d1:0000", "URG-Series USB Driver", "ttyACM"),
+    "epos": ("0403:6001", "FT232R USB UART", "ttyUSB"),
+    "maestro": ("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
+    "os4000": ("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
+    "ax12": ("0403:6001", "USB2Dynamixel", "ttyUSB"),
+    "webcam": ("046d:080a", "Webcam C905", "video"),
+}
+"""USB identity, product and kind of node by kind of device."""
+HUB_PORTS = 7
+DISK = Disk(total=64_000_000_000, free=32_000_000_000)
+"""Of an emulated computer; on the real one, every run would record something else."""
+HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
+
+
+class UsbCable:
+    """``EmulatedPort`` of a device in the emulated tree: pulling the cable takes the device out of it.
+
+    Args:
+        usb: the tree.
+        where: kernel's name of the device's place.
+        cable: what its node leads to.
+    """
+
+    def __init__(self, usb: EmulatedUsb, where: str, cable: EmulatedPort) -> None:
+        self.name = cable.name
+        self._usb = usb
+        self._where = where
+        self._cable = cable
+
+    @property
+    def device(self) -> DeviceEnd:
+        """The device's side of the cable."""
+        return self._cable.device
+
+    @device.setter
+    def device(self, end: DeviceEnd) -> None:
+        self._cable.device = end
+
+    def plug(self) -> None:
+        """Plug the device in; it shows as soon as its hub does."""
+        self._usb.plug(self._where)
+
+    def unplug(self) -> None:
+        """Pull the cable out of the hub."""
+        self._usb.unplug(self._where)
+
+
+class EmulatedComputer:
+    """The USB tree of every device that hangs by hub and port.
+
+    Args:
+        folder: gets proc, sys and dev; must exist.
+        devices: of the truck.
+        cables: what each device's emulator serves, by role.
+        clock: time.
+    """
+
+    def __init__(self, folder: Path, devices: Devices, cables: Mapping[str, EmulatedPort], clock: Clock) -> None:
+        self.folder = folder
+        self._clock = clock
+        self._returning: asyncio.Task[None] | None = None
+        self.usb = EmulatedUsb(folder)
+        self.ports: dict[str, EmulatedPort] = dict(cables)
+        """By role: where cables are plugged and pulled."""
+        places = {
+            role: (device.port, device.kind)
+            for role, device in devices.present().items()
+            if isinstance(device.port, UsbPortConfig)
+        }
+        hubs = {hub for port, _ in places.values() for hub in (port.hub, *ancestors(port.hub)) if "-" in hub}
+        for hub in sorted(hubs):
+            self.usb.add_hub(hub, ports=HUB_PORTS)
+        for role, (port, kind) in places.items():
+            usb_id, title, node = IDENTITIES[kind]
+            self.usb.add_device(
+                port.device,
+                port.usb_id or usb_id,
+                title,
+                node=node,
+                interface=port.interface,
+                serial=f"emulated-{role}",
+                cable=cables[role],
+            )
+            self.ports[role] = UsbCable(self.usb, port.device, cables[role])
+
+    def computer(self) -> Computer:
+        """What a daemon in this process takes for its computer."""
+        return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
+
+    def command(self, words: list[str]) -> None:
+        """Obey one word on the USB tree, see ``HELP``; a hub that returns takes its time.
+
+        Raises:
+            InputError: it is not understood, or there is no such place.
+        """
+        try:
+            match words:
+                case ["lose", hub]:
+                    self.usb.lose_hub(hub)
+                case ["return", hub] if self.usb.knows(hub):
+                    self._returning = asyncio.get_running_loop().create_task(self.usb.return_hub(hub, self._clock))
+                case ["over-current", where]:
+                    self.usb.over_current(where)
+                case ["suspend", where]:
+                    self.usb.suspend_when_idle(where)
+                case _:
+                    raise InputError(HELP)
+        except KeyError as error:
+            raise InputError(f"no hub or device at {error}; {HELP}") from error
+
+
+def hangs_by_hub(devices: Devices) -> bool:
+    """Whether any device is named by hub and port."""
+    return any(isinstance(device.port, UsbPortConfig) for device in devices.present().values())

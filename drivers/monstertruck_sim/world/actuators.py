@@ -1,0 +1,89 @@
+"""What the controllers move: the motor's shaft and the steering servos' arms."""
+
+from math import copysign, exp, floor, pi, radians
+
+from monstertruck_kinematics.polynomials import SERVO_LIMIT
+from monstertruck_sim.world.config import MotorConfig, ServoConfig
+
+RPM = 2 * pi / 60
+"""One revolution per minute, rad/s."""
+
+
+class Shaft:
+    """Motor under a speed controller: ramped demand, first-order lag behind it; sign: forwards positive."""
+
+    def __init__(self, config: MotorConfig) -> None:
+        self._config = config
+        self._target: float | None = None
+        self._acceleration = 0.0
+        self.turns = 0.0
+        self.rpm = 0.0
+        self.demand_rpm = 0.0
+        self.slope = 0.0
+        """Present acceleration, rpm/s."""
+
+    def command(self, target_rpm: float | None, accel_rpm_s: float) -> None:
+        """Ramp towards a speed; None switches the power stage off."""
+        if self._target is None:
+            self.demand_rpm = self.rpm
+        self._target = target_rpm
+        self._acceleration = abs(accel_rpm_s)
+
+    @property
+    def powered(self) -> bool:
+        """Whether the power stage is on."""
+        return self._target is not None
+
+    def step(self, dt: float) -> None:
+        """Move on by dt seconds."""
+        before = self.rpm
+        if self._target is None:
+            self.demand_rpm = 0.0
+            rpm = _towards(before, 0.0, self._config.coast_rpm_s * dt)
+        else:
+            demand = self.demand_rpm = _towards(self.demand_rpm, self._target, self._acceleration * dt)
+            rpm = demand + (before - demand) * exp(-dt / self._config.lag)
+            if demand == 0.0 and abs(rpm) < 0.5:
+                rpm = 0.0
+        self.rpm = rpm
+        self.turns += (before + rpm) / 2 * dt / 60
+        self.slope = (rpm - before) / dt
+
+
+class Servo:
+    """A hobby servo: measures its pulse in steps, ignores small changes, turns at a limited rate, limp without pulses.
+
+    Args:
+        config: true pulse map and limits.
+    """
+
+    def __init__(self, config: ServoConfig) -> None:
+        self._config = config
+        self._left_stop = min(SERVO_LIMIT, radians(config.left_stop_deg))
+        self._right_stop = -min(SERVO_LIMIT, radians(config.right_stop_deg))
+        self._held_us: float | None = None
+        self._target = 0.0
+        """Angle of the held pulse, rad."""
+        self.angle = 0.0
+        """Of the arm, rad."""
+
+    def latch(self, pulse_us: float | None) -> None:
+        """Take over one pulse; None (no pulses) leaves the arm where it is."""
+        if pulse_us is None:
+            self._held_us = None
+            return
+        measured = floor(pulse_us / self._config.resolution_us + 0.5) * self._config.resolution_us
+        if self._held_us is None or abs(measured - self._held_us) > self._config.dead_band_us:
+            self._held_us = measured
+            target = radians((measured - self._config.centre_us) / self._config.us_per_degree)
+            self._target = min(max(target, self._right_stop), self._left_stop)
+
+    def step(self, dt: float) -> None:
+        """Turn towards the held pulse for dt seconds."""
+        if self._held_us is not None:
+            self.angle = _towards(self.angle, self._target, self._config.rate * dt)
+
+
+def _towards(value: float, target: float, step: float) -> float:
+    left = target - value
+    return target if abs(left) <= step else value + copysign(step, left)

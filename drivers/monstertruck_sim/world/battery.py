@@ -1,0 +1,68 @@
+"""A 6S LiPo pack: charge by coulomb counting, sag at once and slowly, read through a divider and an RC filter."""
+
+from math import exp
+
+from monstertruck_sim.world.config import BatteryConfig
+
+CELLS = 6
+_CELL_VOLTS = (
+    3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
+    3.85, 3.87, 3.91, 3.95, 3.98, 4.02, 4.08, 4.11, 4.15, 4.20,
+)  # fmt: skip
+"""At charges in steps of 5 %."""
+_STEPS = len(_CELL_VOLTS) - 1
+
+
+def rest_voltage(charge: float) -> float:
+    """Open-circuit volts of the pack at a charge of 0..1 (the table in common circulation, 5 % steps)."""
+    place = min(max(charge, 0.0), 1.0) * _STEPS
+    below = min(int(place), _STEPS - 1)
+    low, high = _CELL_VOLTS[below], _CELL_VOLTS[below + 1]
+    return CELLS * (low + (high - low) * (place - below))
+
+
+class Battery:
+    """The pack's state; ``step`` moves it on.
+
+    Args:
+        config: parameters and initial charge.
+    """
+
+    def __init__(self, config: BatteryConfig) -> None:
+        self._config = config
+        self._slow_sag = 0.0
+        self.connected = True
+        """Its plug is in."""
+        self.set_charge(config.charge)
+        self._filtered = self.volts
+
+    def set_charge(self, charge: float) -> None:
+        """Exchange the pack for one of another charge, 0..1."""
+        self.charge = charge
+        self._rest = rest_voltage(charge)
+        self.volts = self._loaded(self._config.electronics_w / self._rest)
+
+    @property
+    def analog_volts(self) -> float:
+        """Behind divider and filter."""
+        return self._filtered / self._config.divider + self._config.analog_offset
+
+    def step(self, dt: float, motor_w: float) -> None:
+        """Draw the electronics' and the motor's power for dt seconds."""
+        config = self._config
+        current = (config.electronics_w + motor_w) / max(self.volts, 1.0)
+        self.charge = max(0.0, self.charge - current * dt / 3600 / config.capacity_ah)
+        self._rest = rest_voltage(self.charge)
+        self._slow_sag += (current * config.recovery_resistance - self._slow_sag) * _share(dt, config.recovery_time)
+        self.volts = self._loaded(current)
+        self._filtered += (self.volts - self._filtered) * _share(dt, config.filter_time)
+
+    def _loaded(self, current: float) -> float:
+        if not self.connected:
+            return 0.0
+        return max(0.0, self._rest - current * self._config.resistance - self._slow_sag)
+
+
+def _share(dt: float, time_constant: float) -> float:
+    """Part of a step response after dt."""
+    return 1.0 - exp(-dt / time_constant)

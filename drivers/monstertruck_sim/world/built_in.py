@@ -1,0 +1,183 @@
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, and an open yard."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi, radians, tan
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
+from monstertruck_sim.world.terrain import Profile
+
+RESOLUTION = 0.025
+"""m per cell."""
+_WALL = 0.1
+
+LOOP_LENGTH, LOOP_WIDTH, LOOP_RADIUS = 4.6, 3.4, 1.0
+"""Rounded rectangle of the lap: 14.28 m, 71 s at 0.2 m/s."""
+LOOP_CORRIDOR = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltIn:
+    """A world: map, start pose (x, y, yaw) and the ground's profile where it is not level."""
+
+    map: WorldMap
+    start: tuple[float, float, float]
+    profile: Profile | None = None
+
+
+class _Canvas:
+    """Free space on solid rock, drawn in metres; finally only a skin of the rock is kept as wall.
+
+    Args:
+        x: lower and upper bound, m.
+        y: the same.
+    """
+
+    def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
+        self._origin = (x[0], y[0])
+        columns, rows = round((x[1] - x[0]) / RESOLUTION), round((y[1] - y[0]) / RESOLUTION)
+        self.xs = x[0] + (np.arange(columns) + 0.5) * RESOLUTION
+        self.ys = (y[0] + (np.arange(rows) + 0.5) * RESOLUTION)[:, None]
+        self.free = np.zeros((rows, columns), dtype=np.bool_)
+
+    def rectangle(self, x0: float, y0: float, x1: float, y1: float) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = (self.xs > x0) & (self.xs < x1) & (self.ys > y0) & (self.ys < y1)
+        return inside
+
+    def disc(self, x: float, y: float, radius: float) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = (self.xs - x) ** 2 + (self.ys - y) ** 2 < radius**2
+        return inside
+
+    def map(self) -> WorldMap:
+        skin = (
+            binary_dilation(self.free, np.ones((3, 3), dtype=np.bool_), iterations=round(_WALL / RESOLUTION))
+            & ~self.free
+        )
+        cells = np.full(self.free.shape, UNKNOWN, dtype=np.int8)
+        cells[self.free] = FREE
+        cells[skin] = OCCUPIED
+        return WorldMap(cells, RESOLUTION, self._origin)
+
+
+def loop() -> BuiltIn:
+    """A corridor 1.2 m wide round a block, with niches, posts and boxes for the scan to hold on to."""
+    canvas = _Canvas((-3.4, 3.4), (-2.8, 2.8))
+    dx = np.maximum(abs(canvas.xs) - (LOOP_LENGTH / 2 - LOOP_RADIUS), 0)
+    dy = np.maximum(abs(canvas.ys) - (LOOP_WIDTH / 2 - LOOP_RADIUS), 0)
+    # Inside the straight core the distance to the rounded rectangle does not matter: the block stands there.
+    canvas.free = abs(np.hypot(dx, dy) - LOOP_RADIUS) < LOOP_CORRIDOR / 2
+    for niche in ((1.6, 2.2, 2.9, 2.45), (-1.3, 2.2, -0.4, 2.5), (-0.2, -2.6, 0.5, -2.2), (2.8, -0.5, 3.2, 0.2)):
+        canvas.free |= canvas.rectangle(*niche)
+    for corner in ((2.2, -2.25, 2.85, -1.6), (-2.85, -2.3, -2.2, -1.6), (-2.8, 1.6, -2.2, 2.2)):
+        canvas.free |= canvas.rectangle(*corner)
+    for box in ((-1.2, -2.4, -0.95, -2.18), (0.9, 2.18, 1.15, 2.4), (-3.0, 0.2, -2.78, 0.55), (1.0, -1.15, 1.3, -1.02)):
+        canvas.free &= ~canvas.rectangle(*box)
+    for post in ((-1.0, 1.1, 0.12), (1.75, 0.3, 0.08), (2.82, -1.1, 0.1)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (0.0, -LOOP_WIDTH / 2, 0.0))
+
+
+def rooms() -> BuiltIn:
+    """Four rooms and a hall, doors 0.9 m wide, some furniture: 10 m x 8 m."""
+    canvas = _Canvas((0.0, 10.0), (0.0, 8.0))
+    for room in ((0.3, 0.3, 4.6, 3.0), (4.8, 0.3, 9.7, 3.0), (0.3, 4.9, 5.4, 7.7), (5.6, 4.9, 9.7, 7.7)):
+        canvas.free |= canvas.rectangle(*room)
+    canvas.free |= canvas.rectangle(0.3, 3.2, 9.7, 4.7)
+    for door in ((2.0, 2.9, 2.9, 3.3), (7.2, 2.9, 8.1, 3.3), (3.4, 4.6, 4.3, 5.0), (6.4, 4.6, 7.3, 5.0)):
+        canvas.free |= canvas.rectangle(*door)
+    canvas.free |= canvas.rectangle(5.3, 6.2, 5.7, 7.1)
+    for box in ((0.3, 0.3, 1.1, 0.9), (3.6, 1.8, 4.6, 2.3), (8.9, 0.3, 9.7, 1.5), (1.4, 6.3, 2.3, 6.9)):
+        canvas.free &= ~canvas.rectangle(*box)
+    for post in ((6.0, 1.6, 0.15), (8.2, 6.5, 0.3), (9.2, 4.0, 0.1)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (1.0, 3.95, 0.0))
+
+
+def corridor_maze() -> BuiltIn:
+    """Corridors 1.05 m wide on a 7 x 5 lattice of 1.4 m: a seeded tree with a few loops."""
+    columns, rows, pitch, half = 7, 5, 1.4, 0.525
+    canvas = _Canvas((-1.0, (columns - 1) * pitch + 1.0), (-1.0, (rows - 1) * pitch + 1.0))
+    rng = np.random.default_rng(7)
+    edges = [((c, r), (c + 1, r)) for c in range(columns - 1) for r in range(rows)]
+    edges += [((c, r), (c, r + 1)) for c in range(columns) for r in range(rows - 1)]
+    group = {(c, r): (c, r) for c in range(columns) for r in range(rows)}
+    for index in rng.permutation(len(edges)):
+        a, b = edges[index]
+        if group[a] == group[b] and rng.random() > 0.2:
+            continue
+        merged, kept = group[a], group[b]
+        group = {node: kept if root == merged else root for node, root in group.items()}
+        canvas.free |= canvas.rectangle(
+            a[0] * pitch - half, a[1] * pitch - half, b[0] * pitch + half, b[1] * pitch + half
+        )
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
+def ramp() -> BuiltIn:
+    """A hall 9 m long: level, 8 degrees up, a landing, 12 degrees down, level."""
+    canvas = _Canvas((-1.3, 8.3), (-1.5, 1.5))
+    canvas.free = canvas.rectangle(-1.0, -1.2, 8.0, 1.2) & ~canvas.disc(3.9, 1.2, 0.25) & ~canvas.disc(6.6, -1.2, 0.2)
+    up, down = 1.5 * tan(radians(8)), 1.0 * tan(radians(12))
+    points = ((1.0, 0.0), (2.5, up), (4.5, up), (5.5, up - down), (6.0, up - down))
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0), Profile(tuple((x, round(z, 4)) for x, z in points)))
+
+
+def yard() -> BuiltIn:
+    """Open level floor, 7 m x 7 m, for calibration drives: a few posts and niches along the walls only."""
+    canvas = _Canvas((-4.0, 4.0), (-4.0, 4.0))
+    canvas.free = canvas.rectangle(-3.5, -3.5, 3.5, 3.5)
+    for niche in ((3.4, -1.0, 3.8, 0.2), (-2.0, 3.4, -0.8, 3.75), (-3.7, 0.5, -3.4, 2.0)):
+        canvas.free |= canvas.rectangle(*niche)
+    for post in ((3.0, 2.6, 0.15), (-2.9, -2.4, 0.2), (0.8, -3.1, 0.12)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
+BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
+    "loop": loop,
+    "rooms": rooms,
+    "corridor_maze": corridor_maze,
+    "ramp": ramp,
+    "yard": yard,
+}
+
+
+def lap(spacing: float = 0.05) -> NDArray[np.float64]:
+    """The drawn lap of ``loop``, counter-clockwise from its start pose and back to it.
+
+    Args:
+        spacing: wanted distance of the points, m; the true one divides the lap evenly.
+
+    Returns:
+        (n, 3): x, y (m) and heading (rad, in (-pi, pi]) in the map frame; the last row repeats the first.
+    """
+    half_x, half_y, radius = LOOP_LENGTH / 2 - LOOP_RADIUS, LOOP_WIDTH / 2 - LOOP_RADIUS, LOOP_RADIUS
+    arc = radius * pi / 2
+    # (length, turn) of every piece, from the middle of the lower side.
+    pieces = [(half_x, 0), (arc, 1), (2 * half_y, 0), (arc, 1), (2 * half_x, 0), (arc, 1), (2 * half_y, 0), (arc, 1)]
+    pieces.append((half_x, 0))
+    count = round(sum(length for length, _ in pieces) / spacing)
+    stations = np.linspace(0.0, sum(length for length, _ in pieces), count + 1)
+    points = np.empty((count + 1, 3))
+    begun, x, y, yaw = 0.0, 0.0, -LOOP_WIDTH / 2, 0.0
+    for length, turn in pieces:
+        mine = (stations >= begun - 1e-9) & (stations <= begun + length + 1e-9)
+        along = stations[mine] - begun
+        points[mine] = np.stack(_along(x, y, yaw, along, turn / radius), axis=1)
+        x, y, yaw = (float(v[0]) for v in _along(x, y, yaw, np.array([length]), turn / radius))
+        begun += length
+    points[:, 2] = pi - (pi - points[:, 2]) % (2 * pi)
+    points[-1] = points[0]
+    return points
+
+
+def _along(
+    x: float, y: float, yaw: float, s: NDArray[np.float64], curvature: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    half = s * curvature / 2
+    chord = s * np.sinc(half / pi)
+    return x + chord * np.cos(yaw + half), y + chord * np.sin(yaw + half), yaw + 2 * half

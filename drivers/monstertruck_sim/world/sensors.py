@@ -1,0 +1,242 @@
+"""What the devices' sensing elements feel: the physics behind the emulators."""
+
+from collections.abc import Callable
+from math import atan2, cos, degrees, pi, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.base import CompassReading, JointSource, MotorReading, PulseSource
+from monstertruck_sim.world.config import BatteryConfig, CameraConfig, CompassConfig, LidarConfig, MotorConfig
+from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
+from monstertruck_sim.world.truck_plant import TruckPlant
+
+STEPS = 769
+SWEEP_NS = 100_000_000
+NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
+"""Error codes of the scanner: nothing there; other error (never "free"); step cannot be measured."""
+_STEP_ANGLE = 2 * pi / 1024
+_BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
+_BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
+_LEVEL = 1e-4
+
+Vector = tuple[float, float, float]
+Beams = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Directions: components x, y, z, each (n,)."""
+Caster = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float], NDArray[np.float64]]
+"""Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing."""
+
+
+class SimulatedLidar:
+    """``RangeSource``: every beam leaves from where the truck is at that beam's instant.
+
+    Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
+    as a maker's accuracy covers nearly all readings. A tilted beam meets level ground or passes over walls of finite
+    height; walls are upright and the ground is taken as level around the truck. Joints of a mount turn it about its own
+    centre.
+    """
+
+    def __init__(self, plant: TruckPlant, cast: Caster, config: LidarConfig, seed: int | None) -> None:
+        self.joints: JointSource | None = None
+        self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
+        self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
+        """Steps that never measure."""
+
+    def scan(self, time_ns: int) -> NDArray[np.int32]:
+        """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
+
+        Ask once it is over (within half a second) for exact poses; asked earlier, the truck's motion during the
+        sweep is extrapolated.
+        """
+        self._plant.advance(time_ns)
+        times = time_ns + _BEAM_DELAYS
+        poses = self._plant.poses(times)
+        x, y, yaw, pitch, roll = poses
+        xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
+        if self.joints is None and np.abs(poses[3:]).max() < _LEVEL:
+            ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range)
+        else:
+            beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
+            if self.joints is not None:
+                beams = _turned(beams, *self.joints.angles(times))
+            ranges = self._tilted(xs, ys, yaw, _turned(beams, pitch, roll))
+        return self._measure(ranges, time_ns)
+
+    def _tilted(
+        self, xs: NDArray[np.float64], ys: NDArray[np.float64], yaw: NDArray[np.float64], beams: Beams
+    ) -> NDArray[np.float64]:
+        """Ranges along beams whose directions are given in the truck's level frame."""
+        config = self._config
+        forward, left, up = beams
+        level = np.hypot(forward, left)
+        ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), config.max_range) / level
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ground = np.where(up < 0, config.height / -up, np.inf)
+            ranges[config.height + ranges * up > config.wall_height] = np.inf
+        nearest: NDArray[np.float64] = np.minimum(ranges, ground)
+        return nearest
+
+    def _measure(self, ranges: NDArray[np.float64], time_ns: int) -> NDArray[np.int32]:
+        config = self._config
+        lost = self._lost
+        if self._seed is not None:
+            noise = generator(self._seed, LIDAR, self._plant.slot(time_ns, SWEEP_NS // 2))
+            sigma = np.maximum(0.01, 0.01 * ranges) / config.accuracy_sigmas
+            sigma[np.isinf(sigma)] = 0.0
+            ranges = ranges + sigma * noise.standard_normal(STEPS)
+            lost = self._lost | (noise.random(STEPS) < config.dropout)
+        seen = ranges <= config.max_range
+        millimetres: NDArray[np.int32] = np.rint(np.where(seen, ranges, 0.0) * 1000).astype(np.int32)
+        millimetres[seen & (ranges < config.min_range)] = TOO_NEAR
+        millimetres[~seen] = NO_RETURN
+        millimetres[lost] = FAILED
+        return millimetres
+
+
+class SimulatedView:
+    """``ViewSource``: what stands around the camera, which looks forward and stays level."""
+
+    def __init__(self, plant: TruckPlant, cast: Caster, config: CameraConfig) -> None:
+        self._plant, self._cast, self._config = plant, cast, config
+
+    def ranges(self, time_ns: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
+        self._plant.advance(time_ns)
+        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
+        ahead = self._config.x
+        xs, ys = np.full(len(angles), x + ahead * cos(yaw)), np.full(len(angles), y + ahead * sin(yaw))
+        return self._cast(xs, ys, yaw + angles, self._config.reach)
+
+
+class SimulatedMotor:
+    """``MotorPlant``: one of the driven shafts in the controller's own sign."""
+
+    def __init__(self, plant: TruckPlant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
+        self._plant, self._config, self._shaft = plant, config, shaft
+        self._noise = WhiteNoise(seed, CURRENT, 1 + shaft) if seed is not None else None
+        self._sign = -1.0 if config.inverted else 1.0
+
+    def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
+        """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
+        self._plant.advance(time_ns)
+        self._plant.shafts[self._shaft].command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
+
+    def reading(self, time_ns: int) -> MotorReading:
+        """State at ``time_ns``."""
+        self._plant.advance(time_ns)
+        shaft, current = self._plant.shafts[self._shaft], self._plant.currents[self._shaft]
+        if self._noise is not None:
+            current += self._config.current_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[self._shaft]
+        return MotorReading(
+            turns=self._sign * shaft.turns,
+            rpm=self._sign * shaft.rpm,
+            demand_rpm=self._sign * shaft.demand_rpm,
+            current_ma=self._sign * current * 1000,
+            supply_v=self._plant.battery.volts,
+        )
+
+
+class SimulatedServos:
+    """``ServoPlant``: both steering servos, and the battery at the analog input."""
+
+    def __init__(self, plant: TruckPlant, config: BatteryConfig, seed: int | None) -> None:
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, ANALOG) if seed is not None else None
+
+    def attach(self, pulses: PulseSource) -> None:
+        """Name the controller whose pulses move the servos."""
+        self._plant.pulses = pulses
+
+    def advance(self, time_ns: int) -> None:
+        """Let the servos follow their pulses up to ``time_ns``."""
+        self._plant.advance(time_ns)
+
+    def analog_volts(self, channel: int, time_ns: int) -> float:
+        """Voltage at an analog input; 0 at all but the battery's."""
+        if channel != self._config.channel:
+            return 0.0
+        self._plant.advance(time_ns)
+        volts = self._plant.battery.analog_volts
+        if self._noise is not None:
+            volts += self._config.analog_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[0]
+        return max(0.0, volts)
+
+
+class SimulatedCompass:
+    """``AttitudeSource``: a magnetometer and an accelerometer on the body, axes x forward, y left, z up.
+
+    The level field is turned by the deviation curve and by noise, tilted with the body, distorted by the truck's iron
+    and by the motor's current; the heading is what a tilt compensation makes of that field, so both agree.
+    """
+
+    def __init__(self, plant: TruckPlant, config: CompassConfig, seed: int | None) -> None:
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, COMPASS, 3) if seed is not None else None
+        self._phases, self._bias = [0.0, 0.0], [0.0, 0.0]
+        self._deviation = 0.0
+        if seed is not None:
+            fixed = generator(seed, COMPASS_FIXED)
+            self._phases = fixed.uniform(0, 2 * pi, 2).tolist()
+            self._bias = (radians(config.tilt_bias_deg) * fixed.uniform(-1, 1, 2)).tolist()
+            self._deviation = radians(config.deviation_deg)
+
+    def deviation(self, heading: float) -> float:
+        """Fixed heading error, rad: a one-cycle and a two-cycle wave, together at most the configured amplitude."""
+        one, two = heading + self._phases[0], 2 * heading + self._phases[1]
+        return self._deviation * (0.6 * sin(one) + 0.4 * sin(two))
+
+    def compass(self, time_ns: int) -> CompassReading:
+        """Reading at ``time_ns``."""
+        self._plant.advance(time_ns)
+        config = self._config
+        noise = [0.0, 0.0, 0.0]
+        if self._noise is not None:
+            sigma = radians(config.noise_deg)
+            noise = [sigma * value for value in self._noise.at(self._plant.slot(time_ns, 10_000_000))]
+        pitch, roll = self._plant.attitude
+        heading = config.north_yaw - self._plant.yaw
+        heading += self.deviation(heading) + noise[0]
+        level = (config.horizontal_field * cos(heading), config.horizontal_field * sin(heading), config.vertical_field)
+        field = self._distorted(_to_body(level, pitch, roll))
+        x, y, _ = _to_level(field, pitch, roll)
+        pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
+        return CompassReading(
+            heading_deg=degrees(atan2(y, x)) % 360.0,
+            pitch_deg=-degrees(pitch),
+            roll_deg=degrees(roll),
+            temperature_c=config.temperature_c,
+            field=field,
+            acceleration=_to_body((0.0, 0.0, 1.0), pitch, roll),
+        )
+
+    def _distorted(self, field: Vector) -> Vector:
+        iron = self._config.iron
+        return (
+            iron.soft_x * field[0] + iron.soft_xy * field[1] + iron.hard_x,
+            iron.soft_xy * field[0]
+            + iron.soft_y * field[1]
+            + iron.hard_y
+            + self._config.motor_field * self._plant.current,
+            iron.soft_z * field[2] + iron.hard_z,
+        )
+
+
+def _turned(beams: Beams, pitch: NDArray[np.float64], roll: NDArray[np.float64]) -> Beams:
+    """``_to_level`` for many vectors, each turned by angles of its own."""
+    x, y, z = beams
+    y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
+    return np.cos(pitch) * x + np.sin(pitch) * z, y, np.cos(pitch) * z - np.sin(pitch) * x
+
+
+def _to_body(v: Vector, pitch: float, roll: float) -> Vector:
+    """A vector of the level frame in the body frame: Rx(-roll) Ry(-pitch) v."""
+    x = cos(pitch) * v[0] - sin(pitch) * v[2]
+    z = sin(pitch) * v[0] + cos(pitch) * v[2]
+    return x, cos(roll) * v[1] + sin(roll) * z, cos(roll) * z - sin(roll) * v[1]
+
+
+def _to_level(v: Vector, pitch: float, roll: float) -> Vector:
+    """Inverse of ``_to_body``."""
+    y = cos(roll) * v[1] - sin(roll) * v[2]
+    z = sin(roll) * v[1] + cos(roll) * v[2]
+    return cos(pitch) * v[0] + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * v[0]

@@ -1,0 +1,1 @@
+"""Builds what a configuration describes and connects it to the bus."""

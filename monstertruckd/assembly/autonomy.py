@@ -1,0 +1,225 @@
+"""Builds what thinks: estimation and planners of a configuration, each with its ends of the bus."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.fusion.service import FusionService
+from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryService
+from monstertruck_estimation.slam.service import SlamService
+from monstertruck_estimation.transforms import TransformService, compose, invert, mount
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.behave.stabiliser import StabiliserService
+from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.paths import PathService, load_path
+from monstertruck_planners.track.placed import TARGET, PlacedTracker
+from monstertruck_planners.track.service import TrackerService
+from monstertruck_planners.track.step import TrackSetup
+from monstertruck_runtime.actors.placement import Places
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import Publisher, Subscription
+from monstertruck_runtime.service import Service
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.topics import DRIVES, Writer
+from monstertruckd.assembly.goals import build_goals
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.recorder.picture import MapService
+
+SCANS: Final = 16
+"""Scans that may wait for the estimation worker."""
+ODOMETRIES: Final = 256
+"""Poses and angles that may wait for a scan."""
+STEP_DEADLINE: Final = 5.0
+"""Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
+SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The robot's kinematics and outline, shared by gate, estimation and planners."""
+
+    chassis: Chassis
+    footprint: Footprint
+    points: ScanPoints
+    """Of the newest scan."""
+
+    @classmethod
+    def of(cls, config: TruckConfig) -> Self:
+        """Of a configured robot."""
+        lidar = config.devices.lidar
+        points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
+        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points)
+
+
+def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+    """Transforms always; odometry where the robot can drive and steer."""
+    mounts = {
+        role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
+        for role, m in ((role, device.mount) for role, device in config.devices.present().items())
+        if role in SENSOR_FRAMES
+    }
+    joints = mounts.pop("stabiliser", None)
+    if joints is not None and "lidar" in mounts:
+        mounts["lidar"] = compose(invert(joints), mounts["lidar"])
+    slam = _build_slam(config, bus, clock)
+    yield TransformService(
+        list(mounts.values()),
+        clock,
+        bus.subscribe(topics.ODOMETRY, latest()),
+        bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION),
+        joints=None if joints is None else (joints, bus.subscribe(topics.STABILISER, latest())),
+        localised=tuple if slam is None else slam.frames,
+    )
+    if slam is not None:
+        yield slam
+    if config.missing_actuators() is not None:
+        return
+    yield _build_odometry(config, bus, clock, body.chassis)
+
+
+def _build_odometry(config: TruckConfig, bus: Bus, clock: Clock, chassis: Chassis) -> OdometryService:
+    odometry = config.odometry
+    ends: dict[str, Any] = {
+        "drives": [bus.subscribe(topic, latest()) for topic in DRIVES[: len(chassis.shafts)]],
+        "steering": bus.subscribe(topics.STEERING, latest()) if chassis.linkage is not None else None,
+        "compass": bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
+        "odometry": bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
+        "pose": bus.publisher(topics.POSE, Writer.ESTIMATION) if config.slam is None else None,
+        "rate": odometry.rate,
+    }
+    if isinstance(odometry, OdometryConfig):
+        return OdometryService(DeadReckoning(odometry, chassis), clock, **ends)
+    used = config.slam is not None and odometry.scans is not None
+    scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if used else None
+    health = bus.publisher(topics.FUSION, Writer.ESTIMATION)
+    return FusionService(Fusion(odometry, chassis), clock, scans=scans, health=health, events=bus.event_sink(), **ends)
+
+
+def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
+    devices = config.devices
+    if config.slam is None or devices.lidar is None:
+        return None
+    return SlamService(
+        config.slam,
+        devices.lidar.mount,
+        clock,
+        scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
+        odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
+        compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)) if devices.compass is not None else None,
+        joints=bus.subscribe(topics.STABILISER, fifo(ODOMETRIES)) if devices.stabiliser is not None else None,
+        pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+        whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
+        tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),
+        motion=bus.publisher(topics.SCAN_MOTION, Writer.ESTIMATION),
+        health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
+        events=bus.event_sink(),
+    )
+
+
+def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, places: Places) -> Iterator[Service]:
+    """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
+    if config.tracker is not None:
+        paths, wishes = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
+        frame = "odom" if config.slam is None else "map"
+        drawn = None
+        if config.path is not None:
+            drawn = load_path(config.path.file, closed=config.path.closed, frame=frame)
+        yield PathService(
+            drawn,
+            clock,
+            bus.subscribe(topics.REQ_PATH, fifo(4)),
+            bus.subscribe(topics.GATE, latest()),
+            paths,
+            bus.event_sink(),
+            config.gate.max_request_age,
+        )
+        yield _build_tracker(config, config.tracker, bus, clock, body, wishes, places)
+        if config.planner is not None:
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes, places)
+    if config.devices.stabiliser is not None and config.devices.compass is not None:
+        yield StabiliserService(
+            config.levelling,
+            clock,
+            bus.subscribe(topics.COMPASS, latest()),
+            bus.publisher(topics.PLAN_STABILISER, Writer.PLANNER),
+        )
+    if config.map is not None and config.devices.lidar is not None:
+        yield MapService(
+            config.map,
+            config.devices.lidar.mount,
+            clock,
+            scan=bus.subscribe(topics.SCAN, latest()),
+            pose=bus.subscribe(topics.POSE, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            tracker=bus.subscribe(topics.TRACKER, fifo(256)),
+            events=bus.event_sink(),
+        )
+
+
+def _build_tracker(
+    config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, wishes: Publisher[DriveRequest],
+    places: Places,
+) -> Service:  # fmt: skip
+    lidar, placement = config.devices.lidar, config.placement.tracker
+    inputs: dict[str, Subscription[Any]] = {
+        "pose": bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
+        "path": bus.subscribe(topics.PATH, latest()),
+        "gate": bus.subscribe(topics.GATE, latest()),
+    }
+    if lidar is not None:
+        inputs["scan"] = bus.subscribe(topics.SCAN, latest())
+    if config.devices.compass is not None:
+        inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
+    told, events = bus.publisher(topics.TRACKER, Writer.PLANNER), bus.event_sink()
+    if placement != "loop":
+        setup = TrackSetup(
+            tracker,
+            body.chassis.bicycle,
+            body.footprint,
+            body.points.mount,
+            scan="scan" in inputs,
+            attitude="attitude" in inputs,
+        )
+        actor = places.actor(placement, "tracking", TARGET, latency=0.0, deadline=STEP_DEADLINE)
+        return PlacedTracker(setup, clock, actor, inputs=inputs, drive=wishes, tracker=told, events=events)
+    return TrackerService(
+        tracker,
+        clock,
+        steering=body.chassis.bicycle,
+        footprint=body.footprint,
+        points=body.points,
+        pose=inputs["pose"],
+        path=inputs["path"],
+        gate=inputs["gate"],
+        scan=inputs.get("scan"),
+        attitude=inputs.get("attitude"),
+        drive=wishes,
+        tracker=told,
+        events=events,
+    )
+
+
+def calibration(config: TruckConfig, chassis: Chassis, tree: Tree | None = None) -> dict[str, Any]:
+    """Everything that was measured on this very truck, and the file it comes from, for the log."""
+    devices = config.devices
+    values: dict[str, Any] = {
+        "file": None if tree is None or tree.calibration is None else str(tree.calibration),
+        "wheel_radius_m": config.geometry.wheel_radius,
+        "drive_ratio": config.geometry.drive_ratio,
+        "linkage": None if chassis.linkage is None else dataclasses.asdict(chassis.linkage),
+        "mounts": {role: device.mount.model_dump() for role, device in devices.present().items()},
+    }
+    values |= {f"{role}_inverted": device.driver.inverted for role, device in devices.shafts().items()}
+    if devices.steering is not None:
+        steering = devices.steering.driver
+        values |= {"front_servo": steering.front.model_dump(), "rear_servo": steering.rear.model_dump()}
+        if steering.battery is not None:
+            values["battery"] = steering.battery.model_dump()
+    return values

@@ -1,0 +1,1 @@
+"""Calibration files: written by the calibration commands, laid over the configuration."""

@@ -1,0 +1,108 @@
+"""The daemon's side: it alone writes the calibration, where its user may, and tells which file it runs on."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from pydantic import ValidationError
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.ports import EventSink
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.config.calibration.apply import store_of, with_values
+from monstertruckd.config.calibration.record import Result, WizardName
+from monstertruckd.config.truck import TruckConfig
+
+SHOW: Final = "calibration"
+SAVE: Final = "calibration_save"
+UNDO: Final = "calibration_undo"
+
+
+def register(
+    rpc: Rpc,
+    config: TruckConfig,
+    loaded: Path | None,
+    clock: Clock,
+    events: EventSink,
+    offload: Offload,
+    mode: Callable[[], GateMode],
+) -> None:
+    """Serve ``calibration``, ``calibration_save`` and ``calibration_undo``.
+
+    Args:
+        rpc: where.
+        config: the running one, calibration included.
+        loaded: the file it includes.
+        clock: dates the files.
+        events: told of every new file.
+        offload: where files are read and written.
+        mode: the gate's present one; nothing is written while the truck may move.
+    """
+    store = store_of(config)
+
+    def real_time() -> int:
+        return clock.now() + clock.real_offset()
+
+    def tell(path: Path, what: str, by: Any) -> dict[str, Any]:
+        events(Reason.OK, Severity.INFO, "calibration", f"{path}: {what}; counts from the next start", by=str(by))
+        return {"file": str(path)}
+
+    def at_rest() -> None:
+        if mode() not in (GateMode.DISARMED, GateMode.ESTOPPED):
+            raise RequestRefusedError(
+                Reason.BUSY, f"the truck is {mode()}: calibrations are written while it is disarmed"
+            )
+
+    async def show(_: dict[str, Any]) -> dict[str, Any]:
+        def read() -> dict[str, Any]:
+            newest = store.newest()
+            content = None if newest is None else store.load(newest).model_dump(mode="json")
+            return {
+                "folder": str(store.folder),
+                "loaded": None if loaded is None else str(loaded),
+                "newest": None if newest is None else str(newest),
+                "content": content,
+            }
+
+        return await offload(read)
+
+    async def save(payload: dict[str, Any]) -> dict[str, Any]:
+        at_rest()
+        result = _result(payload.get("result"))
+        await offload(lambda: with_values(config, [result], "result"))
+        path = await offload(lambda: store.save(result, real_time()))
+        saved = (await offload(lambda: store.load(path))).results[result.wizard]
+        told = tell(path, f"{result.wizard} calibrated", payload.get("by"))
+        return told | {"result": saved.model_dump(mode="json")}
+
+    async def undo(payload: dict[str, Any]) -> dict[str, Any]:
+        wizard: WizardName | None = next((n for n in get_args(WizardName) if n == payload.get("wizard")), None)
+        if wizard is None:
+            known = ", ".join(get_args(WizardName))
+            raise InputError(f"wizard: expected one of {known}, got {payload.get('wizard')!r}")
+        at_rest()
+        path = await offload(lambda: store.undo(wizard, real_time()))
+        return tell(path, f"calibration of {wizard} undone", payload.get("by"))
+
+    rpc.register(SHOW, show)
+    rpc.register(SAVE, save)
+    rpc.register(UNDO, undo)
+
+
+def _result(payload: Any) -> Result:
+    """A result from outside.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return Result.model_validate_json(json.dumps(payload))
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        raise InputError(f"result: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error

@@ -1,1 +1,0 @@
-"""Goals in the daemon: requests in, routes planned and deformed elsewhere, paths out."""

@@ -1,0 +1,1 @@
+"""What the computer and its init system see of the daemon: health, logging, notifications, stalls."""

@@ -1,0 +1,107 @@
+"""Log records as messages: what the daemon logs is on ``event/log``, in the log and in the black box."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import Publisher
+from monstertruck_runtime.threads import ThreadHop
+from monstertruck_schemas.event import LogLevel, LogRecord
+from monstertruckd.host.logging_queue import shown
+
+DEPTH: Final = 256
+"""Records on their way to the loop; beyond that the oldest of the lowest level is lost and counted."""
+
+_LEVELS: Final = (
+    (logging.CRITICAL, LogLevel.FATAL),
+    (logging.ERROR, LogLevel.ERROR),
+    (logging.WARNING, LogLevel.WARNING),
+    (logging.INFO, LogLevel.INFO),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A record, as it was when it was logged."""
+
+    stamp: int
+    level: int
+    name: str
+    text: str
+    file: str
+    line: int
+
+
+class Journal(logging.Handler):
+    """Takes records in any thread and publishes them on the loop, one a turn, by the daemon's clock.
+
+    What is logged while one is being published is left out here: it may be about just that, and would never end.
+
+    Args:
+        clock: time; must be readable from any thread, as the wall clock is.
+        out: ``event/log``.
+        on_loss: told how many records did not fit.
+        reproducible: for the virtual clock: only what the loop's own thread logs, as other threads run beside its time.
+    """
+
+    def __init__(
+        self, clock: Clock, out: Publisher[LogRecord], on_loss: Callable[[int], None], *, reproducible: bool
+    ) -> None:
+        super().__init__()
+        self._clock = clock
+        self._out = out
+        self._loop_thread = threading.get_ident()
+        self._reproducible = reproducible
+        self._publishing = False
+        self._hop: ThreadHop[_Line] = ThreadHop(self._publish, DEPTH, on_loss, rank=lambda line: line.level)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue the record; never waits."""
+        here = threading.get_ident() == self._loop_thread
+        if (here and self._publishing) or (self._reproducible and not here):
+            return
+        text = shown(self.format(record))
+        name = Path(record.pathname).name
+        self._hop.put(_Line(self._clock.now(), record.levelno, record.name, text, name, record.lineno))
+
+    def end(self) -> None:
+        """Discard what waits and everything to come; on the loop."""
+        self._hop.close()
+
+    def _publish(self, line: _Line) -> None:
+        self._publishing = True
+        try:
+            self._out.put(
+                LogRecord(
+                    stamp=line.stamp,
+                    received=self._clock.now(),
+                    seq=self._out.next_seq(),
+                    level=next((name for level, name in _LEVELS if line.level >= level), LogLevel.DEBUG),
+                    name=line.name,
+                    text=line.text,
+                    file=line.file,
+                    line=line.line,
+                )
+            )
+        finally:
+            self._publishing = False
+
+
+@contextmanager
+def published(
+    clock: Clock, out: Publisher[LogRecord], on_loss: Callable[[int], None], *, reproducible: bool
+) -> Iterator[None]:
+    """All logging goes to ``out`` as well while the context lasts; see ``Journal``."""
+    journal = Journal(clock, out, on_loss, reproducible=reproducible)
+    root = logging.getLogger()
+    root.addHandler(journal)
+    try:
+        yield
+    finally:
+        root.removeHandler(journal)
+        journal.end()

@@ -1,5 +1,0 @@
-"""``log report``: a run on one HTML page that needs nothing but itself."""
-
-from monstertruckd.logs.report.page import Report, report
-
-__all__ = ["Report", "report"]

@@ -1,0 +1,119 @@
+"""The picture of the path over the scan map: feeds the renderer's worker, saves what it draws."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from monstertruck_planners.collision import scan_points
+from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Ready, Subscription
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Odometry
+from monstertruckd.config.truck import MapRender, Mount
+
+TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
+SPACING = 0.02
+"""Metres between two remembered poses of the driven path, at first."""
+REMEMBERED = 2000
+"""Poses after which every other one is forgotten and the spacing doubles."""
+
+
+class MapService:
+    """One scan per period goes to the worker; the picture is saved whenever a path has come to its end.
+
+    Args:
+        config: periods, deadline, file.
+        mount: of the lidar.
+        clock: time.
+        scan: lidar.
+        pose: pose in map.
+        path: path being tracked.
+        tracker: progress on it.
+        events: where the end of a picture is told.
+    """
+
+    name = "map"
+
+    def __init__(
+        self,
+        config: MapRender,
+        mount: Mount,
+        clock: Clock,
+        *,
+        scan: Subscription[LaserScan],
+        pose: Subscription[Odometry],
+        path: Subscription[Path],
+        tracker: Mailbox[TrackerState],
+        events: EventSink,
+    ) -> None:
+        self._config = config
+        self._mount = mount.planar
+        self._clock = clock
+        self._scan = scan
+        self._pose = pose
+        self._path = path
+        self._tracker = tracker
+        self._events = events
+        self._driven: list[tuple[float, float, float]] = []
+        self._spacing = SPACING
+        self._before = Reason.DRIVING
+
+    async def run(self, ready: Ready) -> None:
+        """Feed the worker until cancelled.
+
+        Raises:
+            WorkerError: the worker failed, hung or died; the next session starts an empty map.
+        """
+        worker = WorkerActor("map", TARGET, self._clock, latency=self._config.latency, deadline=self._config.deadline)
+        async with worker:
+            await worker.start()
+            ready()
+            while True:
+                await self._clock.sleep(self._config.period)
+                scans = self._new_scan()
+                ended = self._ended()
+                if self._config.picture is not None and ended is not None:
+                    file = str(self._config.picture)
+                    outputs = await worker.step({"scans": scans, "render": self._picture(ended), "file": file})
+                    if (error := outputs.get("error")) is not None:
+                        self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"picture not saved: {error}")
+                elif scans:
+                    await worker.step({"scans": scans})
+
+    def _ended(self) -> TrackerState | None:
+        """The state in which a path came to its end since the last look, however briefly it was reported."""
+        ended = None
+        for state in self._tracker.drain():
+            if state.outcome is not Reason.DRIVING and self._before is Reason.DRIVING:
+                ended = state
+            self._before = state.outcome
+        return ended
+
+    def _new_scan(self) -> list[tuple[tuple[float, float, float], Any]]:
+        scan, odometry = self._scan.latest, self._pose.latest
+        if scan is None or odometry is None:
+            return []
+        pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
+        if not self._driven or math.dist(pose[:2], self._driven[-1][:2]) > self._spacing:
+            self._driven.append(pose)
+            if len(self._driven) > REMEMBERED:
+                self._driven = self._driven[::2]
+                self._spacing *= 2
+        if scan.tilt is not None and scan.tilt > self._config.max_tilt:
+            return []
+        return [(pose, scan_points(scan, self._mount))]
+
+    def _picture(self, ended: TrackerState) -> dict[str, Any]:
+        path = self._path.latest
+        paths = [{"name": "driven (estimated)", "style": "driven", "poses": np.array(self._driven).reshape(-1, 3)}]
+        if path is not None:
+            paths.insert(0, {"name": "planned", "style": "planned", "poses": path.poses.reshape(-1, 3)})
+        along = f"{ended.along:.2f} of {ended.length:.2f} m"
+        title = f"Path {path.name if path else ''} over the scan map"
+        return {"title": title, "subtitle": f"{ended.outcome.text}, {along}", "paths": paths}

@@ -1,0 +1,227 @@
+"""Hard and soft iron of the compass from circles driven on level ground.
+
+On level ground the horizontal field of a truck that turns once traces a circle; its iron shifts it (hard iron) and
+makes it an ellipse (soft iron). A flat circle shows no more than that ellipse: neither the vertical iron, nor the
+strength of the field, nor a rotation of the whole (the unit's mounting).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.os4000.config import IronConfig
+from monstertruck_drivers.os4000.iron import level_field
+from monstertruck_kinematics.fitting import Fit, least_squares
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.calibration.record import COMPASS, Estimate, Result
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
+from monstertruckd.tools.calibrate.steps import Move
+from monstertruckd.tools.calibrate.track import Track
+
+Array = NDArray[np.float64]
+
+ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
+
+ANGLE: Final = 0.35
+"""Of both axles, against each other, rad: a circle of 0.44 m."""
+OVERLAP: Final = 1.05
+"""Turns to be driven."""
+TILT: Final = math.radians(0.5)
+"""Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
+LINEARITY: Final = 0.001
+"""Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
+GAP: Final = math.radians(30)
+"""Greatest gap between directions of the field that still is a circle."""
+
+_NAMES: Final = ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """Readings of the driven circles, (n,) each: field in microtesla, tilt in rad, motor current in A."""
+
+    x: Array
+    y: Array
+    z: Array
+    pitch: Array
+    roll: Array
+    current: Array
+    heading: Array
+    """As the unit, or the calibration before, computed it; rad, clockwise."""
+
+    @classmethod
+    def of(cls, tracks: list[Track]) -> "Circle":
+        """What was read while the truck moved.
+
+        Raises:
+            InputError: the compass sends no field.
+        """
+        rows = []
+        for track in tracks:
+            moving = [
+                a for a in track.attitude if track.left < a.stamp < track.arrived and a.magnetic_field is not None
+            ]
+            currents = track.currents_at(np.array([a.stamp for a in moving], dtype=np.float64))
+            for a, current in zip(moving, currents, strict=True):
+                field = a.magnetic_field
+                assert field is not None
+                rows.append((field.x, field.y, field.z, a.pitch, a.roll, current, a.heading))
+        if not rows:
+            raise InputError(
+                "the compass sends no magnetic field: its field mask needs 64 (devices.compass.driver.fields)"
+            )
+        return cls(*np.array(rows).T)
+
+
+@dataclass(frozen=True, slots=True)
+class CompassWizard:
+    """One circle forward, the same one back: what the motor's current adds changes its sign with the direction."""
+
+    speed: float = 0.07
+    """m/s: slowly, for a compass with much iron runs ahead and falls behind by turns, which the gate takes for
+    wheels that do not steer"""
+
+    async def __call__(self, guide: Guide) -> Result:
+        """Measure."""
+        guide.value("devices.compass.driver.rate")
+        guide.say("Motor and computer on, everything mounted as it will drive; phones and keys away from the compass.")
+        await guide.confirm(CLEAR)
+        length = 2 * math.pi / guide.chassis.bicycle.curvature(ANGLE, -ANGLE)
+        full = 2 * math.pi * OVERLAP
+        tracks = [
+            await guide.move(
+                Move(
+                    name,
+                    speed,
+                    ANGLE,
+                    -ANGLE,
+                    metres=1.8 * length,
+                    done=lambda track: abs(track.turned()) > full,
+                )
+            )
+            for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
+        ]
+        return guide.fit("ellipse", lambda: result_of(Circle.of(tracks)))
+
+
+def result_of(circle: Circle) -> Result:
+    """Fit and judge.
+
+    Raises:
+        InputError: no full circle was driven, or the field turns the wrong way round.
+    """
+    fit = fit_ellipse(circle)
+    iron = IronConfig(**dict(zip(_NAMES, _iron(fit.parameters), strict=True)))
+    angle = _angles(circle, iron)
+    _check_coverage(angle)
+    if np.corrcoef(np.diff(np.unwrap(angle)), np.diff(np.unwrap(circle.heading)))[0, 1] < 0:
+        raise InputError(
+            "the field turns against the unit's own heading: its axes are not x forward, y left; mount it otherwise "
+            "(setting E of the unit)"
+        )
+    errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
+    vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)
+    bounds = [vertical if name.startswith("hard") else LINEARITY for name in _NAMES]
+    taken_out = np.degrees(np.abs(_wrapped(circle.heading - angle - _mean_angle(circle.heading - angle))).max())
+    tilt = f"95 % of the readings' noise, and {math.degrees(TILT):g} deg of the unit's tilt error"
+    estimates = [
+        Estimate(
+            name=name,
+            value=value,
+            low=value - error - bound,
+            high=value + error + bound,
+            unit="uT" if name.startswith("hard") else "",
+            samples=circle.x.size,
+            meaning=f"hard iron, unit's own scale; {tilt}"
+            if name.startswith("hard")
+            else f"makes the ellipse a circle, determinant 1; 95 % of the readings' noise, {LINEARITY:.1%} of bend",
+            key=f"{COMPASS}.{name}",
+        )
+        for name, value, error, bound in zip(_NAMES, _iron(fit.parameters), errors, bounds, strict=True)
+    ]
+    estimates.append(
+        Estimate(
+            name="taken_out",
+            value=float(taken_out),
+            unit="deg",
+            samples=circle.x.size,
+            meaning="greatest change of the heading by this calibration, a constant turn left aside",
+        )
+    )
+    return Result(
+        wizard="compass",
+        measured=f"{circle.x.size} readings on a flat circle driven forward and back; residual {fit.rms:.2f} uT",
+        estimates=tuple(estimates),
+        unobserved=(
+            "hard and soft iron along z: on a slope the heading errs by up to (hard_z / horizontal field) x slope",
+            "the strength of the field: all values are in the unit's own scale",
+            "a rotation of the unit on the truck: a constant error of the heading",
+        ),
+    )
+
+
+def fit_ellipse(circle: Circle) -> Fit:
+    """Least squares of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
+
+    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is what the motor's
+    current adds to the field, uT/A.
+    """
+    middle = np.array([(values.max() + values.min()) / 2 for values in (circle.x, circle.y)])
+    radius = max(float(np.ptp(circle.x)), float(np.ptp(circle.y)), 1.0) / 2
+    start = np.array((*middle, 0.0, 0.0, radius, 0.0, 0.0))
+    no_current = float(np.ptp(circle.current)) < 0.05
+    free = np.array((np.inf, np.inf, 0.7, 0.7, np.inf, *((0.0, 0.0) if no_current else (np.inf, np.inf))))
+    lower = np.where(np.isfinite(free), -free, -np.inf)
+
+    def residual(parameters: Array) -> Array:
+        iron = IronConfig(**dict(zip(_NAMES, _iron(parameters), strict=True)))
+        motor_x, motor_y = parameters[5:]
+        field = circle.x - motor_x * circle.current, circle.y - motor_y * circle.current, circle.z
+        forward, left = level_field(field, circle.pitch, circle.roll, iron)
+        return np.asarray(np.hypot(forward, left) - parameters[4])
+
+    return least_squares(residual, start, lower, free)
+
+
+def _iron(parameters: Array) -> tuple[float, ...]:
+    x, y, u, v = (float(value) for value in parameters[:4])
+    w = math.sqrt(1 + v * v)
+    return x, y, w * math.exp(u), v, w * math.exp(-u)
+
+
+def _iron_errors(fit: Fit) -> Array:
+    """Standard errors in the order of ``_NAMES``, by the slopes of ``_iron`` (those of u and v hardly correlate)."""
+    point, errors = fit.parameters[:4], fit.standard_errors[:4]
+    step = 1e-6
+    slopes = np.array(
+        [(np.array(_iron(point + step * row)) - np.array(_iron(point - step * row))) / (2 * step) for row in np.eye(4)]
+    )
+    return np.asarray(np.sqrt((slopes**2).T @ errors**2))
+
+
+def _angles(circle: Circle, iron: IronConfig) -> Array:
+    """Headings by the field with ``iron`` taken out, rad."""
+    forward, left = level_field((circle.x, circle.y, circle.z), circle.pitch, circle.roll, iron)
+    return np.asarray(np.arctan2(left, forward))
+
+
+def _check_coverage(angles: Array) -> None:
+    around = np.sort(angles)
+    gap = float(max(np.diff(around).max(), around[0] + 2 * math.pi - around[-1]))
+    if gap > GAP:
+        raise InputError(
+            f"the truck has not turned all the way round: {math.degrees(gap):.0f} deg of the circle are missing; "
+            "calibrate the steering's directions first"
+        )
+
+
+def _wrapped(angles: Array) -> Array:
+    return np.asarray((angles + math.pi) % (2 * math.pi) - math.pi)
+
+
+def _mean_angle(angles: Array) -> float:
+    return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))

@@ -1,0 +1,181 @@
+"""Sign and ratio of the drive from taped distances.
+
+Only turns of the motor per metre over the floor can be seen: gear ratio and wheel radius never show apart. So the
+radius stays as configured, and the ratio is the one that makes the odometer right with it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.calibration.record import Estimate, Result
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
+from monstertruckd.tools.calibrate.steps import Confirm, Move, Number
+from monstertruckd.tools.calibrate.track import Track
+
+RATIO: Final = "geometry.drive_ratio"
+INVERTED: Final = "devices.drive.driver.inverted"
+ROOM: Final = "a straight of 3 m (half a metre of it behind the truck), 1 m wide, level"
+
+TAPE_SCALE: Final = 0.0005
+"""Share by which a class II tape may be wrong, its sag included."""
+SLIP: Final = 0.003
+"""Share that rolling slip may differ by on another floor."""
+BENT: Final = 0.35
+"""Turn in one run, rad, beyond which a straight tape measures nothing useful."""
+APART: Final = 0.03
+"""Share by which two runs may differ before one of them must be a slip of the pen."""
+
+_FORWARD: Final = Confirm("forward", "Did the truck roll FORWARD, lidar first?", fact=True)
+_MARK: Final = Confirm("mark", "Mark the floor straight below the middle of the front bumper. Done?")
+_DISTANCE: Final = Number(
+    "distance", "Distance from that mark to below the middle of the front bumper now, m", 0.2, 20.0
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveWizard:
+    """Sign, then several runs forward and back."""
+
+    runs: int = 4
+    """Taped distances; at least 3"""
+    metres: float = 2.0
+    """Length of a run"""
+    tape_error: float = 0.002
+    """Standard deviation of one reading of the tape, m; a run has two, at its mark and at its end"""
+    speed: float = 0.15
+
+    sign_only: bool = False
+    """End once it is clear where forward is"""
+
+    async def __call__(self, guide: Guide) -> Result:
+        """Measure."""
+        inverted = bool(guide.value(INVERTED))
+        await guide.confirm(CLEAR)
+        await guide.move(Move("a hand's breadth, to see where forward is", 0.06, metres=0.15))
+        if not await guide.confirm(_FORWARD):
+            return self._reversed(inverted)
+        if self.sign_only:
+            return Result(
+                wizard="drive",
+                measured="the truck was told to roll forward, and did",
+                estimates=(_sign(inverted),),
+                partial=True,
+            )
+        runs = []
+        for run in range(self.runs):
+            await guide.confirm(_MARK)
+            speed = self.speed if run % 2 == 0 else -min(self.speed, 0.12)
+            name = f"run {run + 1} of {self.runs}, {'forward' if speed > 0 else 'back'}"
+            track = await guide.move(Move(name, speed, metres=self.metres))
+            runs.append(Run.of(track, await guide.ask(_DISTANCE)))
+        return guide.fit("turns per metre", lambda: self._result(guide, inverted, runs))
+
+    @staticmethod
+    def _reversed(inverted: bool) -> Result:
+        return Result(
+            wizard="drive",
+            measured="the truck was told to roll forward and rolled backward",
+            estimates=(_sign(not inverted),),
+            unobserved=("the ratio: nothing is driven any further with the sign wrong",),
+            partial=True,
+            again="restart the daemon, so that forward is forward, and calibrate the ratio",
+        )
+
+    def _result(self, guide: Guide, inverted: bool, runs: list["Run"]) -> Result:
+        values = [run.turns / run.way for run in runs]
+        middle = float(np.median(values))
+        for number, value in enumerate(values, start=1):
+            if abs(value / middle - 1) > APART:
+                off = 100 * (value / middle - 1)
+                raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
+        tape = math.sqrt(2) * self.tape_error / self.metres
+        # A compass with iron tells no more of a bend than that there is one.
+        bend = 0.0 if "compass" in guide.known else max(run.bend for run in runs)
+        turns = mean_interval(values, middle * tape).widened(middle * (TAPE_SCALE + bend))
+        radius = float(guide.value("geometry.wheel_radius"))
+        ratio = turns.times(2 * math.pi * radius)
+        floor = (
+            f"on this floor; 95 % of the runs' spread and of {1000 * self.tape_error:g} mm in each reading, "
+            f"{TAPE_SCALE:.2%} of the tape" + (f", {bend:.2%} of the bends" if bend else "")
+        )
+        wheels = f"motor turns per turn of wheels of {radius:g} m {floor}, {SLIP:.1%} of slip on another one"
+        count = len(runs)
+        estimates = [
+            _sign(inverted),
+            _estimate("drive_ratio", ratio.widened(ratio.value * SLIP), count, wheels, key=RATIO),
+            _estimate("turns_per_metre", turns, count, f"turns of the motor per metre {floor}", "1/m"),
+        ]
+        drive = guide.config.devices.drive
+        pulses = None if drive is None else drive.driver.encoder_pulses_per_turn
+        if pulses is not None:
+            ticks = turns.times(4 * pulses)
+            estimates.append(_estimate("ticks_per_metre", ticks, count, f"encoder counts per metre {floor}", "1/m"))
+        return Result(
+            wizard="drive",
+            measured=f"{count} runs of about {self.metres:g} m, forward and back in turn, measured with a tape",
+            estimates=tuple(estimates),
+            unobserved=("gear ratio and wheel radius apart from each other", "slip on slopes and in curves"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One taped run."""
+
+    turns: float
+    """Of the motor."""
+    way: float
+    """Along the arc, m."""
+    bend: float
+    """Share by which the arc is longer than the tape."""
+
+    @classmethod
+    def of(cls, track: Track, distance: float) -> "Run":
+        """From the taped chord, m.
+
+        Raises:
+            InputError: the truck went too crooked.
+        """
+        turn, _ = track.turn()
+        if abs(turn) > BENT:
+            raise InputError(
+                f"the truck turned by {math.degrees(turn):.0f} deg on its way: run `calibrate steering --rough` first"
+            )
+        way = arc(distance, turn)
+        return cls(abs(track.turns), way, way / distance - 1)
+
+
+def arc(chord: float, turn: float) -> float:
+    """Length of a circular arc, m, from its chord and its angle, rad."""
+    half = turn / 2
+    return chord * half / math.sin(half) if half else chord
+
+
+def _sign(inverted: bool) -> Estimate:
+    return Estimate(
+        name="inverted",
+        value=inverted,
+        samples=1,
+        meaning="driving forward needs negative rpm of the controller; seen by the operator",
+        key=INVERTED,
+    )
+
+
+def _estimate(
+    name: str, interval: Interval, samples: int, meaning: str, unit: str = "", key: str | None = None
+) -> Estimate:
+    return Estimate(
+        name=name,
+        value=interval.value,
+        low=interval.low,
+        high=interval.high,
+        unit=unit,
+        samples=samples,
+        meaning=meaning,
+        key=key,
+    )

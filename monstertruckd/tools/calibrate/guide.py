@@ -1,0 +1,154 @@
+"""The frame of every wizard: a coroutine that walks the operator through typed steps.
+
+A wizard gets a ``Guide`` and awaits its steps one by one: ask for a number, have something confirmed, move, collect,
+fit. Every step is a place where it can be given up: the truck moves within ``move`` only and is disarmed between moves,
+and nothing is written before the wizard has returned its result. So an interrupt, a lost link or a killed process
+leaves the calibration as it was; the truck's stop is the gate's business, as for any operator that falls silent.
+"""
+
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final, TypeVar
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.calibration.apply import value_at
+from monstertruckd.config.calibration.record import Result, Value, WizardName
+from monstertruckd.config.calibration.rpc import SAVE
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.motion import Mover, Truck
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Move, Number, Panel
+from monstertruckd.tools.calibrate.track import Track
+
+M = TypeVar("M", bound=Message)
+T = TypeVar("T")
+
+CLEAR: Final = Confirm("clear", "The truck is about to move. Is the floor free as described?")
+
+
+@dataclass(frozen=True, slots=True)
+class Wizard:
+    """One calibration."""
+
+    name: WizardName
+    doc: str
+    """What it finds, in a sentence"""
+    room: str
+    """What the truck needs around it"""
+    run: Callable[["Guide"], Awaitable[Result]]
+
+
+class Guide:
+    """Leads through one wizard.
+
+    Args:
+        truck: link to it.
+        panel: the operator.
+        clock: time.
+        config: what the daemon runs on, calibration included.
+        known: the truck's calibration so far, by wizard.
+    """
+
+    def __init__(
+        self,
+        truck: Truck,
+        panel: Panel,
+        clock: Clock,
+        config: TruckConfig,
+        known: Mapping[WizardName, Result] = MappingProxyType({}),
+    ) -> None:
+        self.config = config
+        self.chassis = config.chassis()
+        self.known = known
+        self._truck = truck
+        self._panel = panel
+        self._clock = clock
+        self._mover = Mover(truck, clock, self.chassis)
+        self._values: dict[str, Any] = config.model_dump()
+
+    def say(self, text: str) -> None:
+        """Tell the operator something."""
+        self._panel.say(text)
+
+    def value(self, key: str) -> Value:
+        """A value the daemon runs on.
+
+        Raises:
+            InputError: this truck has no such device.
+        """
+        value = value_at(self._values, key)
+        if value is None:
+            raise InputError(f"{key}: not in this truck's configuration, so there is nothing to calibrate")
+        return value
+
+    async def ask(self, step: Number) -> float:
+        """A number within its bounds.
+
+        Raises:
+            InputError: there is no usable answer.
+        """
+        value = await self._panel.number(step)
+        if not step.low <= value <= step.high:
+            raise InputError(f"{step.name}: {value:g} is not within {step.low:g} to {step.high:g}")
+        return value
+
+    async def confirm(self, step: Confirm) -> bool:
+        """Yes or no.
+
+        Raises:
+            RequestRefusedError: the operator said no to what has to be.
+            InputError: there is no answer.
+        """
+        yes = await self._panel.confirm(step)
+        if not yes and not step.fact:
+            raise RequestRefusedError(Reason.CANCELLED, f"given up at: {step.question}")
+        return yes
+
+    async def move(self, step: Move) -> Track:
+        """Drive; raises as ``Mover.move`` does."""
+        self._panel.say(f"moving: {step.name}")
+        return await self._mover.move(step, lambda way: self._panel.progress(step.name, way, step.metres))
+
+    async def collect(self, step: Collect[M]) -> list[M]:
+        """Messages of a topic.
+
+        Raises:
+            NoAnswerError: they did not come in time.
+        """
+        found: list[M] = []
+        with self._truck.subscribe(step.topic, fifo(step.count)) as messages:
+            try:
+                async with self._clock.deadline(step.timeout):
+                    while len(found) < step.count:
+                        found.append(await messages.next())
+                        self._panel.progress(step.name, len(found), step.count)
+            except TimeoutError:
+                text = f"{step.topic.name}: {len(found)} of {step.count} messages came within {step.timeout:g} s"
+                raise NoAnswerError(text) from None
+        return found
+
+    def fit(self, name: str, function: Callable[[], T]) -> T:
+        """Compute a result from what was measured, as a step of its own."""
+        self._panel.say(f"computing: {name}")
+        return function()
+
+
+async def calibrate(
+    wizard: Wizard, truck: Truck, panel: Panel, clock: Clock, config: TruckConfig, known: Mapping[WizardName, Result]
+) -> tuple[Result, str]:
+    """Run a wizard, and have the daemon save what it found; returns that as it is saved and the path of the new file.
+
+    Raises:
+        TruckError: whatever ended it; nothing was saved then.
+    """
+    panel.say(f"{wizard.name}: {wizard.doc}")
+    if wizard.room:
+        panel.say(f"room: {wizard.room}")
+    result = await wizard.run(Guide(truck, panel, clock, config, known))
+    saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "by": truck.source})
+    return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])

@@ -1,0 +1,251 @@
+"""Moves through the safety gate: a wizard drives by the ordinary requests of an operator, and by nothing else."""
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from typing import Any, Final, Protocol, TypeVar
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import Topic
+from monstertruckd.tools.calibrate.steps import Move
+from monstertruckd.tools.calibrate.track import Track
+
+M = TypeVar("M", bound=Message)
+
+PERIOD: Final = 0.05
+"""Seconds between two requests."""
+LEASE: Final = 0.5
+"""Asked for, s; the gate grants what it thinks right."""
+ARMING: Final = 3.0
+"""Seconds in which the truck must be armed."""
+TAKING: Final = 3
+"""Requests for rest that go before the order to arm."""
+STEERING: Final = 1.0
+"""Seconds the wheels get for turning while the truck stands."""
+STUCK: Final = 3.0
+"""Seconds without way after which a move is given up."""
+PROGRESS: Final = 0.01
+"""Way, m, that counts as some."""
+STILL: Final = 0.1
+"""Turn of the motor, rad, that is none: an encoder at rest may hover between two counts."""
+AT_REST: Final = 0.5
+"""Seconds of an unchanged drive position that are rest."""
+SETTLE: Final = 5.0
+"""Seconds in which it must come to rest."""
+DEPTH: Final = 4096
+CLOSED: Final = frozenset({GateMode.DISARMED, GateMode.ESTOPPED})
+
+
+class Truck(Protocol):
+    """What a wizard needs of ``TruckClient``, or of its likeness beside the bus."""
+
+    source: str
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Follow a topic."""
+        ...
+
+    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
+        """Ask for a motion."""
+        ...
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        """Arm, disarm, stop."""
+        ...
+
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Ask the daemon."""
+        ...
+
+
+class Mover:
+    """Carries out moves.
+
+    Args:
+        truck: link to it.
+        clock: time.
+        chassis: for the way.
+    """
+
+    def __init__(self, truck: Truck, clock: Clock, chassis: Chassis) -> None:
+        self._truck = truck
+        self._clock = clock
+        self._drivetrain = chassis.drivetrain
+
+    async def move(self, move: Move, tell: Callable[[float], None]) -> Track:
+        """Drive ``move`` and return what was read meanwhile; ``tell`` gets the metres driven.
+
+        However it ends, the truck is told to stop and disarmed.
+
+        Raises:
+            RequestRefusedError: the gate would not, or stopped the truck; carries its reason.
+            NoAnswerError: the truck does not move, or does not say so.
+        """
+        with (
+            self._truck.subscribe(topics.DRIVE, fifo(DEPTH)) as drive,
+            self._truck.subscribe(topics.STEERING, fifo(DEPTH)) as steering,
+            self._truck.subscribe(topics.COMPASS, fifo(DEPTH)) as attitude,
+            self._truck.subscribe(topics.GATE, fifo(DEPTH)) as gate,
+        ):
+            run = _Run(self._truck, self._clock, (drive, steering, attitude, gate))
+            async with self._armed(run):
+                if move.approach:
+                    await run.hold(0.0, move.approach, move.approach, STEERING)
+                await run.hold(0.0, move.front, move.rear, STEERING)
+                run.begin()
+                await run.hold(0.0, move.front, move.rear, move.rest)
+                await self._drive(run, move, tell)
+                await run.rest(move.front, move.rear)
+                await run.hold(0.0, move.front, move.rear, move.rest)
+            return run.track
+
+    async def _drive(self, run: "_Run", move: Move, tell: Callable[[float], None]) -> None:
+        run.track.left = self._clock.now()
+        way, since = 0.0, self._clock.now()
+        while True:
+            await run.hold(move.speed, move.front, move.rear, PERIOD)
+            new = abs(run.track.way(self._drivetrain))
+            tell(new)
+            if new >= move.metres or (move.done is not None and move.done(run.track)):
+                return
+            if new - way > PROGRESS:
+                way, since = new, self._clock.now()
+            elif self._clock.now() - since > STUCK * SECOND:
+                why = ", ".join(reason.text for reason in run.state.reasons) if run.state else ""
+                raise NoAnswerError(f"{move.name}: no way made for {STUCK:g} s ({why or 'no reason given'})")
+
+    @asynccontextmanager
+    async def _armed(self, run: "_Run") -> AsyncIterator[None]:
+        """Armed inside; stopped and disarmed afterwards, whatever happens."""
+        await run.free()
+        try:
+            await run.arm()
+            yield
+        finally:
+            # A lost link needs no order: without requests the gate's lease ends.
+            for order in (Order.STOP, Order.DISARM):
+                with suppress(TruckError):
+                    await self._truck.order(order)
+        await run.disarmed()
+
+
+class _Run:
+    """One move: keeps the lease, collects, watches the gate."""
+
+    def __init__(
+        self,
+        truck: Truck,
+        clock: Clock,
+        feeds: tuple[Mailbox[DriveFeedback], Mailbox[SteeringFeedback], Mailbox[Attitude], Mailbox[GateState]],
+    ) -> None:
+        self.track = Track()
+        self.state: GateState | None = None
+        self._truck = truck
+        self._clock = clock
+        self._feeds = feeds
+
+    def begin(self) -> None:
+        """Forget what was read so far."""
+        self.track = Track()
+
+    async def free(self) -> None:
+        """Make sure that nobody uses the truck.
+
+        Raises:
+            RequestRefusedError: somebody has armed it.
+            NoAnswerError: the gate does not tell.
+        """
+        end = self._clock.now() + round(ARMING * SECOND)
+        while self.state is None:
+            if self._clock.now() > end:
+                raise NoAnswerError(f"the gate does not tell its state within {ARMING:g} s")
+            await self._clock.sleep(PERIOD)
+            self._take()
+        if self.state.mode not in CLOSED:
+            holder = f", {self.state.holder} drives" if self.state.holder else ""
+            raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
+
+    async def arm(self) -> None:
+        """Show a stick at rest for a moment, so that nobody of a lower role drives off, and arm.
+
+        Raises:
+            RequestRefusedError: the gate would not.
+        """
+        end = self._clock.now() + round(ARMING * SECOND)
+        taken = 0
+        while self.state is None or self.state.mode is not GateMode.DRIVING or self.state.holder != self._truck.source:
+            if self._clock.now() > end:
+                reasons = self.state.reasons if self.state is not None else ()
+                why = ", ".join(reason.text for reason in reasons if reason is not Reason.DISARMED)
+                refusal = next((r for r in reasons if r is not Reason.DISARMED), Reason.DISARMED)
+                raise RequestRefusedError(refusal, f"the truck could not be armed: {why or 'no reason given'}")
+            await self._truck.drive(0.0, 0.0, 0.0, LEASE)
+            taken += 1
+            if taken >= TAKING and self.state is not None and self.state.mode is GateMode.DISARMED:
+                await self._truck.order(Order.ARM)
+            await self._clock.sleep(PERIOD)
+            self._take()
+
+    async def disarmed(self) -> None:
+        """Wait until the gate has done so: the state that says DRIVING shall not be taken for the next move's."""
+        end = self._clock.now() + round(ARMING * SECOND)
+        while self.state is None or self.state.mode not in CLOSED:
+            if self._clock.now() > end:
+                raise NoAnswerError(f"the gate does not tell within {ARMING:g} s that it disarmed the truck")
+            await self._clock.sleep(PERIOD)
+            self._take()
+
+    async def hold(self, speed: float, front: float, rear: float, seconds: float) -> None:
+        """Ask for one motion for so long.
+
+        Raises:
+            RequestRefusedError: the gate has taken the truck away.
+        """
+        end = self._clock.now() + round(seconds * SECOND)
+        while self._clock.now() < end:
+            await self._truck.drive(speed, front, rear, LEASE)
+            await self._clock.sleep(min(PERIOD, (end - self._clock.now()) / SECOND))
+            self._take()
+            self._check()
+
+    async def rest(self, front: float, rear: float) -> None:
+        """Stop and wait for rest."""
+        end = self._clock.now() + round(SETTLE * SECOND)
+        still = -1
+        while self._clock.now() < end:
+            await self.hold(0.0, front, rear, PERIOD)
+            if not self.track.drive:
+                continue
+            newest = self.track.drive[-1]
+            moved = [r.stamp for r in self.track.drive if abs(r.position - newest.position) > STILL]
+            if newest.stamp - max(moved, default=newest.stamp) > AT_REST * SECOND:
+                still = newest.stamp
+                break
+        if still < 0:
+            raise NoAnswerError(f"the drive does not come to rest within {SETTLE:g} s")
+        self.track.arrived = still
+
+    def _take(self) -> None:
+        drive, steering, attitude, gate = self._feeds
+        self.track.drive += drive.drain()
+        self.track.steering += [reading for reading in steering.drain() if reading.trusted]
+        self.track.attitude += [reading for reading in attitude.drain() if not reading.heading_disturbed]
+        self.state = next(reversed(gate.drain()), self.state)
+
+    def _check(self) -> None:
+        state = self.state
+        if state is None or (state.mode is GateMode.DRIVING and state.holder == self._truck.source):
+            return
+        reasons = [reason for reason in state.reasons if reason is not Reason.DISARMED]
+        if not reasons and state.mode is GateMode.DRIVING:
+            raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck now")
+        text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
+        raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}")

@@ -1,0 +1,354 @@
+"""Centre, direction, travel and pulse map of both steering servos.
+
+Hobby servos report nothing, so the truck itself is the instrument: the compass sees it turn, the drive counts its way,
+and a string on the floor shows what neither sees, the crabbing of two axles that are off by the same angle.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.calibration.record import STEERING, Estimate, Result
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.statistics import NORMAL
+from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Leg, Maps, SteeringModel, half_widths
+from monstertruckd.tools.calibrate.steps import Confirm, Move, Number
+
+ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
+
+ROUGH: Final = (0.06, 0.1, 0.4)
+"""Speed (m/s), axle angle (rad) and way (m) of the first arcs: too little turn for the gate to call the steering dead,
+should it go the wrong way."""
+ARC: Final = (0.12, 0.18, 1.0)
+FULL: Final = (0.12, 0.35)
+"""Speed and axle angle of full circles."""
+TRAVEL: Final = (0.1, 0.6)
+"""Speed and way of arcs with the wheels as far over as the gate lets them."""
+STRAIGHT: Final = (0.12, 2.0)
+APPROACH: Final = 0.2
+
+DEAD_BAND: Final = 2.0
+"""Pulse, us, by which a servo may stop short of its goal."""
+BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
+"""The same as half a 95 % interval, us."""
+SPAN: Final = 50.0
+"""Degrees of the servo between full circles to the left and to the right."""
+UNSCALED: Final = 0.5
+"""Share of a turn that may be wrong before compass and drive are calibrated."""
+WHEELBASE: Final = 0.003
+"""Share by which a taped wheelbase may be wrong."""
+WAY: Final = 0.02
+"""Share by which the way may be wrong while the drive is not calibrated."""
+SHORT: Final = math.radians(2.0)
+"""Servo angle, rad, that has to be missing before a stop is believed."""
+MARGIN: Final = 1.0
+"""Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
+SCALE: Final = 0.02
+"""Share by which the scale known from short arcs may be wrong."""
+SEEN: Final = 5.0
+"""Standard errors of a turn that make its direction sure."""
+
+_STRING: Final = Confirm(
+    "string", "Lay a string along the truck's left side, 2.5 m ahead, and mark the middle of that side on it. Done?"
+)
+_OFFSET: Final = Number(
+    "offset", "How far has the middle of the left side moved off the string's line, cm, left positive?", -60.0, 60.0
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringWizard:
+    """Short arcs for the directions; then travel, straights along a string and full circles."""
+
+    rough: bool = False
+    """Directions and a first centre only: before the compass is calibrated"""
+    strings: int = 3
+    """Straight runs along a string; 0 = there is none"""
+    string_error: float = 0.0035
+    """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
+
+    async def __call__(self, guide: Guide) -> Result:
+        """Measure."""
+        chassis = guide.chassis
+        if not isinstance(chassis, TruckChassis):
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "only the truck's two steered axles are calibrated so far")
+        maps, model = Maps.of(guide.config), SteeringModel(chassis)
+        await guide.confirm(CLEAR)
+        arcs = await self._arcs(guide, maps, ROUGH)
+        directions = guide.fit("directions", lambda: _directions(arcs))
+        start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]))
+        wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
+        if self.rough or wrong:
+            again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
+            return guide.fit("centres", lambda: _rough(arcs, model, start, None if self.rough else again))
+        legs = [leg for axle in await self._arcs(guide, maps, ARC) for leg in axle]
+        first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
+        travel = await self._travel(guide, maps, model, first)
+        legs += await self._straights(guide, maps)
+        legs += await self._circles(guide, maps, travel)
+        return guide.fit("pulse maps", lambda: self._result(guide, model, legs, first, travel))
+
+    # Driving
+
+    @staticmethod
+    async def _arcs(guide: Guide, maps: Maps, arc: tuple[float, float, float]) -> tuple[list[Leg], list[Leg]]:
+        """Arcs to both sides, forward and back, with the front axle and with the rear one."""
+        speed, angle, metres = arc
+        found: tuple[list[Leg], list[Leg]] = ([], [])
+        for axle, name in enumerate(AXLES):
+            for sign, side in ((1, "left"), (-1, "right")):
+                for direction in (1, -1):
+                    what = f"{name} wheels {side}, {'forward' if direction > 0 else 'back'}"
+                    front, rear = _steered(axle, sign * angle)
+                    track = await guide.move(Move(what, direction * speed, front, rear, metres))
+                    found[axle].append(Leg.of(track, maps))
+        return found
+
+    @staticmethod
+    async def _travel(guide: Guide, maps: Maps, model: SteeringModel, first: Maps) -> "list[Reach]":
+        """How far each axle follows to each side."""
+        speed, metres = TRAVEL
+        limit = guide.config.gate.angle
+        reached = []
+        for axle, name in enumerate(AXLES):
+            for sign, side in ((1, "left"), (-1, "right")):
+                front, rear = _steered(axle, sign * limit)
+                legs = []
+                for direction in (1, -1):
+                    move = Move(f"{name} wheels far {side}", direction * speed, front, rear, metres)
+                    legs.append(Leg.of(await guide.move(move), maps))
+                reached.append(Reach.of(axle, sign, legs, model, first))
+        return reached
+
+    async def _straights(self, guide: Guide, maps: Maps) -> list[Leg]:
+        """Straight ahead and back, the wheels set from one side and from the other."""
+        speed, metres = STRAIGHT
+        legs = []
+        for run in range(max(self.strings, 2)):
+            side = APPROACH if run % 2 == 0 else -APPROACH
+            if self.strings:
+                await guide.confirm(_STRING)
+            track = await guide.move(Move("straight ahead", speed, metres=metres, approach=side))
+            offset = await guide.ask(_OFFSET) / 100 if self.strings else None
+            sigma = math.hypot(self.string_error * metres, 0.003)
+            legs.append(Leg.of(track, maps, offset, sigma))
+            back = await guide.move(Move("straight back", -speed, metres=metres, approach=-side))
+            legs.append(Leg.of(back, maps))
+        return legs
+
+    @staticmethod
+    async def _circles(guide: Guide, maps: Maps, travel: "list[Reach]") -> list[Leg]:
+        """A full turn to each side with each axle, which no slow error of the compass can falsify."""
+        speed, angle = FULL
+        legs = []
+        for reach in travel:
+            front, rear = _steered(reach.axle, reach.sign * min(angle, 0.95 * abs(reach.axle_angle)))
+            move = Move(
+                f"a full circle by the {AXLES[reach.axle]} wheels, {'left' if reach.sign > 0 else 'right'}",
+                speed,
+                front,
+                rear,
+                2.6 * math.pi / abs(guide.chassis.bicycle.curvature(front, rear)),
+                done=lambda track: abs(track.turned()) > 2 * math.pi,
+            )
+            legs.append(Leg.of(await guide.move(move), maps))
+        return legs
+
+    # Judging
+
+    def _result(
+        self, guide: Guide, model: SteeringModel, legs: list[Leg], first: Maps, travel: "list[Reach]"
+    ) -> Result:
+        fit = model.fit(legs, first)
+        maps = Maps.from_parameters(fit.parameters)
+        travel = [Reach.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
+        halves, share = half_widths(fit), _way_error(guide) + WHEELBASE
+        eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
+        band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
+        estimates: list[Estimate] = []
+        for axle, name in enumerate(AXLES):
+            centre, scale = (float(value) for value in fit.parameters[2 * axle : 2 * axle + 2])
+            centre_half, scale_half = (float(value) for value in halves[2 * axle : 2 * axle + 2])
+            estimates += [
+                _direction(name, scale, len(legs)),
+                _centre(name, centre, math.hypot(centre_half, BAND), len(legs), band + eye),
+                Estimate(
+                    name=f"{name}_scale",
+                    value=abs(scale),
+                    low=abs(scale) * (1 - share) - math.hypot(scale_half, BAND / SPAN),
+                    high=abs(scale) * (1 + share) + math.hypot(scale_half, BAND / SPAN),
+                    unit="us/deg",
+                    samples=len(legs),
+                    meaning=f"pulse per degree of the servo; {band}, and {share:.1%} of way and wheelbase",
+                    key=f"{STEERING}.{name}.scale_us_per_deg",
+                ),
+            ]
+            before = guide.known.get("steering")
+            for reach in travel:
+                if reach.axle == axle:
+                    estimates += reach.estimates(name, centre, scale, before)
+        strings = f"along {self.strings} strings" if self.strings else "without a string"
+        return Result(
+            wizard="steering",
+            measured=f"{len(legs)} legs: arcs and full circles with one axle at a time, straights {strings}",
+            estimates=tuple(estimates),
+            unobserved=(
+                "the linkage: its polynomials and the wheelbase are taken as configured, their errors show as scale",
+                "travel beyond the limits of gate and servo",
+                *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far an axle follows to one side."""
+
+    axle: int
+    sign: int
+    """+1 left."""
+    servo: float
+    """Servo angle reached, rad."""
+    axle_angle: float
+    """The axle's angle then, rad."""
+    stopped: bool
+    """Something stopped it there, short of its pulse."""
+
+    half: float
+    """Half the 95 % interval of that, rad."""
+    legs: tuple[Leg, ...]
+    """Arcs with the wheels far over."""
+
+    @classmethod
+    def of(cls, axle: int, sign: int, legs: Sequence[Leg], model: SteeringModel, maps: Maps) -> "Reach":
+        """From arcs with the wheels far over, as far as ``maps`` tell where the other axle stood."""
+        reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
+        stopped = sign * (meant - reached) > SHORT
+        servo = reached if stopped else meant
+        angle = float(model.linkages[axle].axle_from_servo(servo))
+        noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
+        half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
+        return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
+
+    def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
+        """What is told of it, and the limit of the pulse, us, where something stops the wheels.
+
+        A limit set ``before`` hides the stop behind it, and stays.
+        """
+        side, end = "left" if self.sign > 0 else "right", "max_us" if self.sign * scale > 0 else "min_us"
+        value, half = math.degrees(self.axle_angle), math.degrees(self.half)
+        travel = Estimate(
+            name=f"{name}_{side}_travel",
+            value=value,
+            low=value - half if self.stopped else None,
+            high=value + half if self.stopped else None,
+            unit="deg",
+            samples=2,
+            meaning="axle angle at which something stops the wheels; 95 % of the legs' noise and 2 % of scale"
+            if self.stopped
+            else "axle angle that the wheels follow to; the limits of gate and servo allow no more",
+        )
+        limit = None if before is None else before.estimate(f"{name}_{end}")
+        if self.stopped:
+            degrees = math.degrees(self.servo) - self.sign * MARGIN
+            limit = Estimate(
+                name=f"{name}_{end}",
+                value=centre + scale * degrees,
+                unit="us",
+                samples=2,
+                meaning=f"limit of the pulse, {MARGIN:g} deg of the servo before its stop",
+                key=f"{STEERING}.{name}.{end}",
+            )
+        return [travel] if limit is None else [travel, limit]
+
+
+def _steered(axle: int, angle: float) -> tuple[float, float]:
+    """Angles of front and rear axle, rad, with one of them steered."""
+    return (angle, 0.0) if axle == 0 else (0.0, angle)
+
+
+def _directions(arcs: tuple[list[Leg], list[Leg]]) -> tuple[int, int]:
+    """+1 where an axle steers as it is told, -1 where it steers the other way.
+
+    Raises:
+        InputError: an axle does not turn the truck.
+    """
+    signs = []
+    for axle, legs in enumerate(arcs):
+        # Left forward, left back, right forward, right back: what is common to both sides is the centre's.
+        pattern = np.array((1, -1, -1, 1)) * (1 if axle == 0 else -1)
+        turn = float(pattern @ [leg.turn for leg in legs]) / 4
+        error = math.hypot(*(leg.sigma for leg in legs)) / 4
+        if abs(turn) < SEEN * error:
+            raise InputError(
+                f"{AXLES[axle]} wheels: steered, they turn the truck by {math.degrees(turn):.2f} deg only: "
+                "a servo without supply, or on another channel?"
+            )
+        signs.append(1 if turn > 0 else -1)
+    return signs[0], signs[1]
+
+
+def _rough(arcs: tuple[list[Leg], list[Leg]], model: SteeringModel, start: Maps, again: str | None) -> Result:
+    """Directions, and centres as far as they show before compass and drive are calibrated.
+
+    Args:
+        arcs: driven.
+        model: of the truck.
+        start: configured maps, with the directions found.
+        again: what has to follow.
+    """
+    legs = [*arcs[0], *arcs[1]]
+    fit = model.fit(legs, start)
+    halves = half_widths(fit)
+    estimates = []
+    for axle, name in enumerate(AXLES):
+        centre, scale = (float(value) for value in fit.parameters[2 * axle : 2 * axle + 2])
+        half = float(halves[2 * axle]) + UNSCALED * abs(centre - start.centres[axle])
+        meaning = f"rough: 95 % of the legs' noise, and {UNSCALED:.0%} of the correction for compass and drive"
+        estimates += [_direction(name, scale, len(legs)), _centre(name, centre, half, len(legs), meaning)]
+    return Result(
+        wizard="steering",
+        measured=f"{len(legs)} short arcs with one axle at a time",
+        estimates=tuple(estimates),
+        unobserved=("pulse per degree and travel", "equal errors of both centres, but by the eye"),
+        partial=True,
+        again=again,
+    )
+
+
+def _direction(name: str, scale: float, samples: int) -> Estimate:
+    return Estimate(
+        name=f"{name}_direction",
+        value=1 if scale > 0 else -1,
+        samples=samples,
+        meaning="+1: a longer pulse steers left; by the sense in which the truck turned",
+        key=f"{STEERING}.{name}.direction",
+    )
+
+
+def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -> Estimate:
+    return Estimate(
+        name=f"{name}_centre",
+        value=centre,
+        low=centre - half,
+        high=centre + half,
+        unit="us",
+        samples=samples,
+        meaning=f"pulse that steers straight ahead; {meaning}",
+        key=f"{STEERING}.{name}.centre_us",
+    )
+
+
+def _way_error(guide: Guide) -> float:
+    """Share by which the counted way may be wrong."""
+    drive = guide.known.get("drive")
+    ratio = None if drive is None else drive.estimate("turns_per_metre")
+    if ratio is None or ratio.low is None or ratio.high is None:
+        return WAY
+    return (ratio.high - ratio.low) / 2 / float(ratio.value)

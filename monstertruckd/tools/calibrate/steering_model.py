@@ -1,0 +1,211 @@
+"""From pulses to the truck's turns, and back: the fit behind the steering wizard.
+
+Both axles are steered, so a turn shows the difference of their angles only: wz = v_x (tan front - tan rear) / L.
+Driving arcs with one axle at a time tells the gain of each, and straight driving the difference of their centres. Equal
+errors of both centres make the truck crab without turning, which no compass sees: they show as a sideways offset from a
+string, and faintly as unlike circles to the left and to the right, as far as the linkage is what it is taken for.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.fitting import Fit, least_squares
+from monstertruck_kinematics.polynomials import AxlePolynomials
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.statistics import NORMAL, student
+from monstertruckd.tools.calibrate.track import Track
+
+Array = NDArray[np.float64]
+Axle = Literal["front", "rear"]
+AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
+
+HEADING: Final = 0.002
+"""Standard deviation of a turn between two rests, rad: rounding and noise of averaged headings."""
+CURVE: Final = 0.006
+"""And by the compass's own slow error over the heading, rad; a full turn is free of it."""
+SLIP: Final = 0.004
+"""Standard deviation of a turn per root metre by tyres that never roll quite along their plane, rad."""
+LINKAGE: Final = 0.005
+"""Share of a turn by which the linkage may differ from its polynomials."""
+EYE: Final = math.radians(3.0)
+"""Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
+GAIN: Final = 0.15
+"""Share by which a pulse map may differ from the configured one, where nothing else tells."""
+
+
+_ROUNDS: Final = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """Pulse maps of both servos: pulse = centre + scale * servo angle in degrees; scales carry the direction's sign."""
+
+    centres: tuple[float, float]
+    """Front and rear, us."""
+    scales: tuple[float, float]
+    """Front and rear, us per degree."""
+
+    @classmethod
+    def of(cls, config: TruckConfig) -> "Maps":
+        """As configured.
+
+        Raises:
+            InputError: the truck has no steering.
+        """
+        steering = config.devices.steering
+        if steering is None:
+            raise InputError("devices.steering: not in this truck's configuration, so there is nothing to calibrate")
+        servos = (steering.driver.front, steering.driver.rear)
+        front, rear = servos
+        return cls(
+            (front.centre_us, rear.centre_us),
+            (front.direction * front.scale_us_per_deg, rear.direction * rear.scale_us_per_deg),
+        )
+
+    @classmethod
+    def from_parameters(cls, parameters: Array) -> "Maps":
+        """From (front centre, front scale, rear centre, rear scale)."""
+        front, front_scale, rear, rear_scale = (float(value) for value in parameters)
+        return cls((front, rear), (front_scale, rear_scale))
+
+    @property
+    def parameters(self) -> Array:
+        """(4,), see ``from_parameters``."""
+        return np.array((self.centres[0], self.scales[0], self.centres[1], self.scales[1]))
+
+    def pulses(self, axle: int, servo: Array) -> Array:
+        """Pulses, us, that the daemon sends for servo angles, rad."""
+        return np.asarray(self.centres[axle] + self.scales[axle] * np.degrees(servo))
+
+    def servo(self, axle: int, pulses: Array) -> Array:
+        """Servo angles, rad, that pulses mean, cut to what the linkage takes."""
+        angles = np.radians((pulses - self.centres[axle]) / self.scales[axle])
+        return np.asarray(np.clip(angles, -math.pi / 4, math.pi / 4))
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One move, ready for the fit."""
+
+    motor: Array
+    """Turned between readings, rad; (n,)."""
+    pulses: tuple[Array, Array]
+    """Of the front and rear servo meanwhile, us; (n,) each."""
+    turn: float
+    """Measured between the rests, rad, left positive."""
+    sigma: float
+    """Its standard deviation, rad."""
+    offset: float | None = None
+    """Measured sideways from the string at the end, m, left positive."""
+    offset_sigma: float = 0.01
+
+    @classmethod
+    def of(cls, track: Track, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01) -> "Leg":
+        """From a move, driven with the maps the daemon runs on."""
+        motor, *servos = track.steps()
+        turn, noise = track.turn()
+        part = abs(math.remainder(turn, 2 * math.pi))
+        sigma = math.hypot(HEADING, noise, CURVE * min(part, 1.0), LINKAGE * turn)
+        pulses = maps.pulses(0, servos[0]), maps.pulses(1, servos[1])
+        return cls(motor, pulses, turn, sigma, offset, offset_sigma)
+
+
+class SteeringModel:
+    """The truck as the fit sees it.
+
+    Args:
+        chassis: linkage, wheelbase, drive.
+    """
+
+    def __init__(self, chassis: TruckChassis) -> None:
+        assert chassis.linkage is not None
+        self.chassis = chassis
+        self.linkages: tuple[AxlePolynomials, AxlePolynomials] = (chassis.linkage.front, chassis.linkage.rear)
+
+    def angles(self, leg: Leg, maps: Maps) -> tuple[Array, Array]:
+        """Axle angles, rad, that the pulses of a leg mean; (n,) each."""
+        front, rear = (self.linkages[i].axle_from_servo(maps.servo(i, leg.pulses[i])) for i in (0, 1))
+        return front, rear
+
+    def moves(self, leg: Leg, maps: Maps) -> tuple[Array, Array, Array]:
+        """Forward, sideways (m) and turn (rad) between readings of a leg, in the body's frame; (n,) each."""
+        front, rear = self.angles(leg, maps)
+        bicycle = self.chassis.bicycle
+        ways = self.chassis.drivetrain.distance(leg.motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
+        return bicycle.body_twist(ways, front, rear)
+
+    def predict(self, leg: Leg, maps: Maps) -> tuple[float, float]:
+        """Turn, rad, and sideways offset, m, left positive, of a leg."""
+        forward, sideways, turned = self.moves(leg, maps)
+        heading = np.cumsum(turned) - turned / 2
+        return float(turned.sum()), float(np.sum(forward * np.sin(heading) + sideways * np.cos(heading)))
+
+    def way(self, leg: Leg) -> float:
+        """Way rolled on a leg, m."""
+        return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
+
+    def fit(self, legs: Sequence[Leg], start: Maps, gain: float = GAIN) -> Fit:
+        """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
+
+        Args:
+            legs: driven.
+            start: first guess, directions right.
+            gain: share within which the scales are believed beforehand.
+        """
+        guess = start.parameters
+        sigmas = [math.hypot(leg.sigma, SLIP * math.sqrt(self.way(leg))) for leg in legs]
+
+        def residual(parameters: Array) -> Array:
+            maps = Maps.from_parameters(parameters)
+            rows = []
+            for leg, sigma in zip(legs, sigmas, strict=True):
+                turn, aside = self.predict(leg, maps)
+                rows.append((turn - leg.turn) / sigma)
+                if leg.offset is not None:
+                    rows.append((aside - leg.offset) / leg.offset_sigma)
+            off = np.radians((parameters[[0, 2]] - guess[[0, 2]]) / guess[[1, 3]])
+            rows += [float(off.sum()) / (math.sqrt(2) * EYE)]
+            rows += list((parameters[[1, 3]] / guess[[1, 3]] - 1) / gain)
+            return np.array(rows)
+
+        spread = np.array((150.0, 0.5 * abs(guess[1]), 150.0, 0.5 * abs(guess[3])))
+        return least_squares(residual, guess, guess - spread, guess + spread)
+
+    def reached(self, leg: Leg, maps: Maps, axle: int) -> tuple[float, float]:
+        """Servo angle, rad, that an axle really had on a leg by the turn, and the one its pulses mean.
+
+        The other axle is taken as the maps have it. Valid for a leg with steady steering.
+        """
+        bicycle, linkage = self.chassis.bicycle, self.linkages[axle]
+        rolled = float(self.chassis.drivetrain.distance(leg.motor.sum()))
+        angles = [float(side.mean()) for side in self.angles(leg, maps)]
+        other = math.tan(angles[1 - axle])
+        for _ in range(_ROUNDS):  # how far the body gets per turn of the wheels depends on their angle a little
+            forward, _, _ = bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)
+            tangent = leg.turn * bicycle.wheelbase / forward
+            angle = math.atan(other + tangent if axle == 0 else other - tangent)
+            angles[axle] = min(max(angle, linkage.axle_limits[0]), linkage.axle_limits[1])
+        return float(linkage.servo_from_axle(angles[axle])), float(maps.servo(axle, leg.pulses[axle]).mean())
+
+
+def half_widths(fit: Fit, priors: int = 3) -> Array:
+    """Half the 95 % intervals of the parameters.
+
+    The errors of a leg are known beforehand; where the legs disagree by more, their spread counts.
+
+    Args:
+        fit: of ``SteeringModel.fit``.
+        priors: residuals that are beliefs, not measurements.
+    """
+    freedom = fit.residuals.size - priors - fit.parameters.size
+    spread = math.sqrt(float(np.sum(fit.residuals**2)) / max(1, fit.residuals.size - fit.parameters.size))
+    if spread <= 1.0 or freedom < 1:
+        return np.asarray(NORMAL * fit.standard_errors / min(spread, 1.0))
+    return np.asarray(student(freedom) * fit.standard_errors)

@@ -1,0 +1,268 @@
+"""``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
+
+import inspect
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
+    from monstertruckd.config.calibration.record import Estimate, Result, WizardName
+    from monstertruckd.tools.calibrate.guide import Wizard
+
+app = command_group(
+    "Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C."
+)
+
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Take it that everything asked to be done is done.")]
+AnswerOption = Annotated[
+    list[str] | None,
+    typer.Option("--answer", "-a", metavar="NAME=VALUE", help="Answer beforehand; repeated in the order of asking."),
+]
+UndoOption = Annotated[bool, typer.Option("--undo", help="Go back to what held before the last run; twice is redo.")]
+FileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", "-c", help="With --undo and show: this configuration's files, without a daemon.",
+        autocompletion=complete_config,
+    ),
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What every wizard's command is told."""
+
+    robot: str
+    endpoint: str
+    config: Path | None
+    answers: list[str]
+    yes: bool
+    undo: bool
+    json_output: bool
+
+
+def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
+    """Add a command that has the wizard's own options, which ``make`` takes, and those that all share."""
+
+    def command(
+        *,
+        yes: YesOption = False,
+        answer: AnswerOption = None,
+        undo: UndoOption = False,
+        robot: RobotOption = "truck",
+        endpoint: EndpointOption = ENDPOINT,
+        config: FileOption = None,
+        json_output: JsonOption = False,
+        **own: Any,
+    ) -> None:
+        _run(make(**own), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+
+    mine, shared = (inspect.signature(function).parameters.values() for function in (make, command))
+    together = [*mine, *(parameter for parameter in shared if parameter.kind is not parameter.VAR_KEYWORD)]
+    parameters = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in together]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    command.__doc__ = make.__doc__
+    app.command(make.__name__)(command)
+    return make
+
+
+@_wizard
+def drive(
+    runs: Annotated[int, typer.Option(min=3, max=50, help="Taped runs.")] = 4,
+    metres: Annotated[float, typer.Option(min=0.5, max=20, help="Length of a run.")] = 2.0,
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
+    sign_only: Annotated[bool, typer.Option("--sign-only", help="End once it is clear where forward is.")] = False,
+) -> "Wizard":
+    """Which way is forward, and how far a turn of the motor goes: runs along a tape.
+
+    Asks `clear`, `forward` and, for each run, `mark` and `distance` (m).
+    """
+    from monstertruckd.tools.calibrate.catalog import drive_wizard
+    from monstertruckd.tools.calibrate.drive import DriveWizard
+
+    return drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
+
+
+@_wizard
+def steering(
+    rough: Annotated[
+        bool, typer.Option("--rough", help="Directions and a first centre: before the compass is calibrated.")
+    ] = False,
+    strings: Annotated[int, typer.Option(min=0, max=20, help="Straight runs along a string; 0 = there is none.")] = 3,
+    string_error: Annotated[
+        float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
+    ] = 3.5,
+) -> "Wizard":
+    """Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
+
+    Asks `clear` and, for each string, `string` and `offset` (cm).
+    """
+    from monstertruckd.tools.calibrate.catalog import steering_wizard
+    from monstertruckd.tools.calibrate.steering import SteeringWizard
+
+    return steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
+
+
+@_wizard
+def compass() -> "Wizard":
+    """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
+    from monstertruckd.tools.calibrate.catalog import compass_wizard
+
+    return compass_wizard()
+
+
+@_wizard
+def battery(
+    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent.")] = 0.5,
+    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="And the rest of it, V.")] = 0.02,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
+) -> "Wizard":
+    """Scale of the battery voltage from a multimeter; nothing moves.
+
+    Asks `meter` (V) and `another` (yes or no), until that is no.
+    """
+    from monstertruckd.tools.calibrate.battery import BatteryWizard
+    from monstertruckd.tools.calibrate.catalog import battery_wizard
+
+    return battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
+
+
+@app.command()
+def show(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    config: FileOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Print what was calibrated, when, how well, and which file the daemon runs on."""
+    from monstertruck_runtime.clock import run_wall
+    from monstertruckd.config.calibration.record import CalibrationFile
+    from monstertruckd.config.calibration.rpc import SHOW
+
+    if config is not None:
+        store = _store(config)
+        newest, file = store.newest(), store.current()
+        state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file}
+    else:
+
+        async def ask(clock: "Clock") -> dict[str, Any]:
+            async with _client(robot, endpoint, clock) as client:
+                return await client.call(SHOW)
+
+        state = run_wall(ask)
+        content = state["content"]
+        file = None if content is None else CalibrationFile.model_validate_json(_json(content))
+    if json_output:
+        print_json(state)
+        return
+    if file is None:
+        remark(f"nothing calibrated yet: no file in {state['folder']}")
+        return
+    for result in file.results.values():
+        _print(result)
+    remark(f"file: {state['newest']} ({file.change})")
+    if "loaded" in state and state["loaded"] != state["newest"]:
+        remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
+
+
+def _run(wizard: "Wizard", call: _Call) -> None:
+    from monstertruck_runtime.clock import run_wall
+
+    if call.undo:
+        _undo(wizard.name, call)
+        return
+    result, file = run_wall(lambda clock: _guide(wizard, call, clock))
+    if call.json_output:
+        print_json({"result": result, "file": file})
+    else:
+        _print(result)
+    remark(f"saved in {file}; it counts from the next start of the daemon")
+    if result.again is not None:
+        remark(f"not complete: {result.again}")
+
+
+async def _guide(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
+    from monstertruckd.config.calibration.record import CalibrationFile
+    from monstertruckd.config.calibration.rpc import SHOW
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.tools.calibrate.guide import calibrate
+    from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
+
+    async with _client(call.robot, call.endpoint, clock) as client:
+        running = await client.call("config")
+        running.pop("sim", None)  # the world's truth is nothing a wizard may know
+        config = TruckConfig.model_validate_json(_json(running))
+        content = (await client.call(SHOW))["content"]
+        known = {} if content is None else CalibrationFile.model_validate_json(_json(content)).results
+        with TerminalPanel(call.answers, yes=call.yes) as panel:
+            return await calibrate(wizard, client, panel, clock, config, known)
+
+
+def _undo(name: "WizardName", call: _Call) -> None:
+    from monstertruck_runtime.clock import WallClock, run_wall
+    from monstertruckd.config.calibration.rpc import UNDO
+
+    if call.config is not None:
+        clock = WallClock()
+        file = str(_store(call.config).undo(name, clock.now() + clock.real_offset()))
+    else:
+
+        async def ask(clock: "Clock") -> dict[str, Any]:
+            async with _client(call.robot, call.endpoint, clock) as client:
+                return await client.call(UNDO, {"wizard": name, "by": client.source})
+
+        file = run_wall(ask)["file"]
+    if call.json_output:
+        print_json({"file": file})
+    remark(f"{name}: as before, in {file}; it counts from the next start of the daemon")
+
+
+def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
+    from monstertruck_runtime.client import TruckClient
+
+    return TruckClient(robot, endpoint, clock=clock, timeout=10.0)
+
+
+def _store(config: Path) -> Any:
+    from monstertruckd.config.calibration.apply import store_of
+    from monstertruckd.config.load import load_uncalibrated
+
+    return store_of(load_uncalibrated(config)[0])
+
+
+def _json(value: Any) -> str:
+    import json
+
+    return json.dumps(value)
+
+
+def _print(result: "Result") -> None:
+    rows = [
+        (f"{result.wizard}.{e.name}", _number(e), e.unit, str(e.samples), e.date.replace("T", " "), e.meaning)
+        for e in result.estimates
+    ]
+    print_table(("what", "value", "unit", "samples", "measured", "meaning"), rows, right=("value", "samples"))
+    for missing in result.unobserved:
+        remark(f"not seen: {missing}")
+
+
+def _number(estimate: "Estimate") -> str:
+    """The value with half its interval, to two digits of that."""
+    value, low, high = estimate.value, estimate.low, estimate.high
+    if isinstance(value, bool) or low is None or high is None:
+        return f"{value:.5g}" if isinstance(value, float) else str(value).lower()
+    import math
+
+    half = (high - low) / 2
+    digits = max(0, 1 - math.floor(math.log10(half))) if half > 0 else 3
+    return f"{value:.{digits}f} ± {half:.{digits}f}"

@@ -1,0 +1,128 @@
+"""The operator of a wizard at a terminal, or the answers of a script."""
+
+import asyncio
+import os
+import sys
+from collections import defaultdict, deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.cli.output import progress, remark
+from monstertruckd.tools.cli.terminal import when_readable
+
+WORDS = {"y": True, "yes": True, "n": False, "no": False}
+
+
+class TerminalPanel:
+    """Questions on standard error, answers from the command line first, then from standard input, line by line.
+
+    Args:
+        answers: ``NAME=VALUE``, for each name in the order of asking.
+        yes: everything asked to be done is done.
+
+    Raises:
+        InputError: an answer has another form.
+    """
+
+    def __init__(self, answers: list[str], *, yes: bool = False) -> None:
+        self._given: defaultdict[str, deque[str]] = defaultdict(deque)
+        for answer in answers:
+            name, equals, value = answer.partition("=")
+            if not equals:
+                raise InputError(f"--answer {answer}: expected NAME=VALUE")
+            self._given[name].append(value)
+        self._yes = yes
+        self._bars = ExitStack()
+        self._bar: tuple[str, Callable[[float], None]] | None = None
+        self._rest = b""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close_bar()
+        if error is None:
+            for name, values in self._given.items():
+                for value in values:
+                    remark(f"--answer {name}={value}: was not asked for")
+
+    def say(self, text: str) -> None:
+        """Show a sentence."""
+        self._close_bar()
+        remark(text)
+
+    def progress(self, name: str, done: float, total: float) -> None:
+        """Move the bar of this step."""
+        if self._bar is None or self._bar[0] != name:
+            self._close_bar()
+            self._bar = (name, self._bars.enter_context(progress(name, total)))
+        self._bar[1](min(done, total))
+
+    async def number(self, step: Number) -> float:
+        """Ask until a number within the bounds comes; one given beforehand has to be right at once."""
+        while True:
+            text, typed = await self._answer(step.name, step.question)
+            try:
+                value = float(text.replace(",", "."))
+            except ValueError:
+                wrong = f"{step.name}: {text!r} is no number"
+            else:
+                if step.low <= value <= step.high:
+                    return value
+                wrong = f"{step.name}: {value:g} is not within {step.low:g} to {step.high:g}"
+            if not typed:
+                raise InputError(wrong)
+            remark(wrong)
+
+    async def confirm(self, step: Confirm) -> bool:
+        """Ask for yes or no; Enter is yes where something is only to be done."""
+        if self._yes and not step.fact:
+            return True
+        while True:
+            text, typed = await self._answer(step.name, f"{step.question} [{'y/n' if step.fact else 'Y/n'}]")
+            if (word := WORDS.get(text.lower())) is not None:
+                return word
+            if not text and not step.fact:
+                return True
+            if not typed:
+                raise InputError(f"{step.name}: {text!r} is neither yes nor no")
+
+    async def _answer(self, name: str, question: str) -> tuple[str, bool]:
+        """The answer, and whether it was typed."""
+        self._close_bar()
+        if self._given[name]:
+            value = self._given[name].popleft()
+            remark(f"{question} {value}")
+            return value, False
+        remark(question)
+        return await self._line(name), True
+
+    async def _line(self, name: str) -> str:
+        """A line of standard input. Nothing is read ahead of the question by a thread that Ctrl-C could not end."""
+        loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
+        while b"\n" not in self._rest:
+            readable = asyncio.Event()
+            try:
+                when_readable(source, readable.set)
+            except PermissionError:  # a file, or /dev/null: always readable
+                readable.set()
+            try:
+                await readable.wait()
+            finally:
+                loop.remove_reader(source)
+            data = os.read(source, 1024)
+            if not data:
+                raise InputError(f"{name}: no answer on standard input; give it by --answer {name}=VALUE")
+            self._rest += data
+        line, _, self._rest = self._rest.partition(b"\n")
+        return line.decode(errors="replace").strip()
+
+    def _close_bar(self) -> None:
+        self._bars.close()
+        self._bar = None

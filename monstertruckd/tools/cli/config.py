@@ -1,0 +1,116 @@
+"""Commands on configuration files: what they come to, and bringing older ones up to date."""
+
+import difflib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruckd.tools.cli.options import ConfigArgument
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.config.migrate import Upgrade
+
+app = command_group("Check, show and upgrade configuration files.")
+
+Key = tuple[str | int, ...]
+
+
+@app.command("show")
+def show(
+    config: ConfigArgument,
+    keys: Annotated[
+        list[str] | None,
+        typer.Option("--key", "-k", help="Only what is at or below this key, e.g. gate.leases; repeatable."),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Check a configuration and print every value with its origin: file and line, calibration, or default.
+
+    Exit code 2 if it is refused, with one line for each mistake.
+    """
+    from monstertruck_runtime.errors import NotFoundError
+    from monstertruckd.config.load import load_truck
+    from monstertruckd.config.validate import resolved
+
+    loaded, tree = load_truck(config)
+    values = resolved(loaded)
+    leaves = [(key, value) for key, value in _leaves(values, ()) if _wanted(key, keys)]
+    if not leaves:
+        raise NotFoundError(f"{config}: nothing at {', '.join(keys or ())}; sections: {', '.join(values)}")
+    if json_output:
+        origins = {_dotted(key): str(origin) for key, origin in tree.origins.items() if key and _wanted(key, keys)}
+        print_json({"config": _kept(values, (), {key for key, _ in leaves}), "origins": origins})
+        return
+    rows = [(_dotted(key), _short(value), str(tree.origins.get(key) or "default")) for key, value in leaves]
+    print_table(("key", "value", "origin"), rows)
+
+
+def _dotted(key: Key) -> str:
+    return ".".join(map(str, key))
+
+
+def _wanted(key: Key, filters: list[str] | None) -> bool:
+    return not filters or any(f"{_dotted(key)}.".startswith(f"{wanted}.") for wanted in filters)
+
+
+def _leaves(value: Any, key: Key) -> list[tuple[Key, Any]]:
+    if isinstance(value, dict) and value:
+        return [leaf for name, inner in value.items() for leaf in _leaves(inner, (*key, name))]
+    return [(key, value)]
+
+
+def _kept(value: Any, key: Key, leaves: set[Key]) -> Any:
+    """``value`` with nothing but the given leaves in it."""
+    if key in leaves or not isinstance(value, dict):
+        return value
+    inside = {name: (*key, name) for name in value}
+    return {
+        name: _kept(value[name], inner, leaves)
+        for name, inner in inside.items()
+        if any(leaf[: len(inner)] == inner for leaf in leaves)
+    }
+
+
+def _short(value: Any) -> str:
+    return "-" if value is None else json.dumps(value)
+
+
+@app.command("migrate")
+def migrate(
+    config: ConfigArgument,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the changes, write nothing.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """Bring a configuration of an older version, and all it includes, up to date.
+
+    Comments stay, and so does the previous file, beside the new one as NAME.vN.
+    """
+    from monstertruckd.config.migrate import carry_out, plan
+    from monstertruckd.config.validate import VERSION
+
+    upgrades = plan(config)
+    if not dry_run:
+        carry_out(upgrades)
+    if json_output:
+        print_json({"version": VERSION, "files": [_as_json(upgrade, written=not dry_run) for upgrade in upgrades]})
+        return
+    for upgrade in upgrades:
+        if dry_run:
+            print(_difference(upgrade), end="")
+        else:
+            print(f"{upgrade.path}: version {upgrade.version} to {VERSION}; the previous one is {upgrade.kept}")
+    if not upgrades:
+        remark(f"{config}: up to date, version {VERSION}")
+
+
+def _as_json(upgrade: "Upgrade", *, written: bool) -> dict[str, Any]:
+    facts = {"path": upgrade.path, "version": upgrade.version, "changes": _difference(upgrade)}
+    return {**facts, "previous": upgrade.kept if written else None}
+
+
+def _difference(upgrade: "Upgrade") -> str:
+    before, after = upgrade.before.splitlines(keepends=True), upgrade.after.splitlines(keepends=True)
+    return "".join(difflib.unified_diff(before, after, str(Path(upgrade.path)), str(upgrade.path)))

@@ -1,0 +1,104 @@
+"""The demo, and the emulated robot it drives."""
+
+import itertools
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.options import ConfigOption, SimulatedOption
+from monstertruckd.tools.cli.output import (
+    JsonOption,
+    console,
+    finish,
+    on_terminal,
+    print_json,
+    print_table,
+    remark,
+    until_stopped,
+)
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+
+DEMO_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
+
+
+def demo(
+    fast: Annotated[bool, typer.Option("--fast", help="Virtual clock: as fast as it computes, reproducible.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of world and devices; default: the configuration's.")] = None,
+    config: SimulatedOption = DEMO_CONFIG,
+    output: Annotated[Path, typer.Option("--output", "-o", help="New folder for log, map and outputs.")] = Path(
+        "runs/demo"
+    ),
+    json_output: JsonOption = False,
+) -> None:
+    """The emulated truck drives a lap: real drivers, real bytes, real log."""
+    from monstertruck_runtime.clock import run_wall
+    from monstertruck_schemas.reasons import Reason
+    from monstertruckd.tools.demo.fast import run_fast_demo
+    from monstertruckd.tools.demo.wall import run_wall_demo
+
+    load_simulated(config)
+    folder = _fresh(output)
+    screen = on_terminal(sys.stdout) and not json_output
+    try:
+        if fast:
+            summary = run_fast_demo(config, folder, seed)
+        else:
+            summary = run_wall(lambda clock: run_wall_demo(clock, config, folder, seed, screen=screen))
+    except KeyboardInterrupt:
+        remark(f"log and outputs so far: {folder}")
+        raise
+    if json_output:
+        print_json(summary.as_json())
+    else:
+        _print(summary.rows(), summary.messages)
+    if summary.lap.outcome is not Reason.GOAL_REACHED:
+        finish(summary.lap.outcome)
+        finish(Reason.INTERNAL)
+
+
+def load_simulated(config: Path) -> "SimulatedTruckConfig":
+    """A configuration with a world in it.
+
+    Raises:
+        ConfigError: it is refused, or describes a real truck.
+    """
+    from monstertruck_runtime.errors import ConfigError
+    from monstertruckd.config.validate import load_config
+    from monstertruckd.config.yaml_tree import load_tree
+    from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+
+    if "sim" not in load_tree(config).data:
+        raise ConfigError(f"{config}: describes a real truck: it has no section `sim`, as configs/full.yaml has")
+    return load_config(config, SimulatedTruckConfig)[0]
+
+
+def _fresh(folder: Path) -> Path:
+    """``folder``, or the first of ``folder-2``, ``folder-3`` ... that is not there yet: no run overwrites another."""
+    names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
+    return next(name for name in names if not name.exists())
+
+
+def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
+    for name, value in rows:
+        console().print(f"[bold]{name:20}[/bold] {value}", soft_wrap=True)
+    print()
+    print_table(("topic", "messages"), [(name, str(n)) for name, n in sorted(messages.items())], right=("messages",))
+
+
+def simulate(
+    config: ConfigOption,
+    truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
+) -> None:
+    """Serve a simulated truck's devices behind ptys at the ports its configuration names.
+
+    Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
+    name, or `usb` (an unknown word lists what it knows).
+    """
+    from monstertruckd.tools.simulation.host import serve
+
+    load_simulated(config)
+    until_stopped(lambda clock: serve(clock, config, truth))

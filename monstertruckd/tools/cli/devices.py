@@ -1,0 +1,105 @@
+"""Commands on single devices: emulate one on a pty, probe one on a port."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.options import complete_device
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, remark, until_stopped
+
+DeviceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Kind or role: lidar, drive, steering, compass, stabiliser, camera; probe: battery, link, host.",
+        autocompletion=complete_device,
+    ),
+]
+
+OWN_CLIENTS: Final = {
+    "camera": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks"
+}
+"""What an emulator's link is not, by role."""
+
+
+def emulate(
+    device: DeviceArgument,
+    link: Annotated[Path, typer.Option("--link", "-l", help="Symlink to create for the pty.")],
+    seed: Annotated[int, typer.Option(help="Seed of the device's noise.")] = 0,
+) -> None:
+    """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
+
+    Faults are read from standard input, one per line: `unplug`, `plug`, `power-cycle`,
+    `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, or a fault of the device itself
+    (an unknown word lists them).
+    """
+    from monstertruck_drivers.catalog import find_kind
+    from monstertruck_sim.console import FaultConsole
+    from monstertruckd.tools.simulation.single import emulate_device
+
+    async def main(clock: Clock) -> None:
+        async with emulate_device(device, link, clock, seed) as emulated:
+            remark(f"{device} on {link}; faults on standard input, Ctrl-C ends")
+            if (limits := OWN_CLIENTS.get(find_kind(device).role)) is not None:
+                remark(f"{device}: {limits}")
+            await FaultConsole({device: emulated}, sys.stdin, typer.echo).run()
+
+    until_stopped(main)
+
+
+def probe(
+    device: DeviceArgument,
+    port: Annotated[
+        Path | None,
+        typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar; of a camera also a pattern."),
+    ] = None,
+    baud: Annotated[int | None, typer.Option(help="Bits per second; default: the device's own.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Handshake with a device and print its identity, state and first samples. Moves nothing."""
+    from monstertruck_drivers.catalog import find_kind
+    from monstertruck_drivers.link import SerialPort
+    from monstertruck_runtime.errors import InputError, NotFoundError
+
+    kind = find_kind(device)
+    if kind.asked == "port" and port is None:
+        raise InputError(f"{device}: say where it hangs with --port")
+    if kind.asked == "machine" and port is not None:
+        raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
+
+    async def main(clock: Clock) -> dict[str, Any]:
+        if port is None:
+            return await kind.probe()()
+        if kind.asked == "path":
+            return await kind.probe()(str(port))
+        return await kind.probe()(SerialPort(port, baud or kind.baud), clock)
+
+    report = run_wall(main)
+    found = [entry for entries in report.values() if isinstance(entries, list) for entry in entries]
+    if kind.asked == "path" and port is not None and not found:
+        raise NotFoundError(f"{port}: no such {kind.role}")
+    if json_output:
+        print_json(report)
+    else:
+        print_table(("what", "value"), list(_rows(report, "")))
+    errors = [entry["error"] for entry in found if isinstance(entry, dict) and "error" in entry]
+    if errors and len(errors) == len(found):
+        finish(Reason.DEVICE_FAULT, "\n".join(errors))
+
+
+def _rows(value: Any, name: str) -> Iterator[tuple[str, str]]:
+    """Every single value of a report under its dotted name."""
+    if isinstance(value, dict) and value:
+        for key, inner in value.items():
+            yield from _rows(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple) and any(isinstance(inner, dict | list | tuple) for inner in value):
+        for index, inner in enumerate(value):
+            yield from _rows(inner, f"{name}.{index}")
+    elif isinstance(value, list | tuple):
+        yield name, ", ".join(map(str, value)) or "-"
+    else:
+        yield name, "-" if value is None else str(value)

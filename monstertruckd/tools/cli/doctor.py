@@ -1,0 +1,62 @@
+"""The command that looks a truck's computer over."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.options import complete_config
+from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.doctor.finding import Finding
+
+STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+
+
+def doctor(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            "-c",
+            help="Configuration of the truck; default: the installed service's.",
+            autocompletion=complete_config,
+        ),
+    ] = None,
+    root: Annotated[Path, typer.Option("--root", help="Look at the system in this folder instead.")] = Path("/"),
+    json_output: JsonOption = False,
+) -> None:
+    """Look the computer over: software, service, rights, cables, devices, clock, disk, network.
+
+    Every finding comes with the command that mends it. Ends with the code of the first failure; warnings end with 0.
+    """
+    from monstertruck_runtime.clock import run_wall
+    from monstertruckd.tools.doctor.examination import examine
+    from monstertruckd.tools.doctor.finding import verdict
+    from monstertruckd.tools.doctor.patient import admit
+    from monstertruckd.tools.install.unit import Program
+
+    findings = run_wall(lambda clock: examine(admit(root, Program.present(), config, os.getuid(), clock)))
+    reason = verdict(findings)
+    if json_output:
+        print_json({"reason": reason, "findings": findings})
+    else:
+        _print(findings)
+    finish(reason, f"not ready to drive: {reason.text}")
+
+
+def _print(findings: "Sequence[Finding]") -> None:
+    from rich.text import Text
+
+    width = max(len(finding.check) for finding in findings)
+    out = console()
+    for finding in findings:
+        level = finding.level.value
+        out.print(Text(f"{level:5}", style=STYLES[level]) + Text(f"{finding.check:{width}}  {finding.seen}", style=""))
+        if finding.mend is not None and level != "ok":
+            out.print(Text(f"{'':5}{'':{width}}  > {finding.mend}", style="dim"))
+    counts = {level: sum(finding.level.value == level for finding in findings) for level in STYLES}
+    out.print(f"{counts['ok']} fine, {counts['warn']} warnings, {counts['fail']} failures")

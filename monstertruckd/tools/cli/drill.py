@@ -1,0 +1,88 @@
+"""``monstertruckd drill``: seeded faults on an emulated truck, and a scored report."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.demo import load_simulated
+from monstertruckd.tools.cli.options import SimulatedOption
+from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+
+FULL_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "full.yaml"
+
+
+def drill(
+    seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
+    count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
+    config: SimulatedOption = FULL_CONFIG,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Break the emulated truck again and again while it drives, and score how it takes it.
+
+    Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
+    did not come back.
+    """
+    from monstertruckd.tools.drill.drill import Drill
+
+    report = _run(Drill(seed, count, load_simulated(config)), jobs or os.cpu_count() or 1)
+    if json_output:
+        print_json(report.as_json())
+    else:
+        _print(report)
+    if report.unsafe or report.stuck:
+        raise typer.Exit(1)
+
+
+def _run(drill: "Drill", jobs: int) -> "Report":
+    finished = 0
+    with progress("faults", drill.count) as done:
+
+        def tell(outcomes: "Sequence[Outcome]") -> None:
+            nonlocal finished
+            finished += len(outcomes)
+            done(finished)
+
+        return drill.run(jobs=jobs, tell=tell)
+
+
+def _print(report: "Report") -> None:
+    numbers = ("stop bytes s", "standstill s", "metres", "back s", "score")
+    rows = [_cells(outcome) for outcome in report.outcomes]
+    print_table(("fault", "reaction", "reason", *numbers), rows, right=numbers)
+    out = console()
+    for outcome in report.outcomes:
+        for violation in outcome.violations:
+            text = f"{outcome.fault}: after {violation.seconds:.2f} s {violation.rule}: {violation.text}"
+            out.print(text, style="red")
+        if outcome.stuck:
+            out.print(f"{outcome.fault}: not back: {', '.join(outcome.stuck)}", style="yellow")
+    out.print(
+        f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck, "
+        f"{report.blocked} times set back by hand; "
+        f"back after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "
+        f"score [bold]{report.score:.1f}[/bold] of 100"
+    )
+
+
+def _cells(outcome: "Outcome") -> tuple[str, ...]:
+    return (
+        outcome.fault,
+        outcome.reaction,
+        outcome.reason or "-",
+        _seconds(outcome.stop_bytes_s),
+        _seconds(outcome.standstill_s),
+        f"{outcome.metres:.3f}",
+        _seconds(outcome.recovered_s),
+        str(outcome.score),
+    )
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -1,0 +1,39 @@
+"""``monstertruckd drive``: the keyboard as a deadman switch."""
+
+import math
+import sys
+from typing import Annotated
+
+import typer
+
+from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import on_terminal, until_stopped
+
+
+def drive(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, to begin with.")] = SteeringMode.FRONT,
+    speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Speed to begin with, m/s.")] = SPEEDS[1],
+    angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Full lock of an axle, degrees.")] = 22.5,
+    hold: Annotated[
+        float,
+        typer.Option(min=0.1, max=1.0, help="Seconds a first press stands: just above the keyboard's repeat delay."),
+    ] = 0.6,
+) -> None:
+    """Drive with the keyboard: the truck moves only while a key is held, in this terminal.
+
+    `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
+    `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
+    the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
+    """
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.tools.cli.drive_session import DriveSession
+    from monstertruckd.tools.cli.teleop import Teleop
+
+    if not (on_terminal(sys.stdin) and on_terminal(sys.stdout)):
+        raise InputError("drive reads keys as they are held: it needs a terminal")
+    level = min(range(len(SPEEDS)), key=lambda index: abs(SPEEDS[index] - speed))
+    teleop = Teleop(math.radians(angle), first_hold=hold, level=level, mode=mode)
+    until_stopped(lambda clock: DriveSession(teleop, clock, sys.stdin, sys.stdout).run(robot, endpoint))

@@ -1,0 +1,178 @@
+"""Keys of a terminal to drive requests, and the robot's state back onto it."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Coroutine
+from contextlib import suppress
+from typing import IO, Any, Final
+
+from rich.console import Console
+from rich.live import Live
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import TruckError
+from monstertruck_schemas.req import Order, Role
+from monstertruck_schemas.topics import GATE
+from monstertruckd.tools.cli.drive_screen import Stream, draw
+from monstertruckd.tools.cli.keys import KeyReader
+from monstertruckd.tools.cli.teleop import Command, Teleop, Wish
+from monstertruckd.tools.cli.terminal import every_key, forget_input, when_readable
+from monstertruckd.tools.status.watch import PERIOD, Follower
+
+RATE: Final = 20.0
+"""Drive requests per second."""
+LEASE: Final = 0.25
+"""Seconds a request stands."""
+TAKE_HOLD: Final = 0.15
+"""Seconds of neutral requests before an order to arm: a live one is what keeps a tracker from driving off."""
+STALLED: Final = 0.3
+"""After a longer pause of this program, s, keys read late may have been let go long ago."""
+PING: Final = 1.0
+"""Seconds between two measurements of the round trip."""
+
+
+class DriveSession:
+    """One terminal driving one robot.
+
+    Args:
+        teleop: what the keys mean.
+        clock: time.
+        keyboard: terminal that is read.
+        screen: terminal that is drawn on.
+    """
+
+    def __init__(self, teleop: Teleop, clock: Clock, keyboard: IO[Any], screen: IO[Any]) -> None:
+        self._teleop = teleop
+        self._clock = clock
+        self._keyboard = keyboard
+        self._screen = screen
+        self._reader = KeyReader()
+        self._commands: asyncio.Queue[Command] = asyncio.Queue()
+        self._stream = Stream()
+        self._sending = asyncio.Lock()
+        self._arming: asyncio.TimerHandle | None = None
+
+    async def run(self, robot: str, endpoint: str) -> None:
+        """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck told to stop.
+
+        Raises:
+            NotFoundError: no robot answers there.
+        """
+        loop = asyncio.get_running_loop()
+        async with TruckClient(robot, endpoint, role=Role.KEYBOARD, clock=self._clock) as client:
+            follower = Follower(client, self._clock)
+            with every_key(self._keyboard, self._screen):
+                when_readable(self._keyboard.fileno(), self._read)
+                loop.add_signal_handler(signal.SIGHUP, self._commands.put_nowait, "end")
+                try:
+                    await self._until_the_end(client, follower)
+                finally:
+                    loop.remove_reader(self._keyboard)
+                    loop.remove_signal_handler(signal.SIGHUP)
+                    await self._stop(client)
+
+    async def _until_the_end(self, client: TruckClient, follower: Follower) -> None:
+        jobs = [self._ask(client), self._ping(client), self._draw(follower), follower.run()]
+        tasks = [asyncio.create_task(job) for job in (self._obey(client), *jobs)]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+
+    def _read(self) -> None:
+        try:
+            data = os.read(self._keyboard.fileno(), 4096)
+        except OSError:  # the terminal is gone
+            data = b""
+        if not data:
+            asyncio.get_running_loop().remove_reader(self._keyboard)
+            self._commands.put_nowait("end")
+        self._press(self._reader.feed(data))
+
+    def _press(self, keys: list[str]) -> None:
+        for key in keys:
+            command = self._teleop.press(key, self._clock.now())
+            if command is Order.ARM:
+                if self._arming is None:
+                    self._arming = asyncio.get_running_loop().call_later(TAKE_HOLD, self._arm)
+            elif command is not None:
+                self._hold_arming()
+                self._commands.put_nowait(command)
+            elif key == "focus out":
+                self._hold_arming()
+
+    def _arm(self) -> None:
+        self._arming = None
+        self._commands.put_nowait(Order.ARM)
+
+    def _hold_arming(self) -> None:
+        """Forget an order to arm that was not sent yet."""
+        if self._arming is not None:
+            self._arming.cancel()
+            self._arming = None
+
+    async def _obey(self, client: TruckClient) -> None:
+        """Carry out orders as they come; returns at the end."""
+        while (command := await self._commands.get()) != "end":
+            await self._send(client.order(command))
+
+    async def _ask(self, client: TruckClient) -> None:
+        """The deadman's stream: requests while keys stand, silence otherwise."""
+        before = self._clock.now()
+        while True:
+            await self._clock.sleep(1.0 / RATE)
+            now = self._clock.now()
+            if now - before > STALLED * SECOND:
+                self._forget()
+            before = now
+            self._press(self._reader.flush())
+            await self._request(client, self._teleop.wish(now))
+
+    async def _request(self, client: TruckClient, wish: Wish | None) -> None:
+        self._stream.wish = wish
+        if wish is not None:
+            await self._send(client.drive(wish.speed, wish.front, wish.rear, lease=LEASE))
+
+    async def _send(self, sending: Coroutine[Any, Any, None]) -> None:
+        """A silent robot is shown instead of ending the session: it may come back."""
+        try:
+            async with self._sending:
+                await sending
+        except TruckError as error:
+            self._stream.trouble = str(error)
+        else:
+            self._stream.trouble = ""
+
+    def _forget(self) -> None:
+        forget_input(self._keyboard)
+        self._reader.clear()
+        self._hold_arming()
+        self._teleop.release()
+
+    async def _ping(self, client: TruckClient) -> None:
+        while True:
+            sent = self._clock.now()
+            try:
+                await client.get_retained(GATE)
+                self._stream.round_trip = (self._clock.now() - sent) / SECOND
+            except TruckError:
+                self._stream.round_trip = None
+            await self._clock.sleep(PING)
+
+    async def _draw(self, follower: Follower) -> None:
+        """Show the state; returns when the terminal is gone, which the keyboard may notice later."""
+        console = Console(file=self._screen)
+        with suppress(OSError), Live(console=console, screen=True, auto_refresh=False) as live:
+            while True:
+                live.update(draw(follower.state, self._teleop, self._stream, console.width), refresh=True)
+                await self._clock.sleep(PERIOD)
+
+    async def _stop(self, client: TruckClient) -> None:
+        with suppress(TruckError):
+            await client.order(Order.STOP)

@@ -1,0 +1,146 @@
+"""Finds the port of a cable by its being unplugged, and puts it into a configuration file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.catalog import BY_ROLE
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.machine import Machine
+from monstertruck_drivers.usb.tree import Device, Snapshot, parent_of, place, port_of, read_device, read_tree
+from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
+from monstertruck_runtime.small_files import replace_file
+from monstertruckd.config.edit import YamlText
+
+POLL: Final = 0.2
+SETTLE: Final = 0.4
+"""Seconds after the first loss until all of it is seen: a hub takes its devices along."""
+DEFAULT_BAUD: Final = UsbPortConfig.model_fields["baud"].default
+
+
+async def find_cable(role: str, machine: Machine, say: Callable[[str], None], patience: float) -> UsbPortConfig:
+    """Ask for a cable to be unplugged and plugged in again, and name its place.
+
+    Args:
+        role: what the cable leads to, for the questions and the baud rate.
+        machine: where to look.
+        say: shows one line to the user.
+        patience: seconds to wait for either.
+
+    Raises:
+        NoAnswerError: no cable was unplugged in time.
+    """
+    say(f"unplug the USB cable of: {role}")
+    try:
+        async with machine.clock.deadline(patience):
+            device = await _unplugged(machine, say)
+    except TimeoutError:
+        raise NoAnswerError(f"no cable was unplugged within {patience:g} s") from None
+    say(f"{role}: {place(device.name)}, {device.usb_id} {device.title}".rstrip())
+    say("plug it in again")
+    try:
+        async with machine.clock.deadline(patience):
+            while await machine.beside(lambda: read_device(machine.sysfs, device.name)) is None:
+                await machine.clock.sleep(POLL)
+    except TimeoutError:
+        say("still not plugged in there; the port counts all the same")
+    node = device.nodes[0]
+    kind = BY_ROLE.get(role.partition("_")[0])
+    return UsbPortConfig(
+        hub=str(parent_of(device.name)),
+        port=port_of(device.name),
+        interface=node.interface,
+        baud=DEFAULT_BAUD if kind is None else kind.baud,
+        usb_id=device.usb_id,
+    )
+
+
+async def _unplugged(machine: Machine, say: Callable[[str], None]) -> Device:
+    """Wait until one device with a node vanishes alone."""
+
+    async def look() -> Snapshot:
+        return await machine.beside(lambda: read_tree(machine.sysfs))
+
+    before = await look()
+    while True:
+        await machine.clock.sleep(POLL)
+        now = await look()
+        if not _lost(before, now):
+            before = now
+            continue
+        await machine.clock.sleep(SETTLE)
+        now = await look()
+        lost = _lost(before, now)
+        if len(lost) == 1 and lost[0].nodes:
+            return lost[0]
+        if any(device.hub for device in lost):
+            say("a whole hub vanished: plug it in again and pull the device's own cable")
+        elif len(lost) > 1:
+            say("several devices vanished: pull one cable only")
+        elif lost:
+            say(f"{lost[0].usb_id} {lost[0].title} at {place(lost[0].name)} is no serial port or camera: try another")
+        before = now
+
+
+def _lost(before: Snapshot, now: Snapshot) -> list[Device]:
+    """What is gone, or was for a moment."""
+    return [
+        device
+        for name, device in before.devices.items()
+        if name not in now.devices or now.devices[name].devnum != device.devnum
+    ]
+
+
+def config_line(port: UsbPortConfig) -> str:
+    """The line for ``devices.<role>`` in the configuration."""
+    return f"port: {_flow(port)}"
+
+
+def _flow(port: UsbPortConfig) -> str:
+    parts = [f'hub: "{port.hub}"', f"port: {port.port}"]
+    if port.interface:
+        parts.append(f"interface: {port.interface}")
+    if port.baud != DEFAULT_BAUD:
+        parts.append(f"baud: {port.baud}")
+    if port.usb_id is not None:
+        parts.append(f'usb_id: "{port.usb_id}"')
+    return f"{{ {', '.join(parts)} }}"
+
+
+def require_place(path: Path, role: str) -> YamlText:
+    """The file ``path``, which must say ``devices.<role>.port``.
+
+    Raises:
+        InputError: it cannot be read, is not YAML, or does not say it.
+    """
+    try:
+        text = YamlText(path.read_text(encoding="utf-8"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise InputError(str(error)) from error
+    if text.node("devices", role, "port") is None:
+        raise InputError(
+            f"{path}: no devices.{role}.port to replace; write it by hand into the file that says devices.{role}"
+        )
+    return text
+
+
+def write_port(path: Path, role: str, port: UsbPortConfig) -> None:
+    """Replace ``devices.<role>.port`` in a configuration file; everything else stays as it is, comments too.
+
+    A baud rate that stood there is kept. The file is replaced as a whole or not at all.
+
+    Raises:
+        InputError: see ``require_place``; or the file cannot be written.
+    """
+    text = require_place(path, role)
+    key = ("devices", role, "port")
+    baud = text.value(*key, "baud")
+    if baud is not None and baud.isdecimal():
+        port = port.model_copy(update={"baud": int(baud)})
+    text.replace(key, _flow(port))
+    try:
+        replace_file(path, text.text)
+    except OSError as error:
+        raise InputError(f"{path}: {error}") from error

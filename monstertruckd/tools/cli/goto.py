@@ -1,0 +1,91 @@
+"""``goto`` and ``track``: send the truck to a pose or along a path, and follow it there."""
+
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.errors import NotFoundError
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, ViaOption, parse_pose
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.cli.goto_session import Arrival
+
+PATIENCE: Final = 6.0
+"""Seconds to wait for a first route."""
+
+ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the truck as well; it drives off at once.")]
+
+
+def goto(
+    x: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
+    y: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
+    yaw: Annotated[float, typer.Argument(help="Radians.", show_default=False)],
+    via: ViaOption = None,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Drive to a pose in the map: the robot plans, follows and gets itself out of trouble.
+
+    Ends when the goal is reached or given up, with the reason's exit code. Ctrl-C cancels the goal.
+    """
+    from monstertruckd.tools.cli.goto_session import drive_to
+
+    places = [parse_pose(text, yaw_needed=False) for text in via or ()]
+
+    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+        if (await client.call("config")).get("planner") is None:
+            raise NotFoundError(f"robot {robot!r} has no planner: expected a section `planner` in its configuration")
+        return await drive_to(client, clock, (x, y, yaw), places, arm=arm)
+
+    _run(main, robot, endpoint, json_output=json_output)
+
+
+def track(
+    file: Annotated[Path, typer.Argument(help="CSV: x,y,yaw,direction.", show_default=False)],
+    closed: Annotated[bool, typer.Option("--closed", help="The path is a lap: its end is its start.")] = False,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Send a path to the robot and follow how it is driven.
+
+    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the truck.
+    """
+    from monstertruck_planners.track.paths import load_path
+    from monstertruckd.tools.cli.goto_session import follow
+
+    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+        localised = (await client.call("config")).get("slam") is not None
+        path = load_path(file, closed=closed, frame="map" if localised else "odom")
+        return await follow(client, clock, path, arm=arm)
+
+    _run(main, robot, endpoint, json_output=json_output)
+
+
+def _run(
+    drive: Callable[["TruckClient", Clock], Coroutine[Any, Any, "Arrival"]],
+    robot: str,
+    endpoint: str,
+    *,
+    json_output: bool,
+) -> None:
+    from monstertruck_runtime.client import TruckClient
+
+    async def main(clock: Clock) -> "Arrival":
+        async with TruckClient(robot, endpoint, clock=clock, timeout=PATIENCE) as client:
+            return await drive(client, clock)
+
+    arrival = run_wall(main)
+    if json_output:
+        print_json(arrival.as_json())
+    elif not arrival.reason.exit_code:
+        print(f"{arrival.reason.text}: {arrival.text}")
+    finish(arrival.reason, f"{arrival.reason.text}: {arrival.text}")

@@ -1,0 +1,199 @@
+"""One drive to a goal or along a path, seen from outside."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Protocol, TypeVar
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder, Order
+from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER, Topic
+from monstertruckd.tools.cli.answer import ACTIVE, give
+from monstertruckd.tools.cli.output import progress, remark
+
+M = TypeVar("M", bound=Message)
+
+LOOK: Final = 0.5
+"""Seconds between two looks at the gate."""
+PATIENCE: Final = 3.0
+"""Seconds in which a path is taken on or refused."""
+
+
+class Driver(Protocol):
+    """What is needed of a ``TruckClient``."""
+
+    source: str
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Follow a topic."""
+        ...
+
+    async def get_retained(self, topic: Topic[M]) -> M | None:
+        """Newest message of a retained topic."""
+        ...
+
+    async def order(self, order: Order, lease: float = 1.0) -> None:
+        """Send an order."""
+        ...
+
+    async def go(
+        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
+    ) -> dict[str, Any]:
+        """Ask to drive to a pose, by way of places."""
+        ...
+
+    async def goal_control(self, order: GoalOrder) -> None:
+        """Pause, resume, cancel."""
+        ...
+
+    async def path(self, path: Path, lease: float = 1.0) -> None:
+        """Ask to follow a path."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How a drive ended."""
+
+    reason: Reason
+    text: str
+    length: float
+    """Metres of the first route, or of the path."""
+    elapsed: float
+    """Seconds."""
+    routes: int = 1
+    recoveries: int = 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)
+
+
+async def drive_to(
+    driver: Driver, clock: Clock, goal: tuple[float, float, float], via: Sequence[tuple[float, ...]] = (), *, arm: bool
+) -> Arrival:
+    """Send a goal and wait for its end; cancelled, it cancels the goal.
+
+    Raises:
+        RequestRefusedError: the goal or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
+        number = int((await driver.go(goal, via=via))["number"])
+        return await _watched(
+            driver,
+            clock,
+            gate,
+            arm=arm,
+            end=_goal_end(states, number),
+            undo=lambda: driver.goal_control(GoalOrder.CANCEL),
+        )
+
+
+async def _goal_end(states: Mailbox[GoalState], number: int) -> Arrival:
+    length = 0.0
+    with progress("to the goal", 1.0) as show:
+        async for state in states:
+            if state.number > number:
+                return Arrival(Reason.CANCELLED, f"{state.source} sent another goal", length, 0.0)
+            if state.number < number:
+                continue
+            if state.phase is GoalPhase.IDLE:
+                return Arrival(state.outcome, state.text, length, state.elapsed, state.routes, state.recoveries)
+            length = length or state.remaining
+            if length:
+                show(max(1.0 - state.remaining / length, 0.0))
+    raise NoAnswerError("the link to the robot was closed")
+
+
+async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool) -> Arrival:
+    """Send a path and wait for its end; cancelled, it stops the truck.
+
+    Raises:
+        RequestRefusedError: the path or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
+    with (
+        driver.subscribe(TRACKER, fifo(256)) as states,
+        driver.subscribe(GATE, latest()) as gate,
+        driver.subscribe(EVENT, fifo(256)) as events,
+        driver.subscribe(PATH, latest()) as present,
+    ):
+        await driver.path(path)
+        await _taken_on(driver, clock, events, present, path.name)
+        return await _watched(
+            driver, clock, gate, arm=arm, end=_path_end(clock, states, path.name), undo=lambda: driver.order(Order.STOP)
+        )
+
+
+async def _taken_on(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
+    try:
+        async with clock.deadline(PATIENCE):
+            while present.latest is None or present.latest.name != name:
+                for event in events.drain():
+                    if event.source == driver.source and event.severity is Severity.WARNING:
+                        raise RequestRefusedError(event.reason, event.text)
+                await clock.sleep(0.05)
+    except TimeoutError:
+        raise NoAnswerError(f"the robot did not take on the path within {PATIENCE:g} s") from None
+
+
+async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str) -> Arrival:
+    begin = clock.now()
+    with progress("along the path", 1.0) as show:
+        async for state in states:
+            if state.path != name:
+                continue
+            show(state.along / state.length if state.length else 1.0)
+            if state.outcome is not Reason.DRIVING:
+                text = f"{state.along:.2f} of {state.length:.2f} m, {state.cross_track:+.3f} m beside it"
+                return Arrival(state.outcome, text, state.length, (clock.now() - begin) / SECOND)
+    raise NoAnswerError("the link to the robot was closed")
+
+
+async def _watched(
+    driver: Driver,
+    clock: Clock,
+    gate: Mailbox[GateState],
+    *,
+    arm: bool,
+    end: Awaitable[Arrival],
+    undo: Callable[[], Awaitable[None]],
+) -> Arrival:
+    """Wait for the end, and say why the truck stands meanwhile; ``undo`` if that is cut short."""
+    watching = asyncio.create_task(_say_why_it_stands(gate, clock))
+    ending = asyncio.ensure_future(end)
+    try:
+        if arm:
+            answer = await give(driver, clock, Order.ARM)
+            if answer.reason is not Reason.OK:
+                raise RequestRefusedError(answer.reason, f"arm refused: {answer.text}")
+        return await ending
+    except BaseException:
+        await undo()
+        raise
+    finally:
+        watching.cancel()
+        ending.cancel()
+
+
+async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock) -> None:
+    said = ""
+    while True:
+        await clock.sleep(2 * LOOK)
+        state = gate.latest
+        if state is None or state.mode in ACTIVE:
+            said = ""
+            continue
+        why = ", ".join(reason.text for reason in state.reasons) or state.mode.value
+        if why != said:
+            said = why
+            remark(f"the truck stands: {why}; `monstertruckd arm` lets it drive")

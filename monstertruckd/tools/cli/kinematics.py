@@ -1,0 +1,273 @@
+"""Commands on the kinematics library: families, mobility, turning radii, steering linkage, identification."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.kinematics_fit import fit
+from monstertruckd.tools.cli.kinematics_output import figure, refusals, text
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table
+
+if TYPE_CHECKING:
+    from monstertruck_kinematics.truck import Mode
+    from monstertruck_kinematics.wheels import Wheel
+
+app = command_group("Kinematics of the truck and of every wheeled-robot family.")
+app.command("fit")(fit)
+
+Png = Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")]
+Family = Annotated[str, typer.Argument(help="Drive family; `kinematics show` lists them.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", "-s", help="Parameter as name=value, repeatable.")]
+Wheelbase = Annotated[float, typer.Option(help="Wheelbase, m.")]
+Track = Annotated[float, typer.Option(help="Track, m.")]
+
+
+@app.command("show")
+def show_command(
+    family: Annotated[str | None, typer.Argument(help="One family in detail.")] = None,
+    settings: Settings = None,
+    json_output: JsonOption = False,
+) -> None:
+    """The drive families, or one of them: inputs, parameters, mobility."""
+    from monstertruck_kinematics.catalog import FAMILIES, build_drive, parameters_of
+    from monstertruck_kinematics.mobility import analyse
+
+    with refusals():
+        drives = {kind: build_drive(kind, **_parsed(settings)) for kind in ([family] if family else FAMILIES)}
+    mobilities = {kind: analyse(drive.wheels((0.0,) * len(drive.inputs))) for kind, drive in drives.items()}
+    parameters = {kind: parameters_of(kind) | _parsed(settings) for kind in drives}
+    if json_output:
+        print_json(
+            [
+                {
+                    "family": kind,
+                    "class": mobilities[kind].robot_class,
+                    "non_holonomic": mobilities[kind].non_holonomic,
+                    "inputs": drive.inputs,
+                    "parameters": parameters[kind],
+                }
+                for kind, drive in drives.items()
+            ]
+        )
+        return
+    print_table(
+        ("family", "class (m, s)", "non-holonomic", "inputs"),
+        [
+            (kind, f"({text(mobilities[kind].robot_class)})", text(mobilities[kind].non_holonomic), text(drive.inputs))
+            for kind, drive in drives.items()
+        ],
+    )
+    if family:
+        print_table(("parameter", "value"), [(name, text(v)) for name, v in parameters[family].items()])
+
+
+@app.command("mobility", context_settings={"ignore_unknown_options": True})
+def mobility_command(
+    family: Family = "truck",
+    command: Annotated[
+        list[float] | None, typer.Argument(help="The drive's inputs, for their steering angles.")
+    ] = None,
+    settings: Settings = None,
+    wheels: Annotated[Path | None, typer.Option("--wheels", "-w", help="YAML list of wheels instead.")] = None,
+    png: Png = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Degrees of mobility, steerability and manoeuvrability, and the turning centre."""
+    from monstertruck_kinematics.catalog import build_drive
+    from monstertruck_kinematics.mobility import analyse
+
+    with refusals():
+        if wheels is not None:
+            chosen: tuple[Wheel, ...] = _read_wheels(wheels)
+        else:
+            drive = build_drive(family, **_parsed(settings))
+            chosen = drive.wheels(command or (0.0,) * len(drive.inputs))
+        mobility = analyse(chosen)
+    facts = {
+        "mobility": mobility.mobility,
+        "steerability": mobility.steerability,
+        "manoeuvrability": mobility.manoeuvrability,
+        "non_holonomic": mobility.non_holonomic,
+        "turning_centre": mobility.icr_kind,
+        "turning_centre_at": mobility.icr,
+        "turning_centre_line": mobility.icr_line,
+    }
+    if json_output:
+        print_json(facts)
+    else:
+        shown = {name: value for name, value in facts.items() if value is not None}
+        print_table(("of these wheels", "value"), [(name, text(value)) for name, value in shown.items()])
+        print_table(
+            ("wheel", "kind", "x m", "y m", "heading deg"),
+            [(w.name, type(w).__name__, f"{w.x:.3f}", f"{w.y:.3f}", f"{math.degrees(w.heading):.2f}") for w in chosen],
+            right=("x m", "y m", "heading deg"),
+        )
+    if png:
+        _draw_wheels(png, chosen, mobility.icr)
+
+
+@app.command("radius-table")
+def radius_table_command(
+    limits: Annotated[list[float] | None, typer.Option("--limit", "-l", help="Largest angle, degrees.")] = None,
+    wheelbase: Wheelbase = 0.32,
+    track: Track = 0.26,
+    png: Png = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Least turning radius by steering mode and steering limit."""
+    from monstertruck_kinematics.truck import FourWheelSteering
+
+    modes: tuple[Mode, ...] = ("front", "rear", "counter", "crab", "spot")
+    degrees = limits or [22.5, math.degrees(0.4), 25.0]
+    with refusals():
+        geometry = FourWheelSteering(wheelbase, track)
+        table = [
+            (
+                mode,
+                limit,
+                geometry.minimum_radius(mode, math.radians(limit)),
+                geometry.minimum_radius(mode, math.radians(limit), every_wheel=True),
+            )
+            for mode in modes
+            for limit in degrees
+        ]
+    if json_output:
+        names = ("mode", "limit_deg", "radius", "radius_every_wheel")
+        print_json([dict(zip(names, row, strict=True)) for row in table])
+    else:
+        print_table(
+            ("mode", "limit deg", "radius m", "if every wheel keeps the limit, m"),
+            [(mode, f"{limit:.1f}", f"{axle:.3f}", f"{every:.3f}") for mode, limit, axle, every in table],
+            right=("limit deg", "radius m", "if every wheel keeps the limit, m"),
+        )
+    if png:
+        angles = [5.0 + 0.25 * i for i in range(141)]
+        steered: tuple[Mode, ...] = ("front", "counter")
+        with figure(png, "steering limit, deg", "least turning radius, m") as axes:
+            for mode in steered:
+                radii = [geometry.minimum_radius(mode, math.radians(a)) for a in angles]
+                axes.plot(angles, radii, label=f"{mode} steering")
+            axes.legend()
+
+
+@app.command("linkage")
+def linkage_command(
+    pitman: Annotated[float, typer.Option(help="Servo arm, m.")] = 0.020,
+    drag_link: Annotated[float, typer.Option(help="Drag link, m.")] = 0.060,
+    arm: Annotated[float, typer.Option(help="Wheel arm, m.")] = 0.025,
+    arm_angle: Annotated[float, typer.Option(help="Wheel arm's inward angle, degrees.")] = 15.0,
+    king_pins: Annotated[float, typer.Option(help="Between the king-pins, m.")] = 0.200,
+    arms: Annotated[str, typer.Option(help="forward or rearward.")] = "rearward",
+    polynomials: Annotated[str, typer.Option(help="corrected, as_published or 2016.")] = "corrected",
+    png: Png = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Wheel angles over the servo angle: a linkage beside the truck's fitted front polynomials.
+
+    The truck's real lengths are published nowhere; the defaults are an example of the right size.
+    """
+    import numpy as np
+
+    from monstertruck_kinematics.families import Ackermann
+    from monstertruck_kinematics.linkage import SteeringLinkage, reachable_servo
+    from monstertruck_kinematics.polynomials import SteeringPolynomials
+
+    with refusals():
+        linkage = SteeringLinkage(pitman, drag_link, arm, math.radians(arm_angle), king_pins, arms)  # type: ignore[arg-type]
+        axle = SteeringPolynomials.named(polynomials).front  # type: ignore[arg-type]
+        right_end, left_end = reachable_servo(linkage)
+        servo = np.radians(np.arange(-45.0, 45.1, 5.0))
+        servo = servo[(servo >= right_end) & (servo <= left_end)]
+        left, right = linkage.wheels_from_servo(servo)
+        fitted_left, fitted_right = axle.wheels_from_servo(servo)
+    car = Ackermann()
+    columns = {
+        "servo": servo,
+        "linkage_left": left,
+        "linkage_right": right,
+        "linkage_ackermann_defect": car.defect(left, right),
+        "fitted_left": fitted_left,
+        "fitted_right": fitted_right,
+        "fitted_ackermann_defect": car.defect(fitted_left, fitted_right),
+    }
+    if json_output:
+        print_json({name: values.tolist() for name, values in columns.items()})
+    else:
+        rows = [
+            tuple(
+                f"{v:z.4f}" if "defect" in n else f"{math.degrees(v):z.2f}" for n, v in zip(columns, row, strict=True)
+            )
+            for row in zip(*columns.values(), strict=True)
+        ]
+        headings = tuple(n.replace("_", " ") for n in columns)
+        print_table(headings, rows, right=headings)
+        typer.echo("angles in degrees; defect: tan l - tan r - (w/L) tan l tan r, 0 for ideal Ackermann wheels")
+    if png:
+        with figure(png, "servo, deg", "wheel, deg") as axes:
+            for name in ("linkage_left", "linkage_right", "fitted_left", "fitted_right"):
+                axes.plot(np.degrees(servo), np.degrees(columns[name]), label=name.replace("_", " "))
+            axes.legend()
+
+
+def _parsed(settings: list[str] | None) -> dict[str, float | str]:
+    from monstertruck_runtime.errors import InputError
+
+    values: dict[str, float | str] = {}
+    for setting in settings or []:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: expected name=value")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            values[name] = text
+    return values
+
+
+def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
+    """Wheels from YAML: a list of mappings with `kind` (fixed, steered, caster, swedish) and the wheel's fields."""
+    import yaml
+
+    from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SteeredWheel, SwedishWheel, checked
+    from monstertruck_runtime.errors import InputError
+
+    kinds: dict[str, type[Wheel]] = {
+        "fixed": FixedWheel,
+        "steered": SteeredWheel,
+        "caster": CasterWheel,
+        "swedish": SwedishWheel,
+    }
+    try:
+        rows = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: {error}") from error
+    if not isinstance(rows, list):
+        raise InputError(f"{path}: expected a list of wheels")
+    wheels = []
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row, dict) or row.get("kind") not in kinds:
+            raise InputError(f"{path}: wheel {number}: expected a mapping with kind {', '.join(kinds)}")
+        fields = {"name": str(number)} | {name: value for name, value in row.items() if name != "kind"}
+        for name, value in fields.items():
+            if name not in ("name", "group") and not isinstance(value, int | float):
+                raise InputError(f"{path}: wheel {number}: {name} is {value!r}: expected a number")
+        try:
+            wheels.append(kinds[row["kind"]](**fields))
+        except TypeError as error:
+            raise InputError(f"{path}: wheel {number}: {str(error).partition('__init__() ')[2]}") from error
+    return checked(wheels)
+
+
+def _draw_wheels(path: Path, wheels: "tuple[Wheel, ...]", icr: tuple[float, float] | None) -> None:
+    with figure(path, "y, m (left)", "x, m (forward)") as axes:
+        for wheel in wheels:
+            along, aside = math.cos(wheel.heading), math.sin(wheel.heading)
+            ends = (-wheel.radius, wheel.radius)
+            axes.plot([wheel.y + e * aside for e in ends], [wheel.x + e * along for e in ends], linewidth=6.0)
+            axes.annotate(wheel.name, (wheel.y, wheel.x))
+            if icr is not None and wheel.sliding_row is not None:
+                axes.plot([wheel.y, icr[1]], [wheel.x, icr[0]], color="grey", linewidth=0.7)
+        axes.set_aspect("equal")
+        axes.invert_xaxis()

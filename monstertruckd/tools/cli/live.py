@@ -1,0 +1,101 @@
+"""Commands that watch a running robot: the live screen, and plain messages."""
+
+import asyncio
+import math
+import sys
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, TopicArgument
+from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, remark, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+
+SILENCE: Final = 2.0
+"""Seconds without a message after which `echo` says what it is waiting for."""
+
+SHORT: Final = 16
+"""Values of a list that a terminal shows; text it cuts at four times as many characters."""
+
+
+def status(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    once: Annotated[bool, typer.Option("--once", help="Print the state once and end.")] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Machine-readable output; implies --once.")] = False,
+) -> None:
+    """Live screen of a running robot. Piped or with --once it prints the state once."""
+    from monstertruckd.tools.status.watch import print_once, watch
+
+    if once or json_output or not on_terminal(sys.stdout):
+        until_stopped(lambda clock: print_once(clock, robot, endpoint, json_output=json_output))
+    else:
+        until_stopped(lambda clock: watch(clock, robot, endpoint))
+
+
+def echo(
+    topic: TopicArgument,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
+    timeout: Annotated[
+        float | None, typer.Option(min=0.0, help="Give up after so many seconds without a message; exit code 5.")
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Print a topic's messages as they come, one JSON object per line; on a terminal long lists are cut short."""
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.mailbox import fifo
+    from monstertruck_schemas.topics import BY_NAME
+
+    row = BY_NAME.get(topic)
+    if row is None:
+        raise NotFoundError(f"no topic {topic!r}; known: {', '.join(BY_NAME)}")
+
+    short = on_terminal(sys.stdout) and not json_output
+
+    async def main(clock: Clock) -> None:
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            with client.subscribe(row, fifo(256)) as messages:
+                waiting = asyncio.create_task(_explain_silence(client, clock, topic))
+                seen = 0
+                try:
+                    while seen != count:
+                        async with clock.deadline(math.inf if timeout is None else timeout):
+                            message = await messages.next()
+                        waiting.cancel()
+                        print_json(shortened(message.model_dump(mode="json")) if short else message, indent=None)
+                        seen += 1
+                except TimeoutError:
+                    raise NoAnswerError(f"no message of {topic} within {timeout:g} s") from None
+                finally:
+                    waiting.cancel()
+
+    until_stopped(main)
+
+
+async def _explain_silence(client: "TruckClient", clock: Clock, topic: str) -> None:
+    await clock.sleep(SILENCE)
+    if await client.alive():
+        remark(f"robot {client.robot!r} is there but publishes no {topic} yet; waiting")
+    else:
+        remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic}")
+
+
+def shortened(value: Any) -> Any:
+    """``value`` with long lists and texts cut, each saying how long it was."""
+    match value:
+        case dict():
+            return {name: shortened(inner) for name, inner in value.items()}
+        case list() if len(value) > SHORT:
+            return [*map(shortened, value[: SHORT // 2]), f"... {len(value)} values"]
+        case list():
+            return [shortened(inner) for inner in value]
+        case str() if len(value) > 4 * SHORT:
+            return f"{value[: 4 * SHORT]}... {len(value)} characters"
+        case _:
+            return value

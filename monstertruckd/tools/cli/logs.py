@@ -1,0 +1,226 @@
+"""Commands on logs: look inside, repair, export, play back."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.options import complete_topic
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, progress, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.logs.selection import Progress, Selection
+
+app = command_group("Look inside, repair and export logs (MCAP).")
+
+TopicsOption = Annotated[
+    list[str] | None, typer.Option("--topic", "-t", help="Only these topics.", autocompletion=complete_topic)
+]
+StartOption = Annotated[float, typer.Option("--start", min=0.0, help="Seconds after the log's begin.")]
+EndOption = Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")]
+
+
+class ExportFormat(StrEnum):
+    """What a log can be written as."""
+
+    CSV = "csv"
+    NPZ = "npz"
+    ROS2 = "ros2"
+    MCAP = "mcap"
+
+
+LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.", show_default=False)]
+
+
+@app.command("list")
+def list_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of logs, with all folders in it.")] = Path("logs"),
+    json_output: JsonOption = False,
+) -> None:
+    """The logs of a folder: when, how long, how much, finished or not."""
+    from monstertruckd.tools.logs.listing import LogState, list_logs
+
+    logs = list_logs(folder)
+    if json_output:
+        print_json([asdict(log) for log in logs])
+        return
+    if not logs:
+        remark(f"{folder}: no logs")
+        return
+    print_table(
+        ("log", "begins (UTC)", "seconds", "messages", "MB", "state"),
+        [
+            (
+                str(log.path),
+                log.started or "-",
+                "-" if log.duration is None else f"{log.duration:.1f}",
+                "-" if log.messages is None else str(log.messages),
+                f"{log.size / 1e6:.2f}",
+                log.state.value,
+            )
+            for log in logs
+        ],
+        right=("seconds", "messages", "MB"),
+    )
+    if any(log.state in {LogState.UNFINISHED, LogState.DAMAGED} for log in logs):
+        remark("`monstertruckd log recover FILE` finishes an unfinished log and mends a damaged one")
+
+
+@app.command("info")
+def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
+    """What a log holds: topics, counts, rates, attachments, damage."""
+    from monstertruckd.recorder.recover import in_use
+    from monstertruckd.tools.logs.info import info
+
+    summary = info(log)
+    if json_output:
+        print_json(summary)
+        return
+    size = f"{summary['size'] / 1e6:.2f} MB"
+    print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
+    if summary["damage"]:
+        mend = "it is being written" if in_use(log) else "`monstertruckd log recover` repairs it"
+        print(f"damaged: {summary['damage']}; {mend}")
+    rows = [
+        (
+            name,
+            row["schema"],
+            str(row["messages"]),
+            "" if row["rate"] is None else f"{row['rate']:.1f}",
+            f"{row['bytes'] / 1e3:.1f}",
+        )
+        for name, row in summary["topics"].items()
+    ]
+    print_table(("topic", "schema", "messages", "Hz", "kB unpacked"), rows, right=("messages", "Hz", "kB unpacked"))
+    for name, bytes_ in summary["attachments"].items():
+        print(f"attached: {name} ({bytes_} bytes)")
+
+
+@app.command("recover")
+def recover_command(
+    log: LogArgument,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Default: repaired in place.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Repair an unfinished or truncated log: everything up to the first error is kept."""
+    from monstertruckd.recorder.recover import recover
+
+    done = recover(log, output or log)
+    if json_output:
+        print_json(asdict(done))
+    else:
+        print(f"{done.path}: {done.messages} messages kept" + (f"; it {done.damage}" if done.damage else ", was sound"))
+
+
+@app.command("report")
+def report_command(
+    log: LogArgument,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="HTML file; default: beside the log.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Write one HTML page about a log: way, states, events, signals, health, losses. It needs no network."""
+    from monstertruckd.tools.logs.report import report
+
+    with _reading("report", log) as done:
+        written = report(log, output, done)
+    if json_output:
+        print_json(written.figures())
+    else:
+        typer.echo(str(written.file))
+
+
+@app.command("export")
+def export_command(
+    log: LogArgument,
+    output: Annotated[
+        Path, typer.Argument(help="Folder of the tables; new folder of the bag; new MCAP file.", show_default=False)
+    ],
+    form: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.CSV,
+    topics: TopicsOption = None,
+    start: StartOption = 0.0,
+    end: EndOption = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
+    from monstertruckd.tools.logs.selection import Selection
+
+    selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
+    with needs_extra("logs"):
+        export = _exporter(form)
+    with _reading("export", log) as done:
+        files = export(log, output, selection, done)
+    if not files:
+        remark(f"{log}: no message of these topics and times")
+    if json_output:
+        print_json(files)
+        return
+    for topic, file in files.items():
+        typer.echo(f"{topic:20} {file}")
+
+
+@app.command("view")
+def view_command(
+    log: LogArgument,
+    save: Annotated[Path | None, typer.Option("--save", help="Write this rerun file (.rrd), show nothing.")] = None,
+    topics: TopicsOption = None,
+    start: StartOption = 0.0,
+    end: EndOption = None,
+) -> None:
+    """Show a log in the rerun viewer, laid out, without any network (extra `view`)."""
+    from monstertruckd.tools.logs.selection import Selection
+
+    selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
+    with needs_extra("view"):
+        from monstertruckd.tools.logs.rerun_log import convert
+        from monstertruckd.tools.logs.view import show
+    with TemporaryDirectory(prefix="monstertruckd-") as scratch:
+        recording = save or Path(scratch) / f"{log.stem}.rrd"
+        with _reading("convert", log) as done:
+            convert(log, recording, selection, done)
+        if save is None:
+            show(recording)
+        else:
+            typer.echo(str(save))
+
+
+@contextmanager
+def _reading(what: str, log: Path) -> "Iterator[Progress]":
+    """Progress over the bytes of a log."""
+    with progress(what, log.stat().st_size if log.is_file() else None) as done:
+        yield done
+
+
+def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress], dict[str, Path]]":
+    match form:
+        case ExportFormat.CSV:
+            from monstertruckd.tools.logs.export import export_csv as export
+        case ExportFormat.NPZ:
+            from monstertruckd.tools.logs.export import export_npz as export
+        case ExportFormat.ROS2:
+            from monstertruckd.tools.logs.ros2 import export_ros2 as export
+        case ExportFormat.MCAP:
+            from monstertruckd.tools.logs.wall_mcap import export_mcap as export
+    return export
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Say which extra of the distribution brings a library that is missing.
+
+    Raises:
+        NotFoundError: an import inside failed.
+    """
+    from monstertruck_runtime.errors import NotFoundError
+
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        text = f"{error.name} is not installed: it comes with the extra {name!r} "
+        text += f"(pip install 'monstertruckd[{name}]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
+        raise NotFoundError(text) from None

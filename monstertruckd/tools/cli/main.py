@@ -1,0 +1,92 @@
+"""The ``monstertruckd`` command: mounts the command groups."""
+
+import typer
+
+from monstertruckd import __version__
+from monstertruckd.tools.cli import (
+    calibrate,
+    config,
+    demo,
+    devices,
+    doctor,
+    drill,
+    drive,
+    goto,
+    kinematics,
+    live,
+    logs,
+    maps,
+    orders,
+    plan,
+    plan_server,
+    replay,
+    robot,
+    service,
+    usb,
+)
+from monstertruckd.tools.cli.output import HELP_STYLE, HELP_WIDTH, CommandGroup
+
+app = typer.Typer(
+    name="monstertruckd",
+    cls=CommandGroup,
+    help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=HELP_STYLE,
+    context_settings=HELP_WIDTH,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    pass
+
+
+app.command("demo")(demo.demo)
+app.command("simulate")(demo.simulate)
+app.command("drill")(drill.drill)
+app.command("run")(robot.run)
+app.command("check-config", hidden=True)(config.show)  # its name before there were others
+app.command("topics")(robot.topics)
+app.command("reasons")(robot.reasons)
+app.command("status")(live.status)
+app.command("echo")(live.echo)
+app.command("drive")(drive.drive)
+app.command("arm")(orders.arm)
+app.command("disarm")(orders.disarm)
+app.command("estop")(orders.estop)
+app.command("reset")(orders.reset)
+app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
+app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
+app.command("track")(goto.track)
+app.command("plan-server")(plan_server.plan_server)
+app.command("replay")(replay.replay)
+app.command("emulate")(devices.emulate)
+app.command("probe")(devices.probe)
+app.command("usb")(usb.usb)
+app.command("find-port")(usb.find_port)
+app.command("doctor")(doctor.doctor)
+app.command("install-service")(service.install_service)
+app.command("uninstall-service")(service.uninstall_service)
+app.add_typer(config.app, name="config")
+app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(logs.app, name="log")
+app.add_typer(kinematics.app, name="kinematics")
+app.add_typer(maps.app, name="map")
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""Commands on maps: build one from a log, look at it, take it from a robot, localise in it."""
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruckd.tools.cli.options import ENDPOINT
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
+
+if TYPE_CHECKING:
+    from monstertruck_estimation.slam.exchange import Estimate, WorkerOutput
+    from monstertruckd.tools.logs.scans import ScanLog
+
+app = command_group("Build, show, save and use occupancy maps.")
+
+Log = Annotated[Path, typer.Argument(help="MCAP, CARMEN text (.gz), npz or URG text (.dat).", show_default=False)]
+MapPlace = Annotated[Path, typer.Argument(help="Folder of a saved map, or a map_server YAML.", show_default=False)]
+Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
+
+
+@app.command("build")
+def build(
+    log: Log,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
+    png: Png = None,
+    front: Annotated[str, typer.Option(help="Scan front end: planar or kiss.")] = "planar",
+    json_output: JsonOption = False,
+) -> None:
+    """A map from a log's scans, and its odometry where there is one."""
+    from monstertruck_estimation.slam.exchange import WorkerInput
+    from monstertruck_estimation.slam.settings import SlamConfig
+    from monstertruck_estimation.slam.step import EstimationWorker
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.tools.logs.scans import read_scans
+
+    if front not in ("planar", "kiss"):
+        raise InputError(f"--front {front}: expected planar or kiss")
+    scans = read_scans(log)
+    worker = EstimationWorker()
+    facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front}))
+    done: WorkerOutput = worker.step(WorkerInput(finish=True, whole=True, save=output))
+    if done.error is not None:
+        raise InputError(done.error)
+    assert done.whole is not None
+    rows, columns = done.whole.cells.shape
+    facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
+    if png is not None:
+        from monstertruck_estimation.slam.storage import load
+
+        _draw(png, load(output))
+    _print(facts, json_output)
+
+
+@app.command("show")
+def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
+    """What a saved map holds."""
+    from monstertruck_estimation.slam.storage import load
+    from monstertruck_runtime.map_files import FREE, OCCUPIED
+
+    saved = load(place)
+    cells, step = saved.grid.cells, saved.grid.resolution
+    facts: dict[str, Any] = {
+        "map": place,
+        "resolution_m": step,
+        "width_m": saved.grid.size[0],
+        "height_m": saved.grid.size[1],
+        "free_m2": float((cells == FREE).sum() * step**2),
+        "occupied_cells": int((cells == OCCUPIED).sum()),
+        "key_scans": 0 if saved.graph is None else len(saved.graph.poses),
+        "relations": 0 if saved.graph is None else len(saved.graph.edges["edge_loop"]),
+        "loop_relations": 0 if saved.graph is None else int(saved.graph.edges["edge_loop"].sum()),
+    }
+    if png is not None:
+        _draw(png, saved)
+    _print(facts, json_output)
+
+
+@app.command("save")
+def save(
+    output: Annotated[Path, typer.Argument(help="YAML file; its PNG goes beside it.", show_default=False)],
+    robot: Annotated[str, typer.Option(help="Name in the keys.")] = "truck",
+    endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the robot.")] = ENDPOINT,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the map.")] = 5.0,
+) -> None:
+    """The map that a running robot has published, as map_server files."""
+    from monstertruck_estimation.slam.exchange import Patch
+    from monstertruck_estimation.slam.storage import trinary
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock, run_wall
+    from monstertruck_runtime.errors import NoAnswerError
+    from monstertruck_runtime.mailbox import latest
+    from monstertruck_runtime.map_files import save_map
+    from monstertruck_schemas.state import Grid
+    from monstertruck_schemas.topics import MAP
+
+    async def newest(clock: Clock) -> Grid:
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            with client.subscribe(MAP, latest()) as maps:
+                try:
+                    async with clock.deadline(timeout):
+                        return await maps.next()
+                except TimeoutError:
+                    raise NoAnswerError(f"{robot} published no map within {timeout:g} s") from None
+
+    grid = run_wall(newest)
+    cells = grid.cells.reshape(grid.height, grid.width)
+    save_map(trinary(Patch(cells, (grid.origin.x, grid.origin.y), grid.resolution)), output.with_suffix(".yaml"))
+    remark(f"wrote {output.with_suffix('.yaml')}")
+
+
+@app.command("load")
+def load_command(
+    place: MapPlace,
+    config: Annotated[Path, typer.Option("--config", "-c", help="The robot's configuration.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
+) -> None:
+    """A configuration with which the robot localises in a saved map."""
+    import yaml
+
+    from monstertruck_estimation.slam.storage import load
+    from monstertruck_runtime.small_files import replace_file
+    from monstertruckd.config.load import load_truck
+
+    load(place)
+    values = {
+        "include": str(config.resolve()),
+        "version": 1,
+        "slam": {"mode": "localisation", "map": str(place.resolve())},
+    }
+    replace_file(output, yaml.safe_dump(values, sort_keys=False))
+    load_truck(output)
+    remark(f"wrote {output}: `monstertruckd run --config {output}` localises in {place}")
+
+
+@app.command("localise")
+def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
+    """Where a log's scans were taken in a saved map, without knowing where it begins."""
+    from monstertruck_estimation.slam.settings import SlamConfig
+    from monstertruck_estimation.slam.step import EstimationWorker
+    from monstertruck_estimation.slam.storage import load
+    from monstertruckd.tools.logs.scans import read_scans
+
+    saved, scans = load(place), read_scans(log)
+    facts, estimates = _run(EstimationWorker(), scans, SlamConfig(mode="localisation", map=place))
+    known = [estimate for estimate in estimates if estimate.standing.value in ("localised", "degenerate")]
+    facts |= {"map": place, "localised": len(known)}
+    if known:
+        first = known[0]
+        facts |= {"found_after_s": (first.stamp - scans.scans[0].stamp) / 1e9, "found_at": first.pose}
+        facts["last_pose"] = known[-1].pose
+    if png is not None:
+        _draw(png, saved, [estimate.pose for estimate in known])
+    _print(facts, json_output)
+
+
+def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["Estimate"]]:
+    """Every scan through the worker; what to tell of it, and the estimates."""
+    from monstertruck_estimation.slam.exchange import Start, WorkerInput
+
+    first = log.scans[0].odom or (0.0, 0.0, 0.0)
+    worker.step(WorkerInput(start=Start(config, first)))
+    estimates: list[Estimate] = []
+    refused = 0
+    counts: dict[str, int] = {}
+    with progress("scans", len(log.scans)) as advance:
+        for number, scan in enumerate(log.scans, start=1):
+            outputs: WorkerOutput = worker.step(WorkerInput(scan=scan))
+            refused += outputs.refused is not None
+            counts = outputs.counts
+            if outputs.estimate is not None:
+                estimates.append(outputs.estimate)
+            advance(number)
+    standings = Counter(estimate.standing.value for estimate in estimates)
+    offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
+    facts: dict[str, Any] = {
+        "log": log.make,
+        "seconds": (log.scans[-1].stamp - log.scans[0].stamp) / 1e9,
+        **counts,
+        "left_out": refused,
+        "standing": dict(standings),
+        "odometry_ahead_s": offsets[-1] if offsets else None,
+    }
+    return facts, estimates
+
+
+def _print(facts: dict[str, Any], json_output: bool) -> None:
+    if json_output:
+        print_json(facts)
+        return
+    for name, value in facts.items():
+        text = f"{value:.2f}" if isinstance(value, float) else str(value)
+        print(f"{name.replace('_', ' '):18} {text}")
+
+
+def _draw(path: Path, saved: Any, way: Any = ()) -> None:
+    """The grid with the poses of its key scans, or with another way."""
+    import numpy as np
+
+    from monstertruckd.tools.cli.kinematics_output import figure
+
+    grid = saved.grid
+    shades = np.choose(grid.cells.astype(int) // 100 + 1, (0.8, 1.0, 0.0))
+    (x0, y0), (width, height) = grid.origin, grid.size
+    poses = np.array(way).reshape(-1, 3) if len(way) or saved.graph is None else saved.graph.poses
+    with figure(path, "x, m", "y, m") as axes:
+        extent = (x0, x0 + width, y0, y0 + height)
+        axes.imshow(shades, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
+        axes.plot(
+            poses[:, 0], poses[:, 1], color="#e0482f", linewidth=1.2, label="localised" if len(way) else "key scans"
+        )
+        axes.legend(loc="upper right")
+        axes.set_aspect("equal")

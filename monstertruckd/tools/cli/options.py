@@ -1,0 +1,90 @@
+"""Options and arguments that many commands share, with what a shell completes for them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from monstertruck_runtime.errors import InputError
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
+    """Topics with what they carry."""
+    from monstertruck_schemas.topics import TOPICS
+
+    return ((topic.name, topic.doc) for topic in TOPICS if topic.name.startswith(incomplete))
+
+
+def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
+    """Roles and kinds of devices."""
+    from monstertruck_drivers.catalog import BY_ROLE
+
+    words = [(role, kind.name) for role, kind in BY_ROLE.items()]
+    words += [(kind.name, role) for role, kind in BY_ROLE.items()]
+    return (word for word in words if word[0].startswith(incomplete))
+
+
+def complete_role(incomplete: str) -> list[str]:
+    """Places for devices in a configuration."""
+    from monstertruckd.config.truck import Devices
+
+    return [role for role in Devices.model_fields if role.startswith(incomplete)]
+
+
+def complete_config(incomplete: str) -> list[str]:
+    """Configurations of the folder ``configs``; for anything else the shell completes file names itself."""
+    files = (*Path("configs").glob("*.yaml"), *Path("configs", "robots").glob("*.yaml"))
+    return sorted(str(file) for file in files if str(file).startswith(incomplete))
+
+
+RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.")]
+EndpointOption = Annotated[
+    str, typer.Option("--endpoint", "-e", help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT.")
+]
+ConfigOption = Annotated[
+    Path,
+    typer.Option(
+        "--config",
+        "-c",
+        help="Configuration of this robot or experiment (YAML).",
+        show_default=False,
+        autocompletion=complete_config,
+    ),
+]
+SimulatedOption = Annotated[
+    Path,
+    typer.Option("--config", "-c", help="Configuration of a simulated truck.", autocompletion=complete_config),
+]
+ConfigArgument = Annotated[
+    Path, typer.Argument(help="Configuration (YAML).", show_default=False, autocompletion=complete_config)
+]
+TopicArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Name from `monstertruckd topics`, e.g. state/pose.", show_default=False, autocompletion=complete_topic
+    ),
+]
+
+
+def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
+    """Numbers of a pose; nan and inf are let through for the planner to refuse by name.
+
+    Raises:
+        InputError: something else than numbers, or not enough of them.
+    """
+    expected = "x,y,yaw" if yaw_needed else "x,y or x,y,yaw"
+    try:
+        values = tuple(map(float, text.split(",")))
+    except ValueError:
+        values = ()
+    if len(values) != 3 and (yaw_needed or len(values) != 2):
+        raise InputError(f"pose {text!r}: expected {expected}, m and rad")
+    return values
+
+
+ViaOption = Annotated[
+    list[str] | None, typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way; may be repeated.")
+]

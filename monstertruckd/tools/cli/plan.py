@@ -1,0 +1,205 @@
+"""``monstertruckd plan``: a route over a map, without a robot."""
+
+import math
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.options import ViaOption, parse_pose
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruck_planners.route.api import RouteMap, RoutePlanner, RouteResult, Vehicle
+    from monstertruck_runtime.map_files import WorldMap
+
+
+class PlannerKind(StrEnum):
+    """Route planners."""
+
+    HYBRID = "hybrid"
+    LATTICE = "lattice"
+    GRID_ASTAR = "grid_astar"
+
+
+class SteeringChoice(StrEnum):
+    """What the truck may do with its axles."""
+
+    FRONT = "2ws"
+    COUNTER = "counter"
+    BOTH = "4ws"
+
+
+class UnknownChoice(StrEnum):
+    """What unknown cells are."""
+
+    BLOCKED = "blocked"
+    DEAR = "dear"
+    FREE = "free"
+
+
+PoseArgument = Annotated[
+    str, typer.Argument(metavar="X,Y,YAW", show_default=False, help="Pose of the base, m, m, rad.")
+]
+
+
+def plan(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="map_server YAML file.", show_default=False)],
+    start: PoseArgument,
+    goal: PoseArgument,
+    planner: Annotated[PlannerKind, typer.Option("--planner", "-p", help="Kind of planner.")] = PlannerKind.HYBRID,
+    steering: Annotated[
+        SteeringChoice, typer.Option(help="Front axle alone, both axles opposite, or both in every way.")
+    ] = SteeringChoice.BOTH,
+    via: ViaOption = None,
+    unknown: Annotated[UnknownChoice, typer.Option(help="What unknown cells are.")] = UnknownChoice.BLOCKED,
+    budget: Annotated[float, typer.Option(min=0.01, help="Time for the route and its improvement, s.")] = 1.0,
+    reproducible: Annotated[
+        bool, typer.Option("--reproducible", help="A fixed amount of work instead: equal inputs, equal routes.")
+    ] = False,
+    picture: Annotated[Path | None, typer.Option("--png", help="Draw map and route into this file.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Plan a route over a map and say what it is like.
+
+    The truck is the author's; poses are of its base. Exit code by reason when there is no route.
+    """
+    from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
+    from monstertruck_planners.route.catalog import CONFIGS, make_planner
+    from monstertruck_runtime.clock import SECOND, WallClock
+    from monstertruck_runtime.map_files import load_map
+
+    world = load_map(map_file)
+    ground = RouteMap.from_cells(world.cells, world.resolution, (*world.origin, 0.0), unknown.value)
+    vehicle = Vehicle.truck(steering.value)
+    config = CONFIGS[planner.value](budget=budget, unknown=unknown.value)
+    planning = make_planner(vehicle, config)
+    clock = WallClock()
+    if not reproducible:
+        warm_up(planning)
+    now = None if reproducible else (lambda: clock.now() / SECOND)
+    result = _route(planning, ground, vehicle, (parse_pose(start), parse_pose(goal)), via or [], now)
+    if picture is not None:
+        _draw(picture, world, vehicle, result, map_file.stem)
+    if json_output:
+        print_json(_report(result, vehicle))
+    elif result.ok:
+        _tell(result)
+    finish(result.reason, f"{result.reason.text}: {result.text}")
+
+
+def _route(
+    planner: "RoutePlanner", ground: "RouteMap", vehicle: "Vehicle", ends: tuple[tuple[float, ...], tuple[float, ...]],
+    via: list[str], now: Any,
+) -> "RouteResult":  # fmt: skip
+    from monstertruck_planners.route.hybrid import HybridPlanner
+    from monstertruck_planners.route.replan import Waypoint, plan_through
+
+    start, goal = (vehicle.reference_pose(pose) for pose in ends)
+    if not via:
+        return planner.plan(ground, start, goal, now)
+    if not isinstance(planner, HybridPlanner):
+        raise InputError("--via: expected the planner hybrid")
+    poses = [parse_pose(text, yaw_needed=False) for text in via]
+    places = [Waypoint(*(pose if len(pose) == 2 else vehicle.reference_pose(pose).tolist())) for pose in poses]
+    return plan_through(planner, ground, start, [*places, Waypoint(*goal.tolist())], now)
+
+
+def _report(result: "RouteResult", vehicle: "Vehicle") -> dict[str, Any]:
+    from monstertruck_planners.route.motion import moved
+
+    report: dict[str, Any] = {"reason": result.reason, "text": result.text, "statistics": result.statistics}
+    if result.path is not None:
+        path = result.path
+        report |= {
+            "length": path.length,
+            "backward": path.backward,
+            "cusps": path.cusps,
+            "cost": result.cost,
+            "least_radius": 1 / path.greatest_curvature if path.greatest_curvature else None,
+            "reference": path.reference,
+            "segments": [
+                {
+                    "kind": s.kind,
+                    "length": s.length,
+                    "direction": s.direction,
+                    "curvature": s.curvature,
+                    "sideslip": s.sideslip,
+                    "steering": s.steering,
+                }
+                for s in path.segments
+            ],
+            "poses": path.base_poses(0.05).tolist(),
+        }
+    elif result.poses is not None:
+        report |= {"cost": result.cost, "poses": moved(result.poses, -vehicle.reference).tolist()}
+    return report
+
+
+def _tell(result: "RouteResult") -> None:
+    statistics = result.statistics
+    first = f", first route after {statistics['first_s'] * 1e3:.1f} ms" if statistics.get("elapsed_s") else ""
+    if result.path is None:
+        print(f"way of cost {result.cost:.2f} m, not drivable as it is{first}")
+        return
+    path = result.path
+    tightest = f", least radius {1 / path.greatest_curvature:.3f} m" if path.greatest_curvature else ""
+    driven = f"{path.length:.2f} m ({path.backward:.2f} m backward), {path.cusps} changes of direction"
+    print(f"route of {driven}{tightest}{first}")
+
+
+def _draw(file: Path, world: "WorldMap", vehicle: "Vehicle", result: "RouteResult", name: str) -> None:
+    """Map, route and footprints.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    import matplotlib as mpl
+    import numpy as np
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+    from matplotlib.patches import Rectangle
+
+    from monstertruck_planners.collision import Footprint
+    from monstertruck_planners.route.motion import moved
+
+    width, height = world.size
+    figure, axis = plt.subplots(figsize=(9, min(max(9 * height / width, 3), 14)))
+    shades = np.select([world.cells < 0, world.cells >= 50], [0.75, 0.15], 1.0)
+    x, y = world.origin
+    axis.imshow(shades, origin="lower", cmap="gray", vmin=0, vmax=1, extent=(x, x + width, y, y + height))
+    if result.path is not None:
+        samples = result.path.sample(0.02)
+        base = moved(samples.poses, -vehicle.reference)
+        for direction, colour, label in ((1, "C0", "forward"), (-1, "C3", "backward")):
+            own = np.where((samples.direction == direction)[:, None], base[:, :2], np.nan)
+            if np.isfinite(own).any():
+                axis.plot(own[:, 0], own[:, 1], colour, lw=1.5, label=label)
+        footprint = Footprint()
+        for px, py, yaw in base[:: max(len(base) // 40, 1)]:
+            axis.add_patch(
+                Rectangle(
+                    (px - footprint.half_length, py - footprint.half_width),
+                    2 * footprint.half_length, 2 * footprint.half_width, angle=math.degrees(yaw),
+                    rotation_point=(px, py), fill=False, lw=0.5, color="0.4",
+                )
+            )  # fmt: skip
+        axis.legend(loc="upper right")
+        axis.set_title(f"{name}: {result.path.length:.2f} m, {result.path.cusps} changes of direction")
+    elif result.poses is not None:
+        base = moved(result.poses, -vehicle.reference)
+        axis.plot(base[:, 0], base[:, 1], "C0", lw=1.5)
+        axis.set_title(f"{name}: way over the grid")
+    else:
+        axis.set_title(f"{name}: {result.reason.text}")
+    axis.set(xlabel="x, m", ylabel="y, m")
+    figure.tight_layout()
+    try:
+        figure.savefig(file, dpi=110)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot draw: {error}") from error
+    finally:
+        plt.close(figure)

@@ -1,0 +1,128 @@
+"""`replay`: a log on Zenoh once more, or computed again and compared."""
+
+import math
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruckd.tools.cli.logs import LogArgument, TopicsOption
+from monstertruckd.tools.cli.options import ENDPOINT
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, progress, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.replay_check.comparison import Greatest, TopicComparison
+    from monstertruckd.tools.replay_check.result import Check
+
+CHECK = "Compute the log's outputs again from its sensors and compare them."
+CONFIG = "With --check: compute with this configuration and show what it would have changed."
+TOLERANCE = "With --check: greatest difference that agrees, in m, rad and so on; 0 = equal bit for bit."
+
+ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise"
+
+
+def replay(
+    log: LogArgument,
+    robot: Annotated[str, typer.Option("--robot", "-r", help="Name to replay under.")] = "truck",
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = ENDPOINT,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
+    topics: TopicsOption = None,
+    check: Annotated[bool, typer.Option("--check", help=CHECK)] = False,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help=CONFIG)] = None,
+    tolerance: Annotated[float | None, typer.Option("--tolerance", min=0, help=TOLERANCE)] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber; or check it.
+
+    Ctrl-C or SIGTERM end it like its last message does, with exit code 0. With --check nothing is published: what the
+    robot made of its sensors is computed once more and held against what it recorded.
+    """
+    if check:
+        _check(log, config, tolerance, json_output=json_output)
+        return
+    if config is not None or tolerance is not None or json_output:
+        raise typer.BadParameter("--config, --tolerance and --json need --check")
+    from monstertruckd.tools.logs.replay import replay_log
+
+    with suppress(KeyboardInterrupt), progress("replay", log.stat().st_size if log.exists() else None) as done:
+        count = replay_log(log, robot, endpoint, speed, topics, done)
+        remark(f"{count} messages replayed")
+
+
+def _check(log: Path, config: Path | None, tolerance: float | None, *, json_output: bool) -> None:
+    from monstertruckd.tools.replay_check import check_log, parts_of
+
+    with progress("check", sum(part.stat().st_size for part in parts_of(log)) if log.is_file() else None) as done:
+        result = check_log(log, config, tolerance, done)
+    if json_output:
+        print_json(result.figures())
+    else:
+        _show(result)
+    finish(result.reason, _verdict(result))
+
+
+def _show(result: "Check") -> None:
+    whose = "the log's own configuration" if result.config is None else str(result.config)
+    parts = f" (a run of {len(result.parts)} parts)" if len(result.parts) > 1 else ""
+    print(f"{result.log}{parts}  {result.duration:.1f} s with {whose}")
+    print_table(
+        ("topic", "compared", "equal", "missing", "extra", "greatest difference"),
+        [
+            (
+                row.topic.name,
+                str(row.compared),
+                str(row.equal),
+                str(row.missing),
+                str(row.surplus(result.end)),
+                _greatest(row),
+            )
+            for row in result.topics
+        ],
+        right=("compared", "equal", "missing", "extra"),
+    )
+    print(f"{result.equal} of {result.compared} outputs equal bit for bit")
+    if result.first is not None:
+        first = result.first
+        fields = ", ".join(first.fields) or "header"
+        print(f"first difference: {first.topic} number {first.sequence} at {first.at:.2f} s: {fields}")
+    if result.rounded:
+        remark(f"{ROUNDED}: try --tolerance {result.sufficient:g}")
+    for message in result.unreadable:
+        remark(f"{message.topic} number {message.sequence} at {message.at:.2f} s was left out: {message.error}")
+    if result.left_out is not None:
+        remark(f"goals and tracker are left out: {result.left_out}")
+    for topic, count in result.lost.items():
+        remark(f"{count} messages of {topic} never reached the log")
+
+
+def _greatest(row: "TopicComparison") -> str:
+    from monstertruckd.tools.replay_check.difference import Kind
+
+    known = (row.greatest[kind] for kind in Kind if kind in row.greatest)
+    parts = [f"{_amount(one)} at {one.at:.1f} s" for one in known]
+    return ", ".join(parts) or ("" if row.equal == row.compared else "header")
+
+
+def _amount(one: "Greatest") -> str:
+    from monstertruckd.tools.replay_check.difference import Kind
+
+    match one.kind:
+        case _ if math.isinf(one.value):
+            return f"other {one.field}"
+        case Kind.LENGTH:
+            return f"{one.value * 100:.2g} cm"
+        case Kind.ANGLE:
+            return f"{math.degrees(one.value):.2g}°"
+        case _:
+            return f"{one.field} {one.value:.2g}"
+
+
+def _verdict(result: "Check") -> str:
+    from monstertruck_schemas.reasons import Reason
+
+    if result.reason is Reason.LOG_DAMAGED:
+        return f"{result.log}: {result.damage}"
+    if result.reason is Reason.REPLAY_DIFFERS:
+        return f"{result.log}: {Reason.REPLAY_DIFFERS.text}"
+    return ""

@@ -1,0 +1,74 @@
+"""Commands of the robot itself: run the daemon, print its tables of topics and reasons."""
+
+from typing import Annotated
+
+import typer
+
+from monstertruckd.tools.cli.options import ConfigOption
+from monstertruckd.tools.cli.output import JsonOption, print_json, print_table
+
+
+def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
+    """Run the daemon until SIGTERM or Ctrl-C: neutral first, then everything is closed in order."""
+    from monstertruckd.run import run_daemon
+
+    raise typer.Exit(run_daemon(config, verbose=verbose).exit_code)
+
+
+def topics(json_output: JsonOption = False) -> None:
+    """Print the topic table: every key, its message, rate, writer and who keeps it."""
+    from monstertruck_schemas.topics import TOPICS
+
+    if json_output:
+        rows = [
+            {
+                "name": topic.name,
+                "key": topic.key("<robot>"),
+                "schema": topic.schema_name,
+                "rate_hz": topic.rate,
+                "stale_after_s": topic.stale_after,
+                "writer": topic.writer.value,
+                "logged": topic.logged,
+                "retained": topic.retained,
+                "doc": topic.doc,
+            }
+            for topic in TOPICS
+        ]
+        print_json(rows)
+        return
+    print_table(
+        ("name", "schema", "Hz", "stale s", "writer", "kept", "what"),
+        [
+            (
+                topic.name,
+                topic.schema_name,
+                "" if topic.rate is None else f"{topic.rate:g}",
+                "" if topic.stale_after is None else f"{topic.stale_after:g}",
+                topic.writer.value,
+                " ".join(word for word, is_so in (("logged", topic.logged), ("retained", topic.retained)) if is_so),
+                topic.doc,
+            )
+            for topic in TOPICS
+        ],
+        right=("Hz", "stale s"),
+        title="Topics: mt/<robot>/<name>",
+    )
+
+
+def reasons(
+    json_output: JsonOption = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="The table of docs/command-line.md.")] = False,
+) -> None:
+    """Print the reasons of events, refusals and ends, each with the exit code it gives a command."""
+    from monstertruck_schemas.reasons import Reason
+
+    if markdown:
+        for reason in sorted(Reason, key=lambda reason: reason.exit_code):
+            print(f"| {reason.exit_code} | `{reason.value}` | {reason.text} |")
+        return
+
+    if json_output:
+        print_json([{"reason": reason, "exit_code": reason.exit_code, "text": reason.text} for reason in Reason])
+        return
+    rows = [(reason.value, str(reason.exit_code), reason.text) for reason in Reason]
+    print_table(("reason", "exit code", "what"), rows, right=("exit code",))

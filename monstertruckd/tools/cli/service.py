@@ -1,0 +1,100 @@
+"""Commands of the service: install it into systemd and udev, take it out again."""
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from monstertruck_runtime.errors import NotPermittedError
+from monstertruckd.tools.cli.options import complete_config
+from monstertruckd.tools.cli.output import JsonOption, print_json, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.install.apply import Report
+
+T = TypeVar("T")
+
+RootOption = Annotated[
+    Path, typer.Option("--root", help="System to write into instead of this one; then no program of it is run.")
+]
+DryOption = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+
+
+def install_service(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            "-c",
+            help="Configuration of the truck, copied to /etc/monstertruckd; default: the one that is there.",
+            autocompletion=complete_config,
+        ),
+    ] = None,
+    user: Annotated[
+        str | None,
+        typer.Option(
+            help="User the service runs as; made if there is none. Default: the one it runs as, or monstertruckd."
+        ),
+    ] = None,
+    start: Annotated[bool, typer.Option("--start", help="Start or restart the service as well.")] = False,
+    dry_run: DryOption = False,
+    root: RootOption = Path("/"),
+    json_output: JsonOption = False,
+) -> None:
+    """Make the daemon a service: unit, user, udev rules and configuration; again as often as you like.
+
+    Needs root, and no network. The service starts with the computer from then on.
+    """
+    from monstertruckd.tools.install.apply import install, run_command, runs_here
+    from monstertruckd.tools.install.plan import RESTART, plan
+    from monstertruckd.tools.install.unit import Program
+
+    planned = plan(config, user, Program.present(), root)
+    report = _as_root(lambda: install(planned, root, dry=dry_run))
+    if start:
+        report.commands.append(RESTART)
+        if not dry_run:
+            _as_root(lambda: run_command(RESTART))
+    _print(report, planned.notes, dry=dry_run, json_output=json_output)
+    if not (start or dry_run) and report.changed and runs_here(root):
+        remark(f"to use it now: sudo {shlex.join(RESTART)}")
+
+
+def uninstall_service(
+    dry_run: DryOption = False, root: RootOption = Path("/"), json_output: JsonOption = False
+) -> None:
+    """Stop the service and take it out; configuration, logs, state and the user stay."""
+    from monstertruckd.tools.install.apply import uninstall
+
+    report = _as_root(lambda: uninstall(root, dry=dry_run))
+    _print(report, (), dry=dry_run, json_output=json_output)
+
+
+def _as_root(action: Callable[[], T]) -> T:
+    """Do it, or tell the command that may."""
+    try:
+        return action()
+    except NotPermittedError as error:
+        again = shlex.join(["sudo", sys.executable, "-m", "monstertruckd", *sys.argv[1:]])
+        raise NotPermittedError(f"{error}; needs root: {again}") from error
+
+
+def _print(report: "Report", notes: tuple[str, ...], *, dry: bool, json_output: bool) -> None:
+    if json_output:
+        value = {"dry_run": dry, "changed": report.changed, "notes": notes}
+        files = {str(path): change for path, change in report.changes.items()}
+        print_json(value | {"files": files, "previous": report.previous, "commands": report.commands})
+        return
+    for path, change in report.changes.items():
+        print(f"{change:8} {path}")
+    for path in report.previous:
+        print(f"kept     {path}")
+    for command in report.commands:
+        print(f"run      {shlex.join(command)}")
+    for note in notes:
+        remark(f"note: {note}")
+    if not report.changed:
+        print("nothing to change")

@@ -1,0 +1,64 @@
+"""Commands on the USB tree: show it, and find out which port a cable is in."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from monstertruck_runtime.clock import run_wall
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_role
+from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, print_json, remark
+
+
+def usb(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    local: Annotated[bool, typer.Option("--local", help="This machine's own tree, without a daemon.")] = False,
+    json_output: JsonOption = False,
+) -> None:
+    """USB hubs, ports and devices of a running robot: what hangs where, its role, state and replugs."""
+    from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
+
+    nodes = run_wall(local_tree if local else lambda clock: robot_tree(clock, robot, endpoint))
+    if json_output:
+        print_json(nodes)
+    elif not nodes:
+        remark(
+            "no USB hub on this machine" if local else f"robot {robot!r} sees no USB hub; --local shows this machine's"
+        )
+    elif on_terminal(sys.stdout):
+        console().print(*draw(nodes), sep="\n")
+    else:
+        print("\n".join(plain(nodes)))
+
+
+def find_port(
+    role: Annotated[
+        str,
+        typer.Argument(help="Role of the device: lidar, drive, steering, compass ...", autocompletion=complete_role),
+    ],
+    write: Annotated[
+        Path | None, typer.Option("--write", "-w", help="Configuration file to put the port into.")
+    ] = None,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for the cable.")] = 60.0,
+    json_output: JsonOption = False,
+) -> None:
+    """Unplug the cable: this names its hub and port and prints the line for the configuration."""
+    from monstertruck_drivers.usb.machine import Machine
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.config.truck import Devices
+    from monstertruckd.tools.cli.find_port import config_line, find_cable, require_place, write_port
+
+    if role not in Devices.model_fields:
+        raise InputError(f"no role {role!r}; known: {', '.join(Devices.model_fields)}")
+    if write is not None:
+        require_place(write, role)
+    port = run_wall(lambda clock: find_cable(role, Machine(clock), remark, wait))
+    if json_output:
+        print_json({"role": role, "port": port})
+    else:
+        print(config_line(port))
+    if write is not None:
+        write_port(write, role, port)
+        remark(f"written to {write}")

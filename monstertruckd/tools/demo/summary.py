@@ -1,0 +1,117 @@
+"""What a demo run achieved, from the log and the world's truth."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.clock import SECOND
+from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.simulation.operator import Lap
+
+GOAL_CLOSING = 0.3
+"""Greatest true closing error of the lap, m."""
+
+
+def log_figures(folder: Path) -> tuple[dict[str, int], int, tuple[Path, ...]]:
+    """Messages by topic, bytes, and files of a run's folder."""
+    logs = sorted((folder / "logs").glob("*.mcap"))
+    messages: dict[str, int] = {}
+    for log in logs:
+        for name, topic in info(log)["topics"].items():
+            messages[name] = messages.get(name, 0) + topic["messages"]
+    return messages, sum(log.stat().st_size for log in logs), (*logs, *folder.glob("map.png"))
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Figures of one lap."""
+
+    lap: Lap
+    truth: NDArray[np.float64]
+    """Shape (n, 6): time s, x m, y m, yaw rad, speed m/s, stuck."""
+    lateness_p99: float
+    """Of the control tick, s."""
+    lateness_max: float
+    messages: dict[str, int] = field(default_factory=dict)
+    """By topic."""
+    log_bytes: int = 0
+    files: tuple[Path, ...] = ()
+    digest: str | None = None
+    """sha256 over (key, stamp, payload) of every logged message; virtual clock only."""
+    speedup: float | None = None
+    """Simulated seconds per real second; virtual clock only."""
+    closed: bool = True
+    """The path is a lap: its true closing error counts."""
+
+    def _driven(self) -> NDArray[np.float64]:
+        times = self.truth[:, 0]
+        during = (times >= self.lap.start / SECOND) & (times <= self.lap.end / SECOND + 1.0)
+        return self.truth[during]
+
+    @property
+    def distance(self) -> float:
+        """Metres really driven."""
+        return float(np.hypot(*np.diff(self._driven()[:, 1:3], axis=0).T).sum())
+
+    @property
+    def closing_error(self) -> float:
+        """True distance between start and end of the closed lap, m."""
+        driven = self._driven()
+        return float(np.hypot(*(driven[-1, 1:3] - driven[0, 1:3])))
+
+    @property
+    def collided(self) -> bool:
+        """Whether the truck ever ran into something."""
+        return bool(self._driven()[:, 5].any())
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Name and value of every figure, for print."""
+        rows = [
+            ("outcome", self.lap.outcome.text + (", COLLIDED" if self.collided else "")),
+            ("lap time", f"{self.lap.seconds:.1f} s"),
+            *self._interruption_row(),
+            ("distance, true", f"{self.distance:.2f} m"),
+            ("cross-track RMS", f"{self.lap.cross_track_rms * 100:.2f} cm"),
+            *self._closing_row(),
+            ("tick lateness p99", f"{self.lateness_p99 * 1e3:.2f} ms (max {self.lateness_max * 1e3:.2f} ms)"),
+            ("messages", f"{sum(self.messages.values())} in {len(self.messages)} topics"),
+            ("log size", f"{self.log_bytes / 1e6:.2f} MB, compressed"),
+        ]
+        if self.speedup is not None:
+            rows.append(("speed", f"{self.speedup:.1f} x real time"))
+        if self.digest is not None:
+            rows.append(("sha256", self.digest))
+        return rows + [("file", str(file)) for file in self.files]
+
+    def _interruption_row(self) -> list[tuple[str, str]]:
+        """Nothing, for a lap without a stop."""
+        told = Counter(reason.text for reason in self.lap.interruptions)
+        text = ", ".join(f"{count} x {reason}" for reason, count in told.items())
+        return [("stopped on the way", f"{text}; armed again")] if text else []
+
+    def _closing_row(self) -> list[tuple[str, str]]:
+        if not self.closed:
+            return []
+        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal {GOAL_CLOSING * 100:.0f} cm)")]
+
+    def as_json(self) -> dict[str, object]:
+        """Everything as plain data."""
+        return {
+            "outcome": self.lap.outcome.value,
+            "collided": self.collided,
+            "lap_s": self.lap.seconds,
+            "distance_m": self.distance,
+            "cross_track_rms_m": self.lap.cross_track_rms,
+            "interruptions": [reason.value for reason in self.lap.interruptions],
+            "closing_error_m": self.closing_error if self.closed else None,
+            "lateness_p99_s": self.lateness_p99,
+            "lateness_max_s": self.lateness_max,
+            "messages": self.messages,
+            "log_bytes": self.log_bytes,
+            "speedup": self.speedup,
+            "sha256": self.digest,
+            "files": [str(file) for file in self.files],
+        }

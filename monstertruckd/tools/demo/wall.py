@@ -1,0 +1,184 @@
+"""The demo on the wall clock: emulators behind ptys in one process, the daemon in another, the operator here."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.live import Live
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+from monstertruckd.config.yaml_tree import load_tree
+from monstertruckd.tools.demo.summary import Summary, log_figures
+from monstertruckd.tools.simulation.operator import drive_lap
+from monstertruckd.tools.status.screen import draw
+from monstertruckd.tools.status.watch import PERIOD, Follower
+
+PATIENCE = 60.0
+"""Seconds for the two processes to come up (the first run compiles the ray caster)."""
+
+
+async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:
+    """Drive a lap over ptys.
+
+    Args:
+        clock: time.
+        config: simulated truck's configuration.
+        folder: where configuration, log, picture and outputs of the processes go.
+        seed: replaces the configuration's own.
+        screen: whether to draw the live screen.
+
+    Raises:
+        NoAnswerError: a process did not come up, or the lap was not finished.
+    """
+    endpoint = free_endpoint()
+    overlay = write_overlay(config, folder, endpoint, seed)
+    truth = folder / "truth.npz"
+    simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
+    async with (
+        program(folder / "simulate.txt", *simulate),
+        _ready((folder / "simulate.txt").read_bytes, clock),
+        program(folder / "daemon.txt", "run", "--config", str(overlay)),
+        await connect(clock, load_tree(config).data.get("robot", "truck"), endpoint) as client,
+    ):
+        follower = Follower(client, clock)
+        watching = asyncio.create_task(_show(follower, clock, screen=screen))
+        try:
+            lap = await drive_lap(client, clock, patience=PATIENCE)
+            await clock.sleep(1.0)
+            if "map" in load_tree(overlay).data:
+                await _appear((folder / "map.png").exists, clock)
+        finally:
+            watching.cancel()
+            await asyncio.wait([watching])
+        loop = follower.state.loop
+    with np.load(truth) as archive:
+        rows = archive["truth"]
+    return Summary(
+        lap,
+        rows,
+        loop.lateness_p99 if loop else 0.0,
+        loop.lateness_max if loop else 0.0,
+        *log_figures(folder),
+        closed=load_tree(overlay).data.get("path", {}).get("closed", False),
+    )
+
+
+@asynccontextmanager
+async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]:
+    """Enter once the simulator has said that its devices are plugged in."""
+    try:
+        async with clock.deadline(PATIENCE):
+            while b"ready" not in said():
+                await clock.sleep(0.05)
+    except TimeoutError:
+        raise NoAnswerError(f"the simulator did not come up within {PATIENCE:g} s: {said()!r}") from None
+    yield
+
+
+def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
+    """A configuration that includes ``config``, hangs its devices on ptys and puts all output into ``folder``.
+
+    Devices by hub and port stay there: their hubs are those of an emulated computer.
+    """
+    given = load_tree(config).data
+    here = folder.resolve()
+    by_path = (role for role, device in given.get("devices", {}).items() if device and "hub" not in device["port"])
+    overlay: dict[str, Any] = {
+        "include": str(config.resolve()),
+        "version": 1,
+        "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in by_path},
+        "machine": str(here / "machine"),
+        "zenoh": {"listen": [endpoint]},
+        "recorder": {"directory": str(here / "logs")},
+        "state_directory": str(here / "state"),
+    }
+    if given.get("map"):
+        overlay["map"] = {"picture": str(here / "map.png")}
+    if seed is not None:
+        overlay["sim"] = {"seed": seed}
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "config.yaml"
+    file.write_text(yaml.safe_dump(overlay, sort_keys=False), encoding="utf-8")
+    return file
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@asynccontextmanager
+async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it, its output goes to a file."""
+    with output.open("wb") as stream:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "monstertruckd",
+            *arguments,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+        )
+    ended = asyncio.create_task(process.wait())
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        done, _ = await asyncio.wait([ended], timeout=15)
+        if not done:
+            process.kill()
+            await ended
+
+
+async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
+    """A client, as soon as the daemon listens."""
+    try:
+        async with clock.deadline(PATIENCE):
+            while True:
+                try:
+                    async with TruckClient(robot, endpoint, clock=clock, timeout=0.5) as client:
+                        if await client.alive():
+                            break
+                except NotFoundError:
+                    await clock.sleep(0.2)
+    except TimeoutError:
+        raise NoAnswerError(f"the daemon did not come up within {PATIENCE:g} s at {endpoint}") from None
+    return TruckClient(robot, endpoint, source=f"demo:{os.getpid()}", clock=clock)
+
+
+async def _appear(exists: Callable[[], bool], clock: Clock) -> None:
+    """Wait for a picture that a niced worker draws; without one the summary just does not list it."""
+    with contextlib.suppress(TimeoutError):
+        async with clock.deadline(15.0):
+            while not exists():
+                await clock.sleep(0.1)
+
+
+async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:
+    following = asyncio.create_task(follower.run())
+    try:
+        if not screen:
+            await following
+        with Live(console=Console(), screen=True, auto_refresh=False) as live:
+            while True:
+                live.update(draw(follower.state, live.console.width), refresh=True)
+                await clock.sleep(PERIOD)
+    finally:
+        following.cancel()
+        await asyncio.wait([following])

@@ -1,0 +1,207 @@
+"""Puts a plan into a system, or takes it out; what is already so is left alone."""
+
+import os
+import shlex
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.small_files import replace_file
+from monstertruckd.tools.install.configuration import FOLDER
+from monstertruckd.tools.install.plan import (
+    AFTER_INSTALL,
+    AFTER_REMOVAL,
+    BEFORE_REMOVAL,
+    ENABLED,
+    MODULES,
+    RULES,
+    SERVICE,
+    SYSUSERS,
+    TMPFILES,
+    UNIT,
+    Command,
+    Plan,
+    Planned,
+    below,
+)
+
+UNFINISHED: Final = FOLDER / ".unfinished"
+"""There while an installation is under way: if it breaks off, the next one tells the programs all the same."""
+BOOTED: Final = Path("/run/systemd/system")
+"""There while systemd runs, see sd_booted(3)."""
+FILES: Final = (ENABLED, UNIT, RULES, MODULES, TMPFILES, SYSUSERS)
+"""What is taken out; configuration, logs, state and the user stay."""
+
+
+class Change(StrEnum):
+    """What becomes of a file."""
+
+    NEW = "new"
+    CHANGED = "changed"
+    SAME = "same"
+    REMOVED = "removed"
+    MASKED = "masked"
+    """A link to /dev/null is in its place: somebody has switched it off."""
+
+
+@dataclass(slots=True)
+class Report:
+    """What was done, or would be."""
+
+    changes: dict[Path, Change] = field(default_factory=dict)
+    commands: list[Command] = field(default_factory=list)
+    previous: list[Path] = field(default_factory=list)
+    """Where replaced configurations went."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything is or would be different."""
+        return bool(self.commands) or any(change is not Change.SAME for change in self.changes.values())
+
+
+Run = Callable[[Sequence[str]], None]
+
+
+def run_command(arguments: Sequence[str]) -> None:
+    """Run a program of the system without a shell.
+
+    Raises:
+        NotFoundError: there is none.
+        CommandFailedError: it failed; the text is its own.
+    """
+    try:
+        done = subprocess.run(arguments, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)  # noqa: S603
+    except FileNotFoundError:
+        raise NotFoundError(f"{arguments[0]}: no such program; a service needs systemd and udev") from None
+    if done.returncode:
+        said = (done.stderr or done.stdout).strip() or f"ended with {done.returncode}"
+        raise CommandFailedError(f"{' '.join(arguments)}: {said}")
+
+
+def runs_here(root: Path) -> bool:
+    """Whether the system below ``root`` is the one that runs, by systemd: not an image, a chroot or a container."""
+    return root == Path("/") and below(root, BOOTED).is_dir()
+
+
+def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command) -> Report:
+    """Write what differs, then tell the running system; one that does not run is only written.
+
+    Raises:
+        InputError: a file is masked, is none, or is behind a link out of ``root``; nothing has been written then.
+        NotPermittedError: not allowed to write there.
+        NotFoundError, CommandFailedError: see ``run_command``; running it again goes on from there.
+    """
+    report = Report({file.path: _change(root, file) for file in plan.files})
+    unfinished = below(root, UNFINISHED)
+    here = runs_here(root)
+    if here and (unfinished.exists() or report.changed):
+        report.commands += AFTER_INSTALL
+    if dry or not report.changed:
+        return report
+    _refuse_masked(root, report)
+    with _permission():
+        if here:
+            unfinished.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(unfinished, "", follow_links=False)
+        for file in plan.files:
+            if report.changes[file.path] is not Change.SAME:
+                _write(root, file, report)
+        for command in report.commands:
+            run(command)
+        unfinished.unlink(missing_ok=True)
+    return report
+
+
+def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Report:
+    """Stop the service and take its files away.
+
+    Raises:
+        InputError: a file is behind a link out of ``root``.
+        NotPermittedError: not allowed to.
+        NotFoundError, CommandFailedError: see ``run_command``.
+    """
+    report = Report({path: Change.REMOVED for path in FILES if os.path.lexists(_place(root, path))})
+    here = runs_here(root) and report.changed
+    before = BEFORE_REMOVAL if here and UNIT in report.changes else ()
+    after = AFTER_REMOVAL if here else ()
+    report.commands = [*before, *after]
+    if dry:
+        return report
+    with _permission():
+        for command in before:
+            run(command)
+        for path in report.changes:
+            below(root, path).unlink()
+        for command in after:
+            run(command)
+    return report
+
+
+def _place(root: Path, path: Path) -> Path:
+    """Where a file is.
+
+    Raises:
+        InputError: a link on the way there leads out of ``root``.
+    """
+    place = below(root, path)
+    folder = place.parent.resolve()
+    if not folder.is_relative_to(root.resolve()):
+        raise InputError(f"{place}: would be in {folder}, outside {root}; make the link on the way a relative one")
+    return place
+
+
+def _change(root: Path, file: Planned) -> Change:
+    place = _place(root, file.path)
+    if not os.path.lexists(place):
+        return Change.NEW
+    if place.is_symlink() and os.path.normpath(file.path.parent / place.readlink()) == os.devnull:
+        return Change.MASKED
+    if not (place.is_symlink() or place.is_file()):
+        raise InputError(f"{place}: expected a file; move away what is there")
+    if file.target is not None:
+        return Change.SAME if place.is_symlink() and place.readlink() == file.target else Change.CHANGED
+    return Change.SAME if not place.is_symlink() and place.read_text(errors="replace") == file.text else Change.CHANGED
+
+
+def _refuse_masked(root: Path, report: Report) -> None:
+    for path, change in report.changes.items():
+        if change is Change.MASKED:
+            elsewhere = [] if root == Path("/") else [f"--root={root}"]
+            unit = path == UNIT
+            mend = ["systemctl", *elsewhere, "unmask", SERVICE] if unit else ["rm", str(below(root, path))]
+            raise InputError(f"{path}: is masked by a link to {os.devnull}; to have it again: {shlex.join(mend)}")
+
+
+def _write(root: Path, file: Planned, report: Report) -> None:
+    place = _place(root, file.path)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if file.target is not None:
+        place.unlink(missing_ok=True)
+        place.symlink_to(file.target)
+        return
+    # The file behind a link stays where it is anyway.
+    if file.keep_previous and report.changes[file.path] is Change.CHANGED and not place.is_symlink():
+        report.previous.append(file.path.with_name(_keep(place).name))
+    replace_file(place, file.text, follow_links=False)
+
+
+def _keep(place: Path) -> Path:
+    """Give a file a second name, with a ~, under which it stays when it is replaced; the first one is never gone."""
+    previous = place.with_name(f"{place.name}~")
+    if previous.is_symlink() or not previous.is_file() or previous.read_bytes() != place.read_bytes():
+        previous.unlink(missing_ok=True)
+        previous.hardlink_to(place)
+    return previous
+
+
+@contextmanager
+def _permission() -> Iterator[None]:
+    try:
+        yield
+    except PermissionError as error:
+        raise NotPermittedError(f"{error.filename}: {error.strerror}") from error

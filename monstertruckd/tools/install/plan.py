@@ -1,0 +1,145 @@
+"""What an installation consists of: files, and programs to tell about them."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.small_files import text_of
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.install.configuration import FOLDER, files_of, load_real
+from monstertruckd.tools.install.rules import rules_text
+from monstertruckd.tools.install.shipped import filled
+from monstertruckd.tools.install.unit import LINKS, Program, temporary, unit_text, user_name
+
+USER: Final = "monstertruckd"
+SERVICE: Final = "monstertruckd.service"
+UNIT: Final = Path("/etc/systemd/system") / SERVICE
+ENABLED: Final = Path("/etc/systemd/system/multi-user.target.wants") / SERVICE
+SYSUSERS: Final = Path("/etc/sysusers.d/monstertruckd.conf")
+TMPFILES: Final = Path("/etc/tmpfiles.d/monstertruckd.conf")
+MODULES: Final = Path("/etc/modules-load.d/monstertruckd.conf")
+RULES: Final = Path("/etc/udev/rules.d/70-monstertruckd.rules")
+CONFIG: Final = FOLDER / "truck.yaml"
+"""Used where neither the user nor an installed unit names one."""
+
+Command = tuple[str, ...]
+
+AFTER_INSTALL: Final[tuple[Command, ...]] = (
+    ("systemd-sysusers", str(SYSUSERS)),
+    ("systemd-tmpfiles", "--create", str(TMPFILES)),
+    ("systemctl", "restart", "systemd-modules-load.service"),
+    ("udevadm", "control", "--reload"),
+    (
+        *("udevadm", "trigger", "--settle"),
+        *(f"--subsystem-match={name}" for name in ("usb", "usb-serial", "tty", "video4linux")),
+    ),
+    ("systemctl", "daemon-reload"),
+)
+BEFORE_REMOVAL: Final[tuple[Command, ...]] = (("systemctl", "stop", SERVICE),)
+AFTER_REMOVAL: Final[tuple[Command, ...]] = (("systemctl", "daemon-reload"), ("udevadm", "control", "--reload"))
+RESTART: Final[Command] = ("systemctl", "restart", SERVICE)
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One file, or a link where ``target`` is given."""
+
+    path: Path
+    text: str = ""
+    target: Path | None = None
+    keep_previous: bool = False
+    """An operator may have edited it: the old one stays beside the new one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A whole installation."""
+
+    files: tuple[Planned, ...]
+    notes: tuple[str, ...]
+    """What will not work, and why."""
+
+
+def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> Plan:
+    """What belongs to the service of a configuration.
+
+    Args:
+        config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
+        user: the service runs as; None: as whom the installed unit says, else ``USER``.
+        program: what it runs.
+        root: of the system that gets it.
+
+    Raises:
+        NotFoundError: no configuration was named and none is installed.
+        ConfigError: it was refused.
+        InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
+            could not see the program.
+    """
+    user = user_name((installed_user(root) or USER) if user is None else user)
+    hidden = temporary(program)
+    if hidden is not None and root == Path("/"):
+        raise InputError(hidden)
+    source = config_file or installed_config(root) or below(root, CONFIG)
+    if config_file is None and not source.is_file():
+        raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")
+    config = load_real(source)
+    installed, copies = _placed(source, below(root, FOLDER))
+    return Plan(
+        (
+            *copies,
+            Planned(SYSUSERS, filled("sysusers.conf", {"user": user})),
+            Planned(TMPFILES, filled("tmpfiles.conf", {"user": user})),
+            Planned(MODULES, filled("modules-load.conf", {})),
+            Planned(RULES, rules_text(config)),
+            Planned(UNIT, unit_text(config, installed, user, program)),
+            Planned(ENABLED, target=UNIT),
+        ),
+        (*_notes(config), *([hidden] if hidden is not None else ())),
+    )
+
+
+def installed_config(root: Path) -> Path | None:
+    """The configuration the installed unit starts the daemon with, without one the usual; None if that is missing too.
+
+    A file the unit names is given even if it is not there.
+    """
+    unit = text_of(below(root, UNIT)) or ""
+    named = re.search(r"^ExecStart=.* --config (/\S+)$", unit, re.MULTILINE)
+    file = below(root, Path(named[1]) if named is not None else CONFIG)
+    return file if named is not None or file.is_file() else None
+
+
+def installed_user(root: Path) -> str | None:
+    """Whom the installed unit runs the daemon as."""
+    named = re.search(r"^User=(\S+)$", text_of(below(root, UNIT)) or "", re.MULTILINE)
+    return None if named is None else named[1]
+
+
+def below(root: Path, path: Path) -> Path:
+    """Where an absolute path is in the system below ``root``."""
+    return root / path.relative_to("/")
+
+
+def _placed(source: Path, folder: Path) -> tuple[Path, tuple[Planned, ...]]:
+    """Where the configuration will be, and what must be copied for that."""
+    if source.resolve().is_relative_to(folder.resolve()):
+        return FOLDER / source.resolve().relative_to(folder.resolve()), ()
+    files = files_of(source)
+    copies = [
+        Planned(FOLDER / place, file.read_text(encoding="utf-8"), keep_previous=True) for place, file in files.items()
+    ]
+    return copies[0].path, tuple(copies)
+
+
+def _notes(config: TruckConfig) -> list[str]:
+    notes = [
+        f"devices.{role}.port: {device.port.path} is made by no rule; name hub and port: monstertruckd find-port {role}"
+        for role, device in config.devices.present().items()
+        if not isinstance(device.port, UsbPortConfig) and device.port.path.is_relative_to(LINKS)
+    ]
+    if config.usb.power.method is CycleMethod.UHUBCTL:
+        notes.append("usb.power.method: uhubctl needs the raw hubs, which the service may not open; use port")
+    return notes

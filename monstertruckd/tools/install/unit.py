@@ -1,0 +1,121 @@
+"""The unit of the service, from the configuration and from where the program is."""
+
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.truck import AnyPort, TruckConfig
+from monstertruckd.tools.install.shipped import filled, shipped
+
+HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
+"""Hidden from the service but for the program itself."""
+HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the service must not be run from
+LINKS: Final = Path("/dev/truck")
+"""Folder of the links that the udev rules make."""
+_PLAIN: Final = re.compile(r"/[A-Za-z0-9/._+=,:~-]*")
+_USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,31}")
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What the service runs."""
+
+    python: Path
+    """Interpreter, of the environment the packages are in."""
+    neutral: Path
+    """Stop script."""
+    reads: tuple[Path, ...]
+    """Folders with the interpreter and all packages."""
+
+    @classmethod
+    def present(cls) -> Self:
+        """The one that is running now."""
+        neutral = shipped("neutral.py")
+        base = Path(sys.base_prefix)  # may be a link in front of the true folder; both names are used
+        reads = dict.fromkeys((Path(sys.prefix), base, base.resolve(), neutral.parents[1]))
+        return cls(Path(sys.executable), neutral, tuple(reads))
+
+
+def unit_text(config: TruckConfig, config_file: Path, user: str, program: Program) -> str:
+    """The unit.
+
+    Args:
+        config: whose drives are stopped after a death.
+        config_file: what the service is started with.
+        user: it runs as.
+        program: what is run.
+
+    Raises:
+        InputError: systemd or its sandbox could not use the user's name or one of the paths.
+    """
+    at_home = _at_home(program)
+    return filled(
+        "monstertruckd.service",
+        {
+            "python": _plain(program.python),
+            "config": _plain(config_file),
+            "stop": _stop(config, program),
+            "user": user_name(user),
+            "home": "tmpfs" if at_home else "yes",
+            "bind": "\n".join(f"BindReadOnlyPaths={_plain(place, without=':')}" for place in at_home),
+            "switch": "" if config.usb.power.method is None else "ReadWritePaths=-/sys/devices",
+        },
+    )
+
+
+def user_name(name: str) -> str:
+    """``name``, if a user may be called so.
+
+    Raises:
+        InputError: it may not; a line break in it would be a setting of its own.
+    """
+    if not _USER.fullmatch(name):
+        raise InputError(f"user {name!r}: expected a lower-case letter or _, then at most 31 of a-z 0-9 _ -")
+    return name
+
+
+def node_of(role: str, port: AnyPort) -> Path:
+    """Where the device of ``role`` is in /dev once the udev rules are in place."""
+    return LINKS / role if isinstance(port, UsbPortConfig) else port.path
+
+
+def _stop(config: TruckConfig, program: Program) -> str:
+    drives = [
+        f"{_plain(node_of(role, device.port), without='=')}={device.driver.node}@{device.port.baud}"
+        for role, device in config.devices.shafts().items()
+    ]
+    # Without site: the script must run even when the environment's packages do not load.
+    return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""
+
+
+def temporary(program: Program) -> str | None:
+    """Why the service could not run ``program``; None = it can."""
+    hidden = (place for place in program.reads if any(place.is_relative_to(folder) for folder in HIDDEN))
+    place = next(hidden, None)
+    return None if place is None else f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd"
+
+
+def _at_home(program: Program) -> list[Path]:
+    """What the service must still see of the folders that are hidden from it."""
+    return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
+
+
+def _plain(path: Path, without: str = "") -> str:
+    """``path`` for a unit file.
+
+    Args:
+        path: absolute.
+        without: a sign that ends a path at that place.
+
+    Raises:
+        InputError: it would need quoting.
+    """
+    if without and without in str(path):
+        raise InputError(f"{path}: expected a path without {without}, which ends it in the unit")
+    if not _PLAIN.fullmatch(str(path)):
+        raise InputError(f"{path}: expected an absolute path of letters, digits and / . _ + = , : ~ - for systemd")
+    return str(path)

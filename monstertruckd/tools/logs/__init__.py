@@ -1,0 +1,1 @@
+"""What is made of logs: lists, summaries, exports, reports, pictures, replays."""

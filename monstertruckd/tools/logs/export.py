@@ -1,0 +1,182 @@
+"""Export of logs for spreadsheets (CSV) and numpy (NPZ): one file per topic, one column per field."""
+
+import csv
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.recorder.reader import LogReader
+from monstertruckd.tools.logs.selection import ALL, Progress, Selection
+from monstertruckd.tools.logs.unfinished import removed_on_failure
+from monstertruckd.tools.logs.wall_time import real_offset
+
+_LOG_TIME, _REAL_TIME = "log_time", "real_time"
+
+
+def export_csv(
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> dict[str, Path]:
+    """Write ``<group>_<name>.csv`` for every topic that has messages.
+
+    Nested records get dotted columns; arrays and lists stand in one cell as JSON; absent values are empty. Pictures
+    become files of a folder beside the table, which names them. ``log_time`` is daemon time, ns; ``real_time`` the
+    calendar's (UTC).
+
+    Returns:
+        The files by topic.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, a message in it is invalid, or the folder cannot be written.
+    """
+    directory = _folder(output)
+    files: dict[str, Path] = {}
+    with _tables(directory, ".csv", files) as place, ExitStack() as stack:
+        writers: dict[str, Any] = {}
+        for topic, row in _rows(path, directory, selection, progress):
+            if topic not in writers:
+                writers[topic] = csv.writer(stack.enter_context(place(topic).open("w", newline="")))
+                writers[topic].writerow(row)
+            row[_REAL_TIME] = f"{np.datetime64(row[_REAL_TIME], 'ns')}Z"
+            writers[topic].writerow(_cell(value) for value in row.values())
+    return files
+
+
+def export_npz(
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> dict[str, Path]:
+    """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
+
+    Absent numbers are NaN. Arrays of equal length are stacked to shape (messages, length); others are laid end
+    to end, with their lengths in ``<column>.lengths``. Text, lists and mappings are strings (lists as JSON).
+    Pictures become files of a folder beside the table, which names them. ``log_time`` is daemon time, ``real_time``
+    UNIX time, both in ns.
+
+    Returns:
+        The files by topic.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, a message in it is invalid, or the folder cannot be written.
+    """
+    directory = _folder(output)
+    tables: dict[str, dict[str, list[Any]]] = {}
+    for topic, row in _rows(path, directory, selection, progress):
+        table = tables.setdefault(topic, {name: [] for name in row})
+        for name, value in row.items():
+            table[name].append(value)
+    files: dict[str, Path] = {}
+    with _tables(directory, ".npz", files) as place:
+        for topic, table in tables.items():
+            arrays: dict[str, NDArray[Any]] = {}
+            for name, values in table.items():
+                arrays |= _column(name, values)
+            with place(topic).open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
+    return files
+
+
+@contextmanager
+def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
+    """Says where to write a topic's table; all get their names, noted in ``files``, once all are whole."""
+    with removed_on_failure() as parts:
+
+        def place(topic: str) -> Path:
+            files[topic] = directory / f"{_stem(topic)}{suffix}"
+            parts.append(files[topic].with_name(files[topic].name + ".part"))
+            return parts[-1]
+
+        yield place
+    for part, file in zip(parts, files.values(), strict=True):
+        part.replace(file)
+
+
+def _folder(directory: str | Path) -> Path:
+    directory = Path(directory)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{directory}: cannot be made: {error.strerror}"
+        raise InputError(msg) from None
+    return directory
+
+
+def _stem(topic: str) -> str:
+    return topic.replace("/", "_")
+
+
+def _rows(
+    path: str | Path, directory: Path, selection: Selection, progress: Progress | None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(topic, column to value) of every selected message; pictures are saved on the way."""
+    reader = LogReader(Path(path))
+    offset = real_offset(reader)
+    for entry, message in selection.of(reader, progress):
+        row = _flat(message, type(message), "")
+        for name, value in row.items():
+            if isinstance(value, bytes):
+                row[name] = _save(value, directory, f"{_stem(entry.topic)}/{entry.log_time}.{row.get('format', 'bin')}")
+        yield entry.topic, {_LOG_TIME: entry.log_time, _REAL_TIME: entry.log_time + offset, **row}
+
+
+def _save(data: bytes, directory: Path, name: str) -> str:
+    file = directory / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(data)
+    return name
+
+
+def _flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+    """Columns of a record; the same for every message of a model, present or not."""
+    row: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        value = None if record is None else getattr(record, name)
+        nested = _record_type(field.annotation)
+        row |= {prefix + name: value} if nested is None else _flat(value, nested, f"{prefix}{name}.")
+    return row
+
+
+def _record_type(annotation: Any) -> type[BaseModel] | None:
+    for option in (annotation, *get_args(annotation)):
+        if isinstance(option, type) and issubclass(option, BaseModel) and _is_plain(annotation):
+            return option
+    return None
+
+
+def _is_plain(annotation: Any) -> bool:
+    """A record or an optional record, not a list of records."""
+    return all(option is type(None) or isinstance(option, type) for option in (get_args(annotation) or (annotation,)))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.value if isinstance(value, Enum) else value
+
+
+def _cell(value: Any) -> Any:
+    value = [_plain(item) for item in value] if isinstance(value, tuple) else _plain(value)
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+def _column(name: str, values: list[Any]) -> dict[str, NDArray[Any]]:
+    if all(isinstance(value, np.ndarray) for value in values):
+        lengths = [len(value) for value in values]
+        if len(set(lengths)) == 1:
+            return {name: np.stack(values)}
+        return {name: np.concatenate(values), f"{name}.lengths": np.array(lengths)}
+    if all(value is None or isinstance(value, int | float) for value in values):
+        if any(value is None for value in values):
+            return {name: np.array([np.nan if value is None else value for value in values], np.float64)}
+        return {name: np.array(values)}
+    return {name: np.array(["" if value is None else str(_cell(value)) for value in values])}

@@ -1,0 +1,82 @@
+"""Plays a log back on Zenoh, on the log's own clock."""
+
+import asyncio
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+from monstertruck_runtime.clock import ReplayClock, run_replay
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.ports import Ready
+from monstertruck_schemas.topics import BY_NAME, Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.bus.zenoh_config import ZenohConfig
+from monstertruckd.bus.zenoh_session import ZenohBridge
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.logs.wall_time import first_offset
+
+
+def replay_log(
+    log: Path,
+    robot: str,
+    endpoint: str,
+    speed: float,
+    topics: Collection[str] | None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> int:
+    """Publish the messages of ``log`` at their own times; returns how many.
+
+    Requests are left out: they came from outside and would reach nobody.
+
+    Args:
+        log: file to read.
+        robot: name to publish under.
+        endpoint: where to listen.
+        speed: multiple of real time.
+        topics: only these; none = all.
+        progress: told the bytes of the log read so far.
+
+    Raises:
+        NotFoundError: no such log, or an unknown topic.
+        InputError: the log holds no message to replay.
+        BusyError: the endpoint is in use.
+    """
+    if unknown := set(topics or ()) - BY_NAME.keys():
+        raise NotFoundError(f"no topic {', '.join(sorted(unknown))}; known: {', '.join(BY_NAME)}")
+    reader = open_log(log)
+    start = next((message.log_time for message in reader), None)
+    if start is None:
+        raise InputError(f"{log}: holds no messages")
+
+    async def main(clock: ReplayClock) -> int:
+        bus = Bus(clock)
+        bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+        await bridge.open()
+        serving = asyncio.Event()
+        task = asyncio.create_task(bridge.run(_set(serving)))
+        waiting = asyncio.create_task(serving.wait())
+        try:
+            await asyncio.wait([waiting, task], return_when=asyncio.FIRST_COMPLETED)
+            if task.done():
+                task.result()
+            count = 0
+            for entry in reader:
+                topic = BY_NAME.get(entry.topic)
+                if topic is None or topic.writer is Writer.OUTSIDE or (topics and entry.topic not in topics):
+                    continue
+                progress(reader.position)
+                await clock.sleep_until(entry.log_time)
+                bus.hand_over(topic, entry.decode())
+                count += 1
+            return count
+        finally:
+            for job in (waiting, task):
+                job.cancel()
+            await asyncio.wait([waiting, task])
+
+    offset = first_offset(log, reader.metadata().get("run", {}))
+    return run_replay(main, start=start, real_offset=offset, rate=speed)
+
+
+def _set(event: asyncio.Event) -> Ready:
+    return event.set

@@ -1,0 +1,124 @@
+"""The picture under the path: what the lidar saw, or the newest occupancy grid of the log."""
+
+import io
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from monstertruck_estimation.transforms import FrameTree, yaw_of
+from monstertruck_planners.collision import scan_points
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import NotFoundError
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid, Odometry, Transforms
+from monstertruckd.recorder.occupancy import Area, OccupancyRaster
+
+Poses = NDArray[np.float64]
+
+_MAX_TILT: Final = math.radians(3)
+_STEP, _TURN, _REST = 0.08, 0.1, 20 * SECOND
+"""A scan is taken after this way (m), this turn (rad) or this time (ns) since the one before."""
+_POSES: Final = 64
+_GREATEST_SIDE: Final = 1400
+"""Pixels of the picture's longer side."""
+_WALL, _FREE = 28.0, 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A raster as PNG with transparency: unknown is clear, free white, walls dark."""
+
+    png: bytes
+    area: Area
+
+
+class ScanMap:
+    """Gathers scans at the poses the log gives for them; an occupancy grid in the log takes their place."""
+
+    def __init__(self) -> None:
+        self._raster = OccupancyRaster()
+        self._grid: Grid | None = None
+        self._mounts = FrameTree()
+        self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=_POSES)
+        self._taken: tuple[int, float, float, float] | None = None
+
+    def pose(self, odometry: Odometry) -> None:
+        """The truck's newest pose in the map."""
+        pose = odometry.pose
+        self._poses.append((odometry.stamp, pose.x, pose.y, pose.yaw))
+
+    def transforms(self, tree: Transforms) -> None:
+        """The frames, for the lidar's mount."""
+        self._mounts = FrameTree(tree.transforms)
+
+    def grid(self, grid: Grid) -> None:
+        """A newer occupancy grid."""
+        self._grid = grid
+
+    def scan(self, scan: LaserScan) -> None:
+        """Take in a scan if the truck has moved since the one before."""
+        if self._grid is not None or not self._poses or (scan.tilt or 0.0) > _MAX_TILT:
+            return
+        newest = self._poses[-1]
+        if self._taken is not None and not _apart(self._taken, newest):
+            return
+        self._taken = newest
+        x, y, yaw = self._pose_at(scan.stamp + round(scan.scan_time / 2 * SECOND))
+        mount = self._mount(scan.frame)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        origin = np.array([x, y]) + np.array(mount[:2]) @ turn
+        self._raster.add(origin, np.array([x, y]) + scan_points(scan, mount) @ turn)
+
+    def picture(self) -> Picture | None:
+        """What was gathered; None without scans and grids."""
+        if self._grid is not None:
+            return _grid_picture(self._grid)
+        occupancy = self._raster.occupancy()
+        return _picture(occupancy, self._raster.area) if np.isfinite(occupancy).any() else None
+
+    def _mount(self, frame: str) -> tuple[float, float, float]:
+        try:
+            transform = self._mounts.lookup("base", frame)
+        except NotFoundError:
+            return 0.0, 0.0, 0.0
+        x, y, _ = transform.translation
+        return x, y, yaw_of(transform.rotation)
+
+    def _pose_at(self, stamp: int) -> tuple[float, float, float]:
+        table = np.array(self._poses, np.float64)
+        x, y, yaw = (float(np.interp(stamp, table[:, 0], column)) for column in (*table.T[1:3], np.unwrap(table[:, 3])))
+        return x, y, yaw
+
+
+def _apart(a: tuple[int, float, float, float], b: tuple[int, float, float, float]) -> bool:
+    moved = math.dist(a[1:3], b[1:3]) > _STEP
+    return moved or abs(math.remainder(b[3] - a[3], math.tau)) > _TURN or b[0] - a[0] > _REST
+
+
+def _grid_picture(grid: Grid) -> Picture:
+    cells = grid.cells.reshape(grid.height, grid.width).astype(np.float64)
+    x, y = grid.origin.x, grid.origin.y
+    area = Area(x, y, x + grid.width * grid.resolution, y + grid.height * grid.resolution)
+    return _picture(np.where(cells < 0, np.nan, cells / 100.0), area)
+
+
+def _picture(occupancy: Poses, area: Area) -> Picture:
+    """From shares of hits, row 0 lowest, NaN unknown; cut to what is known."""
+    known = np.isfinite(occupancy)
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    cell = (area.x1 - area.x0) / occupancy.shape[1]
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    wall = np.clip(np.nan_to_num(occupancy[part]) * 2.0, 0.0, 1.0)
+    shade = np.stack([_FREE + (_WALL - _FREE) * wall, np.where(known[part], 255.0, 0.0)], axis=-1)
+    image = Image.fromarray(np.flipud(shade).astype(np.uint8), "LA")
+    image.thumbnail((_GREATEST_SIDE, _GREATEST_SIDE))
+    data = io.BytesIO()
+    image.save(data, "PNG", optimize=True)
+    x0, y0 = area.x0 + columns[0] * cell, area.y0 + rows[0] * cell
+    return Picture(data.getvalue(), Area(x0, y0, x0 + wall.shape[1] * cell, y0 + wall.shape[0] * cell))

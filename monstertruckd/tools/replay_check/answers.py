@@ -1,0 +1,146 @@
+"""Routes and deformations computed again: they count when the log shows it, and recorded ones are driven on.
+
+The truck drove the recorded path, whatever is found now. So that what comes after can be compared, it rests on the
+recorded one; what was computed is kept, to be held against it.
+"""
+
+import asyncio
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
+from monstertruck_runtime.actors.placement import Actor, LoopActor, Placement, Places
+from monstertruck_runtime.actors.remote import RemoteDesk
+from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_schemas.plan import Path, Steering
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.replay_check.goals import DEFORMED, PLANNED, TOGETHER, GoalRecord
+from monstertruckd.tools.replay_check.pace import PacedClock
+
+Array = NDArray[np.float64]
+
+BEFORE: Final = SECOND // 1000
+"""A route is there this long before the tick that takes it, ns."""
+NOTHING: Final = PlanAnswer(Reason.OK, "", np.empty((0, 3)), np.empty(0))
+
+
+class Book:
+    """What was computed where another path was driven."""
+
+    def __init__(self) -> None:
+        self._computed: dict[str, PlanAnswer] = {}
+
+    def settle(self, computed: PlanAnswer, driven: Path | None) -> PlanAnswer:
+        """What the goal service is answered: the path that was driven, where there was one."""
+        if driven is None or _same(computed, driven):
+            return computed
+        self._computed[driven.name] = computed if computed.ok else NOTHING
+        poses = np.array(driven.poses).reshape(-1, 3)
+        length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+        return replace(
+            computed,
+            reason=Reason.OK,
+            poses=poses,
+            directions=np.array(driven.directions),
+            steering=driven.steering or _steering(computed, poses),
+            length=length,
+        )
+
+    def as_computed(self, path: Path) -> Path:
+        """``path`` as it would be if nobody had driven another one."""
+        computed = self._computed.get(path.name)
+        if computed is None:
+            return path
+        assert computed.poses is not None
+        assert computed.directions is not None
+        update = {"poses": computed.poses.ravel(), "directions": computed.directions, "steering": computed.steering}
+        return path.model_copy(update=update)
+
+
+class _Replayed:
+    """Takes steps in the loop, and is told by a log when their results count."""
+
+    def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: Book, latency: float) -> None:
+        self._inner = LoopActor(target, WallClock(), 0.0)  # not virtual: it answers at once
+        self._clock, self._record, self._book = clock, record, book
+        self._latency = round(latency * SECOND)
+
+    async def start(self) -> None:
+        """Make ready for the first step."""
+        await self._inner.start()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._inner.__aexit__(kind, error, trace)
+
+
+class ReplayedPlanner(_Replayed):
+    """Routes and ways out."""
+
+    async def step(self, task: PlanTask) -> PlanAnswer:
+        """Answer just before the tick that shows the recorded answer; never, if the log ends before."""
+        end = self._record.decided(self._clock.now())
+        answer: PlanAnswer = await self._inner.step(task)
+        if end is None:
+            await asyncio.Event().wait()
+        assert end is not None
+        await self._clock.reach(end - BEFORE)
+        return self._book.settle(answer, self._record.path_between(end - TOGETHER, end, PLANNED))
+
+
+class ReplayedDeformer(_Replayed):
+    """What becomes of a route; most of it shows nowhere and counts after the configured latency."""
+
+    async def step(self, task: DeformTask) -> DeformAnswer:
+        """Answer when a path shows the recorded answer, else in time."""
+        begin = self._clock.now()
+        answer: DeformAnswer = await self._inner.step(task)
+        shown = self._record.path_between(begin, begin + 2 * self._latency, DEFORMED)
+        await self._clock.reach(begin + self._latency + 1 if shown is None else shown.stamp)
+        if shown is None or "-held-up" in shown.name:
+            return answer
+        path = self._book.settle(answer.path or replace(NOTHING, reason=Reason.PATH_BLOCKED), shown)
+        return replace(answer, finding="new", path=path)
+
+
+class ReplayedPlaces(Places):
+    """Actors of the goal service."""
+
+    def __init__(self, clock: PacedClock, record: GoalRecord, book: Book) -> None:
+        super().__init__(clock, RemoteDesk())
+        self._paced, self._record, self._book = clock, record, book
+
+    def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:
+        """In the loop, wherever it was."""
+        how = target, self._paced, self._record, self._book, latency
+        match name:
+            case "planning":
+                return ReplayedPlanner(*how)
+            case "deforming":
+                return ReplayedDeformer(*how)
+            case _:
+                return super().actor(placement, name, target, latency=latency, **limits)
+
+
+def _steering(computed: PlanAnswer, poses: Array) -> tuple[Steering, ...]:
+    """Ways of steering, which paths in logs do not name: those where the computed path comes nearest."""
+    if computed.poses is None or not computed.steering:
+        return ()
+    apart = poses[:, None, :2] - computed.poses[None, :, :2]
+    return tuple(computed.steering[index] for index in np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1))
+
+
+def _same(computed: PlanAnswer, driven: Path) -> bool:
+    if computed.poses is None or computed.directions is None:
+        return False
+    return np.array_equal(computed.poses.ravel(), driven.poses) and np.array_equal(
+        computed.directions, driven.directions
+    )

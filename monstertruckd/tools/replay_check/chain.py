@@ -1,0 +1,350 @@
+"""The services of a robot that compute from sensors, put together once more without its devices."""
+
+import asyncio
+from bisect import bisect_left
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from typing import Any, Final
+
+from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_estimation.scan_tilt import TiltStamper
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.track.paths import PathService
+from monstertruck_runtime import wire
+from monstertruck_runtime.actors.agenda import use_agenda
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.ports import Publisher
+from monstertruck_runtime.service import Service
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.health import SlamHealth
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.req import GoalControl, GoalRequest
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.topics import Topic
+from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners
+from monstertruckd.assembly.devices import scan_publisher
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import PlacementConfig, TruckConfig
+from monstertruckd.recorder.reader import LogMessage
+from monstertruckd.tools.replay_check.answers import Book, ReplayedPlaces
+from monstertruckd.tools.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill, is_deformed
+from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
+from monstertruckd.tools.replay_check.recorded import Survey
+
+TICKS: Final[Mapping[str, tuple[str, ...]]] = {
+    "transforms": (topics.TRANSFORMS.name,),
+    "odometry": (topics.ODOMETRY.name, topics.FUSION.name),
+    "levelling": (topics.PLAN_STABILISER.name,),
+    "tracker": (topics.PLAN_DRIVE.name, topics.TRACKER.name),
+    "goals": (topics.GOAL.name,),
+}
+"""Services that read and publish without waiting in between, and the outputs that show when they did."""
+SERVICES: Final = {topic: service for service, names in TICKS.items() for topic in names}
+
+WORKER: Final = (topics.SLAM.name, topics.SCAN_MOTION.name, topics.MAP.name, topics.MAP_TILES.name)
+"""Outputs of the estimation worker, which come when it is done."""
+
+LINKS: Final = 16
+"""Turns of the loop after which a worker's answer has certainly been told."""
+
+GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
+"""Not computed again, but read by the tracker."""
+ASKED: Final = frozenset({topics.GATE.name, topics.REQ_GOAL.name, topics.REQ_GOAL_CONTROL.name, topics.REQ_PATH.name})
+"""The same for goals, whose paths are computed."""
+
+
+def replayable(config: TruckConfig) -> TruckConfig:
+    """The part of a configuration that is computed again: nothing is saved, drawn or sent elsewhere.
+
+    Raises:
+        NotFoundError: the saved map it localises in is not there.
+    """
+    slam = config.slam
+    if slam is not None:
+        if slam.mode == "localisation" and (slam.map is None or not slam.map.is_dir()):
+            raise NotFoundError(f"slam.map: {slam.map}: no such folder; the log does not hold it")
+        slam = slam.model_copy(update={"save": None})
+    return config.model_copy(
+        update={
+            "slam": slam,
+            "path": None,
+            "map": None,
+            "placement": PlacementConfig(),
+        }
+    )
+
+
+def outputs_of(config: TruckConfig) -> frozenset[str]:
+    """Topics a replay of this configuration computes again."""
+    config, devices = replayable(config), config.devices
+    names = {topics.TRANSFORMS.name}
+    if config.missing_actuators() is None:
+        names |= {topics.ODOMETRY.name, topics.POSE.name}
+        if not isinstance(config.odometry, OdometryConfig):
+            names.add(topics.FUSION.name)
+    if config.slam is not None:
+        names |= {topics.POSE.name, *WORKER}
+    if devices.compass is not None and devices.lidar is not None:
+        names.add(topics.SCAN.name)
+    if devices.compass is not None and devices.stabiliser is not None:
+        names.add(topics.PLAN_STABILISER.name)
+    if config.tracker is not None:
+        names |= set(TICKS["tracker"])
+        if config.planner is not None:
+            names |= {topics.GOAL.name, topics.PATH.name}
+    return frozenset(names)
+
+
+def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | None:
+    """What keeps the planner of a robot from being computed again; None = nothing does, or it has none."""
+    if own.planner is None or used.planner is None:
+        return None if own.planner is used.planner else "only one of the two configurations has a planner"
+    if not log.told:
+        return "the log holds no report on goals"
+    if used.slam is None and used.planner.map is not None and not used.planner.map.is_file():
+        return f"planner.map: {used.planner.map}: no such file, and the log does not hold it"
+    if log.unknown_waypoints(period_of(own.planner)):
+        return "waypoints came by remote call, which no log holds"
+    return None
+
+
+def without_goals(config: TruckConfig) -> TruckConfig:
+    """A configuration whose planner is not computed again, nor the tracker that drives to its goals."""
+    return config.model_copy(update={"planner": None, "tracker": None})
+
+
+def period_of(planner: PlannerConfig) -> int:
+    """Between two ticks of the goal service, ns."""
+    return round(SECOND / planner.rate)
+
+
+def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
+    """Ticks that left nothing in the log: when, ns, and whose; in their order."""
+    early = [(instant, "odometry") for instant in _early_ticks(config, log)]
+    if config.planner is None or not log.goals.told:
+        return early
+    return sorted(early + [(instant, "goals") for instant in log.goals.unseen_ticks(period_of(config.planner))])
+
+
+def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
+    """Of odometry, which reads already but has nothing to tell yet: its grid, continued back from its first output."""
+    first = log.first.get(topics.ODOMETRY.name)
+    if first is None:
+        return ()
+    started = log.first.get(topics.TRANSFORMS.name)
+    begin = log.start if started is None else started.stamp
+    period = round(SECOND / config.odometry.rate)
+    return range(first.stamp - period, begin - period // 4, -period)
+
+
+class Chain:
+    """Takes the messages of a log in their order.
+
+    Args:
+        config: of the robot; see ``replayable``.
+        clock: of the running replay.
+        unseen: ticks nobody recorded, see ``unseen_ticks``.
+        log: what the log told beforehand.
+    """
+
+    def __init__(self, config: TruckConfig, clock: PacedClock, unseen: Iterable[tuple[int, str]], log: Survey) -> None:
+        config = replayable(config)
+        self._clock = clock
+        self._ready = log.ready
+        self._goal_record, self._book = log.goals, Book()
+        self._calls = {} if config.planner is None else log.goals.calls(period_of(config.planner))
+        self._goal_ticks = [] if config.planner is None else log.goals.ticks(period_of(config.planner))
+        self._called = [one.state.stamp for one in log.goals.told if one.sequence in self._calls]
+        self._asked: Counter[str] = Counter()
+        """Newest number of a request for goals, by source."""
+        self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None
+        if self._turns is not None:
+            use_agenda(clock, self._turns)
+        self._answering = False
+        self._answers = 0
+        self.bus = Bus(clock)
+        self._scans: Publisher[LaserScan] = scan_publisher(config, self.bus)
+        self._services = list(self._build(config))
+        self.bus.listen(topics.SLAM, self._count_answer)
+        self._paces = {service.name: Pace() for service in self._services if service.name in TICKS}
+        self._unseen = deque(one for one in unseen if one[1] in self._paces)
+        self._goals = next((service for service in self._services if isinstance(service, GoalService)), None)
+        sensors = {topic.name for topic in topics.topics_of("sensor")}
+        given = GIVEN if self._goals is None else ASKED
+        self._inputs = sensors if config.tracker is None else sensors | given
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """The services run while the context lasts.
+
+        Raises:
+            TruckError: a service failed.
+        """
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                running = [tasks.create_task(self._run(service)) for service in self._services]
+                try:
+                    yield
+                finally:
+                    if self._turns is not None:
+                        self._turns.open()  # a service that ends awaits its worker
+                    for task in running:
+                        task.cancel()
+        except* TruckError as group:
+            raise _first(group) from None
+
+    async def take(self, topic: Topic[Message], message: Message, log_time: int) -> None:
+        """Hand over an input, recorded at ``log_time``, ns."""
+        await self._catch_up(log_time)
+        if topic is topics.SCAN:
+            assert isinstance(message, LaserScan)
+            self._scans.put(message.model_copy(update={"tilt": None}) if self.stamps_tilt else message)
+        else:
+            if isinstance(message, GoalRequest | GoalControl):
+                self._asked[message.source] = max(self._asked[message.source], message.seq)
+            self.bus.hand_over(topic, message)
+        await asyncio.sleep(0)  # who waits for it goes first
+
+    async def tick(self, outputs: Sequence[LogMessage]) -> None:
+        """Whoever wrote ``outputs``, recorded in a row, had its turn then; who reads them did not come in between."""
+        await self._catch_up(outputs[0].log_time)
+        for output in outputs:
+            if (call := self._calls.get(output.sequence)) is not None and output.topic == topics.GOAL.name:
+                await self._call(call, output.stamp)
+            elif (service := self._writer_of(output)) in self._paces and not self._is_start(output):
+                await self._paces[service].release(self._turn_of(service, output))
+        await asyncio.sleep(0)
+        for output in outputs:
+            if output.topic == topics.PATH.name:
+                await self._lead(output)
+
+    async def answer(self, output: LogMessage) -> None:
+        """The worker's result counted now, as its first output shows; its last one is how well the scan fitted."""
+        await self._catch_up(output.log_time)
+        if self._turns is None:
+            return
+        if not self._answering:
+            before = self._answers
+            self._turns.next()
+            for _ in range(LINKS):
+                if self._answers != before:
+                    break
+                await asyncio.sleep(0)
+        self._answering = output.topic != topics.SLAM.name
+
+    async def finish(self, end: int) -> None:
+        """Let workers go on until ``end``, ns."""
+        await self._catch_up(end)
+
+    @property
+    def stamps_tilt(self) -> bool:
+        """Whether scans get the tilt of their plane here."""
+        return isinstance(self._scans, TiltStamper)
+
+    def ticks(self, output: LogMessage) -> bool:
+        """Whether a recorded message shows when a service had its turn."""
+        called = output.topic == topics.PATH.name and _near(self._called, output.stamp) is not None
+        return called or self._writer_of(output) in self._paces
+
+    def takes(self, topic: str) -> bool:
+        """Whether a recorded message is an input."""
+        return topic in self._inputs
+
+    def as_computed(self, topic: Topic[Message], message: Message, payload: bytes) -> bytes:
+        """An output's bytes as they would be if what was computed had been driven."""
+        if not isinstance(message, Path):
+            return payload
+        computed = self._book.as_computed(message)
+        return payload if computed is message else wire.encode(topic, computed)
+
+    def _writer_of(self, output: LogMessage) -> str:
+        """Service that had its turn when ``output`` was written; of what waits for no turn its topic."""
+        if output.topic == topics.PATH.name and _near(self._goal_ticks, output.stamp) is not None:
+            return output.topic if is_deformed(output) else GoalService.name
+        if output.topic == topics.PLAN_DRIVE.name and self._goals is not None and asks_standstill(output):
+            return GoalService.name
+        return SERVICES.get(output.topic, output.topic)
+
+    def _is_start(self, output: LogMessage) -> bool:
+        """Whether it is the goal service's first report, which it gives before its first tick."""
+        return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
+
+    def _turn_of(self, service: str, output: LogMessage) -> int:
+        """When that turn was, ns: what one of the goal service tells on the wall clock has several stamps."""
+        near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
+        return output.stamp if near is None else near
+
+    async def _call(self, call: Call, instant: int) -> None:
+        """Somebody asked the goal service, at ``instant``, ns; whoever had a turn before goes first."""
+        await asyncio.sleep(0)
+        gate = self.bus.newest(topics.GATE)
+        if self._goals is None or gate is None:
+            return
+        self._asked[call.source] += 1
+        request = call.request(gate, instant, self._asked[call.source])
+        with Pace().borrowed(instant), suppress(RequestRefusedError):
+            if isinstance(request, GoalRequest):
+                self._goals.take(request)
+            else:
+                self._goals.control(request)
+
+    async def _lead(self, output: LogMessage) -> None:
+        """A recorded path that was not computed is given, for the truck drove it."""
+        for _ in range(LINKS):
+            if (newest := self.bus.newest(topics.PATH)) is not None and newest.stamp >= output.stamp:
+                return
+            await asyncio.sleep(0)
+        with suppress(TruckError):
+            path: Any = output.decode()
+            self.bus.hand_over(topics.PATH, path)
+
+    def _count_answer(self, _: SlamHealth) -> None:
+        self._answers += 1
+
+    async def _catch_up(self, instant: int) -> None:
+        while self._unseen and self._unseen[0][0] <= instant:
+            due, service = self._unseen.popleft()
+            await self._clock.reach(due)
+            await self._paces[service].release(due)
+            await asyncio.sleep(0)
+        await self._clock.reach(instant)
+
+    def _build(self, config: TruckConfig) -> Iterator[Service]:
+        body = Body.of(config)
+        yield from build_estimation(config, self.bus, self._clock, body)
+        places = ReplayedPlaces(self._clock, self._goal_record, self._book)
+        planners = build_planners(config, self.bus, self._clock, body, places)
+        wanted = TICKS.keys() if config.planner is None else {*TICKS, PathService.name}
+        yield from (service for service in planners if service.name in wanted)
+
+    async def _run(self, service: Service) -> None:
+        pace = self._paces.get(service.name)
+        if pace is not None:
+            if service is self._goals and (start := self._goal_record.start) is not None:
+                await self._clock.reach(start)
+                pace.instant = start
+            pace.adopt()
+        elif (ready := self._ready.get(service.name)) is not None:
+            await self._clock.reach(ready)
+        await service.run(_nothing)
+
+
+def _near(instants: Sequence[int], stamp: int) -> int | None:
+    """The instant, of some in their order, that a stamp belongs to, ns."""
+    at = bisect_left(instants, stamp - TOGETHER)
+    return instants[at] if at < len(instants) and instants[at] <= stamp + TOGETHER else None
+
+
+def _nothing() -> None:
+    """Nobody waits for a service to be ready."""
+
+
+def _first(group: BaseExceptionGroup[Any]) -> BaseException:
+    error: BaseException = group
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error

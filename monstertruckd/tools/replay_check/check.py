@@ -1,0 +1,184 @@
+"""Computes a log again and says how far that is from what was recorded.
+
+Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
+for bit. So are those of the estimation worker and what rests on them in a log of the virtual clock. On the wall clock
+the log shows when the worker's results counted, but not which of two inputs of one instant it had read: there what
+rests on them may differ by ``WORKER_TOLERANCE``, and its own messages are shown, not judged. So are paths to goals,
+whose search ended by time there, not by work, and reports on goals: most results of their workers show nowhere.
+"""
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.clock import SECOND, VirtualLoop
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import BY_NAME, Topic
+from monstertruckd.bus.local import TapCallback
+from monstertruckd.config.load import load_truck
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.recorder.reader import LogMessage
+from monstertruckd.tools.logs.wall_time import first_offset
+from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
+from monstertruckd.tools.replay_check.comparison import TopicComparison
+from monstertruckd.tools.replay_check.pace import PacedClock
+from monstertruckd.tools.replay_check.recorded import Survey, preamble, recorded_config, survey
+from monstertruckd.tools.replay_check.result import Check, Unreadable
+from monstertruckd.tools.replay_check.run_log import RunLog
+
+RESTS_ON_WORKER: Final = frozenset(
+    topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
+)
+"""Outputs a worker has a say in where the robot maps or localises."""
+RESTS_ON_GOALS: Final = frozenset({topics.TRACKER.name, topics.PLAN_DRIVE.name})
+"""The same where it drives to goals; of the wall clock several stamps of one tick are known as one."""
+GOALS: Final = frozenset({topics.PATH.name, topics.GOAL.name})
+WORKER_TOLERANCE: Final = 0.02
+"""Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""
+
+
+def check_log(
+    log: Path,
+    config: Path | None = None,
+    tolerance: float | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Check:
+    """Compute the outputs of ``log`` again and compare them.
+
+    Args:
+        log: file to read; of a run in several parts any one stands for all.
+        config: another configuration to compute with; None = the log's own.
+        tolerance: greatest difference that agrees, in SI units, instead of the ones above.
+        progress: told the bytes of the run read so far.
+
+    Raises:
+        NotFoundError: no such log, configuration or saved map.
+        InputError: the log holds no configuration, no sensors, no outputs, or has no first part.
+        ConfigError: a configuration is refused.
+        WorkerError: the estimation worker failed.
+    """
+    reader = RunLog(log)
+    found = survey(reader)
+    attachments, metadata = preamble(reader)
+    own = recorded_config(log, attachments)
+    used = own if config is None else load_truck(config)[0]
+    left_out = why_no_goals(own, used, found.goals)
+    if left_out is not None:
+        own, used = without_goals(own), without_goals(used)
+    compared = outputs_of(own) | outputs_of(used)
+    _refuse_the_middle(log, found, compared)
+    virtual = first_offset(log, metadata) == 0
+    loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
+    rows = {
+        topic.name: TopicComparison(
+            topic,
+            tolerance if tolerance is not None else WORKER_TOLERANCE * (topic.name in loose),
+            found.start,
+            judged=topic.name not in shown,
+        )
+        for topic in topics.TOPICS
+        if topic.name in compared
+    }
+    unreadable: list[Unreadable] = []
+
+    async def main(clock: PacedClock) -> None:
+        chain = Chain(used, clock, unseen_ticks(own, found), found)
+        tap = chain.bus.tap(_into(rows, chain), (row.topic for row in rows.values()))
+        async with chain.running():
+            relevant = (entry for entry in reader if entry.topic in rows or chain.takes(entry.topic))
+            for bunch in _bunches(relevant, chain.ticks):
+                progress(reader.position)
+                await _feed(chain, bunch, rows, found, unreadable)
+            await chain.finish(found.end)
+            tap.close()
+
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(found.start)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, VirtualLoop)
+        runner.run(main(PacedClock(loop)))
+    end = max((found.newest[name].log_time for name in compared & found.newest.keys()), default=found.end)
+    return Check(
+        log,
+        reader.parts,
+        config,
+        (found.end - found.start) / SECOND,
+        end,
+        tuple(rows.values()),
+        tuple(unreadable),
+        found.lost(),
+        found.damage,
+        left_out,
+    )
+
+
+def _bunches(log: Iterable[LogMessage], ticks: Callable[[LogMessage], bool]) -> Iterator[list[LogMessage]]:
+    """Messages one by one; but outputs that show ticks together, as long as nothing else was recorded in between."""
+    bunch: list[LogMessage] = []
+    for entry in log:
+        ticking = ticks(entry)
+        if bunch and not ticking:
+            yield bunch
+            bunch = []
+        bunch.append(entry)
+        if not ticking:
+            yield bunch
+            bunch = []
+    if bunch:
+        yield bunch
+
+
+async def _feed(
+    chain: Chain,
+    bunch: Sequence[LogMessage],
+    rows: Mapping[str, TopicComparison],
+    found: Survey,
+    unreadable: list[Unreadable],
+) -> None:
+    for entry in bunch:
+        if (row := rows.get(entry.topic)) is not None:
+            row.recorded(entry.sequence, entry.log_time, entry.payload)
+    entry = bunch[0]
+    if entry.topic in WORKER:
+        await chain.answer(entry)
+        return
+    if not chain.takes(entry.topic):
+        await chain.tick(bunch)
+        return
+    try:
+        message = entry.decode()
+    except TruckError as error:
+        at = (entry.log_time - found.start) / SECOND
+        unreadable.append(Unreadable(entry.topic, entry.sequence, at, str(error)))
+    else:
+        await chain.take(BY_NAME[entry.topic], message, entry.log_time)
+
+
+def _into(rows: Mapping[str, TopicComparison], chain: Chain) -> TapCallback:
+    def take(topic: Topic[Message], message: Message, payload: bytes, at: int) -> None:
+        rows[topic.name].recomputed(at, chain.as_computed(topic, message, payload))
+
+    return take
+
+
+def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
+    """On the wall clock: topics that may differ a little, and topics that are not judged."""
+    loose, shown = frozenset[str](), frozenset[str]()
+    if any(config.slam is not None for config in configs):
+        loose, shown = RESTS_ON_WORKER, shown | frozenset(WORKER)
+    if any(config.planner is not None for config in configs):
+        loose, shown = loose | RESTS_ON_GOALS, shown | GOALS
+    return loose, shown
+
+
+def _refuse_the_middle(log: Path, found: Survey, compared: Collection[str]) -> None:
+    outputs = [entry for name, entry in found.first.items() if name in compared and name != topics.SCAN.name]
+    if not outputs:
+        raise InputError(f"{log}: holds no outputs of estimation to compare with")
+    for entry in outputs:
+        number = entry.decode().seq
+        if number > 0:
+            text = f"{entry.topic} begins with number {number}: expected the first part of a run, which begins with 0"
+            raise InputError(f"{log}: {text}")

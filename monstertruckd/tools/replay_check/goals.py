@@ -1,0 +1,191 @@
+"""What a log tells of goals beforehand: when they had their turns, what was asked by remote call, and what was found.
+
+The goal service tells less than it does: most of its ticks leave nothing in the log, remote calls are not recorded, and
+results of its workers show in the paths that are driven, as its decisions do in its reports.
+"""
+
+import itertools
+import re
+from bisect import bisect_right
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from monstertruck_planners.goals.lead import SOURCE
+from monstertruck_planners.goals.service import REPORT
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import TruckError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, GoalControl, GoalOrder, GoalRequest, Role
+from monstertruck_schemas.state import GateState
+from monstertruckd.recorder.reader import LogMessage
+
+ASKED: Final = frozenset({topics.REQ_GOAL.name, topics.REQ_GOAL_CONTROL.name})
+CANCELLED_BY: Final = "cancelled by "
+
+LEASE: Final = 1.0
+PLANNED: Final = r"goal-\d+\.\d+"
+DEFORMED: Final = r"goal-\d+-(deformed|held-up)\.\d+"
+TOGETHER: Final = SECOND // 50
+"""What a tick tells has stamps this near to each other, ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A remote call, as the report on the goal shows it."""
+
+    source: str
+    frame: str
+    what: Pose2D | GoalOrder
+    """The goal, or what is to become of it."""
+
+    def request(self, gate: GateState, stamp: int, seq: int) -> GoalRequest | GoalControl:
+        """The request it carried, but for what no report tells, with the rights it must have had."""
+        header: dict[str, Any] = {
+            "stamp": stamp,
+            "received": stamp,
+            "seq": seq,
+            "frame": self.frame,
+            "source": self.source,
+            "role": Role.STATION,
+            "lease": LEASE,
+            "nonce": gate.nonce,
+            "gate_stamp": gate.stamp,
+        }
+        if isinstance(self.what, GoalOrder):
+            return GoalControl(**header, order=self.what)
+        return GoalRequest(**header, goal=self.what)
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A report on the goal, where it stood in the log."""
+
+    sequence: int
+    state: GoalState
+
+
+@dataclass(slots=True)
+class GoalRecord:
+    """Of one log."""
+
+    told: list[Told] = field(default_factory=list)
+    paths: list[Path] = field(default_factory=list)
+    wishes: list[int] = field(default_factory=list)
+    """Stamps of requests to stand still, ns."""
+    asked: list[int] = field(default_factory=list)
+    """When requests came by topic, ns."""
+
+    def note(self, entry: LogMessage) -> None:
+        """Take in a message of the log."""
+        if entry.topic in ASKED:
+            self.asked.append(entry.log_time)
+            return
+        with suppress(TruckError):
+            match entry.topic:
+                case topics.GOAL.name:
+                    self._tell(entry)
+                case topics.PATH.name:
+                    path = entry.decode()
+                    assert isinstance(path, Path)
+                    self.paths.append(path)
+                case topics.PLAN_DRIVE.name if self.told and asks_standstill(entry):
+                    self.wishes.append(entry.stamp)
+
+    def _tell(self, entry: LogMessage) -> None:
+        state = entry.decode()
+        assert isinstance(state, GoalState)
+        self.told.append(Told(entry.sequence, state))
+
+    @property
+    def start(self) -> int | None:
+        """When the service reported first, ns; None in a log without goals."""
+        return self.told[0].state.stamp if self.told else None
+
+    def ticks(self, period: int) -> list[int]:
+        """Instants of the ticks that show."""
+        calls = self.calls(period)
+        stamps = [one.state.stamp for one in self.told if one.sequence not in calls] + self.wishes
+        shown: list[int] = []
+        for stamp in sorted(stamps):
+            if not shown or stamp - shown[-1] > TOGETHER:
+                shown.append(stamp)
+        return shown
+
+    def unseen_ticks(self, period: int) -> list[int]:
+        """Instants of those between them that left nothing while a goal was pursued, so that no report was due."""
+        told = [one.state.stamp for one in self.told]
+        found: list[int] = []
+        for before, after in itertools.pairwise(self.ticks(period)):
+            for number in range(round((after - before) / period) - 1, 0, -1):
+                instant = after - number * period
+                newest = self.told[bisect_right(told, instant) - 1].state
+                if newest.phase is not GoalPhase.IDLE:
+                    found.append(min(instant, newest.stamp + REPORT - 1))
+        return found
+
+    def calls(self, period: int) -> dict[int, Call]:
+        """What came by remote call, by the number of the report that shows it.
+
+        What comes by topic is in the log itself, and shows within two ticks.
+        """
+        found: dict[int, Call] = {}
+        for before, after in itertools.pairwise(self.told):
+            stamp = after.state.stamp
+            if any(0 <= stamp - asked <= 2 * period for asked in self.asked):
+                continue
+            if (call := _call(before.state, after.state)) is not None:
+                found[after.sequence] = call
+        return found
+
+    def unknown_waypoints(self, period: int) -> bool:
+        """Whether a remote call named waypoints: reports only count them."""
+        goals = {number for number, call in self.calls(period).items() if isinstance(call.what, Pose2D)}
+        return any(one.sequence in goals and one.state.waypoints for one in self.told)
+
+    def decided(self, since: int) -> int | None:
+        """When the answer to what was asked of the route planner at ``since``, ns, counted; None = not any more."""
+        for before, after in itertools.pairwise(self.told):
+            if after.state.stamp > since and _answered(before.state, after.state):
+                return after.state.stamp
+        return None
+
+    def path_between(self, begin: int, end: int, name: str) -> Path | None:
+        """First path told after ``begin`` and until ``end``, ns, whose name fits the pattern."""
+        told = (path for path in self.paths if begin < path.stamp <= end)
+        return next((path for path in told if re.fullmatch(name, path.name)), None)
+
+
+def asks_standstill(entry: LogMessage) -> bool:
+    """Whether a wish to the gate is the goal service's, not the tracker's."""
+    wish = entry.decode()
+    return isinstance(wish, DriveRequest) and wish.source == SOURCE
+
+
+def is_deformed(entry: LogMessage) -> bool:
+    """Whether a path came of deformation, not of a tick of the goal service."""
+    path = entry.decode()
+    return isinstance(path, Path) and re.fullmatch(DEFORMED, path.name) is not None
+
+
+def _answered(before: GoalState, after: GoalState) -> bool:
+    decided = ("phase", "routes", "recoveries", "outcome")
+    same = all(getattr(before, name) == getattr(after, name) for name in decided)
+    return before.phase is GoalPhase.PLANNING and before.number == after.number and not same
+
+
+def _call(before: GoalState, after: GoalState) -> Call | None:
+    if after.number != before.number and after.goal is not None:
+        return Call(after.source, after.frame, after.goal)
+    if before.phase is after.phase:
+        return None
+    if before.phase is GoalPhase.PAUSED and after.phase is GoalPhase.PLANNING:
+        return Call(after.source, after.frame, GoalOrder.RESUME)
+    if after.phase is GoalPhase.PAUSED:
+        return Call(after.source, after.frame, GoalOrder.PAUSE)
+    if after.outcome is Reason.CANCELLED and after.text.startswith(CANCELLED_BY):
+        return Call(after.text.removeprefix(CANCELLED_BY), after.frame, GoalOrder.CANCEL)
+    return None

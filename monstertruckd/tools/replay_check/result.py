@@ -1,0 +1,115 @@
+"""What a check of a log found."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.replay_check.comparison import First, TopicComparison
+
+ROUNDING: Final = 1e-6
+"""SI units: what another processor's maths routines, which round otherwise, are off by is far less."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A sensor's message whose bytes are none of its topic."""
+
+    topic: str
+    sequence: int
+    at: float
+    """Seconds after the log's begin."""
+    error: str
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What came out."""
+
+    log: Path
+    parts: tuple[Path, ...]
+    """The files of its run."""
+    config: Path | None
+    """The other configuration; None = the log's own."""
+    duration: float
+    """Of the log, s."""
+    end: int
+    """Instant up to which outputs were recorded, ns."""
+    topics: tuple[TopicComparison, ...]
+    unreadable: tuple[Unreadable, ...]
+    lost: dict[str, int]
+    """Messages that never reached the log, by topic."""
+    damage: str | None
+    left_out: str | None = None
+    """Why planner and tracker were not computed; None = they were, or there are none."""
+
+    @property
+    def compared(self) -> int:
+        """Outputs that were recorded and came again."""
+        return sum(row.compared for row in self.topics)
+
+    @property
+    def equal(self) -> int:
+        """Of them, equal bit for bit."""
+        return sum(row.equal for row in self.topics)
+
+    @property
+    def first(self) -> First | None:
+        """The first output that is off by more than its topic's tolerance."""
+        return min((row.first for row in self.topics if row.first), key=lambda first: first.at, default=None)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether everything came again within the tolerance."""
+        return all(row.agrees(self.end) for row in self.topics) and not self.unreadable
+
+    @property
+    def rounded(self) -> bool:
+        """Whether it does not agree, but nothing is off by more than ``ROUNDING``."""
+        close = all(row.within(self.end, ROUNDING) for row in self.topics) and not self.unreadable
+        return close and not self.agrees
+
+    @property
+    def sufficient(self) -> float:
+        """Tolerance, SI units, with which a check that is ``rounded`` agrees."""
+        return max([ROUNDING, *(row.tolerance for row in self.topics if row.judged)])
+
+    @property
+    def reason(self) -> Reason:
+        """How the check ended; another configuration may change what it likes."""
+        if self.damage is not None:
+            return Reason.LOG_DAMAGED
+        return Reason.OK if self.agrees or self.config is not None else Reason.REPLAY_DIFFERS
+
+    def figures(self) -> dict[str, Any]:
+        """Everything as plain values for JSON: what is not finite becomes null."""
+        return {
+            "log": str(self.log),
+            "parts": [str(part) for part in self.parts],
+            "config": None if self.config is None else str(self.config),
+            "reason": self.reason,
+            "agrees": self.agrees,
+            "rounded": self.rounded,
+            "duration": self.duration,
+            "compared": self.compared,
+            "equal": self.equal,
+            "first_difference": None if self.first is None else asdict(self.first),
+            "topics": {row.topic.name: self._row(row) for row in self.topics},
+            "unreadable": [asdict(message) for message in self.unreadable],
+            "lost": self.lost,
+            "damage": self.damage,
+            "left_out": self.left_out,
+        }
+
+    def _row(self, row: TopicComparison) -> dict[str, Any]:
+        return {
+            "tolerance": row.tolerance,
+            "judged": row.judged,
+            "compared": row.compared,
+            "equal": row.equal,
+            "differing": row.differing,
+            "missing": row.missing,
+            "extra": row.surplus(self.end),
+            "greatest": {str(one.kind): asdict(one) for one in row.greatest.values()},
+            "first_difference": None if row.first is None else asdict(row.first),
+        }

@@ -1,0 +1,137 @@
+"""The emulated robot as a process of its own: devices behind ptys, world truth kept for the judges."""
+
+import asyncio
+import signal
+import sys
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.cable import EmulatedPort
+from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
+from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.memory import settle
+from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
+from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
+from monstertruck_sim.robot import SimulatedRobot
+from monstertruck_sim.world.world import World
+from monstertruckd.config.truck import Monitors, PortConfig
+from monstertruckd.config.validate import load_config
+from monstertruckd.tools.drill.faults import Mishaps, Site
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+
+TRUTH_PERIOD = SECOND // 20
+
+
+class TruthLog:
+    """What really happened, sampled on an absolute schedule; for judges only, never for the daemon."""
+
+    COLUMNS = ("time", "x", "y", "yaw", "speed", "stuck")
+
+    def __init__(self, world: World, clock: Clock) -> None:
+        self._world = world
+        self._clock = clock
+        self._rows = array("d")
+
+    async def run(self) -> None:
+        """Sample until cancelled."""
+        due = self._clock.now()
+        while True:
+            now = self._clock.now()
+            state = self._world.truth(now)
+            self._rows.extend((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
+            due += TRUTH_PERIOD
+            await self._clock.sleep_until(due)
+
+    def array(self) -> NDArray[np.float64]:
+        """Shape (n, 6): ``COLUMNS``, s, m, m, rad, m/s, 0 or 1."""
+        return np.array(self._rows).reshape(-1, len(self.COLUMNS))
+
+
+async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
+    """Serve the devices of ``config_file`` behind ptys at their configured ports until SIGTERM or SIGINT.
+
+    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
+
+    Raises:
+        InputError: the configuration has hubs or monitors, but names no place for the emulated computer.
+    """
+    config, _ = load_config(config_file, SimulatedTruckConfig)
+    with TemporaryDirectory(prefix="monstertruck-") as folder, _shown(config, Path(folder)):
+        await _serve(clock, config, Path(folder), truth)
+
+
+@contextmanager
+def _shown(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
+    """Let ``machine`` lead to the emulated computer, where the daemon needs one."""
+    if not hangs_by_hub(config.devices) and config.monitors == Monitors():
+        yield
+        return
+    link = config.machine
+    if link.exists() and not link.is_symlink():
+        raise InputError(f"machine: {link} exists: expected the name of a link to be made to the emulated computer")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder, target_is_directory=True)
+    try:
+        yield
+    finally:
+        link.unlink(missing_ok=True)
+
+
+async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth: Path | None) -> None:
+    devices = config.devices.present()
+    cables: dict[str, EmulatedPort] = {}
+    for role, device in devices.items():
+        path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cables[role] = PtyPort(path)
+    computer = EmulatedComputer(folder, config.devices, cables, clock)
+    robot = SimulatedRobot(config.sim, config, clock, computer.ports, folder)
+    log = TruthLog(robot.world, clock)
+    emulated: dict[str, Commanded] = {role: Emulated(robot.emulators[role], robot.ports[role]) for role in devices}
+    emulated |= {name: EmulatedFiles(files) for name, files in robot.monitored.items()}
+    emulated["usb"] = computer
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    tasks = [
+        asyncio.create_task(robot.run(), name="robot"),
+        asyncio.create_task(log.run(), name="truth"),
+        asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
+    ]
+    if config.sim.drill is not None:
+        mishaps = Mishaps(Site(config, robot, computer, clock), config.sim.drill, _say)
+        tasks.append(asyncio.create_task(mishaps.run(), name="faults"))
+    if robot.recorded is not None:
+        tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
+    waiting = asyncio.create_task(stop.wait())
+    settle()
+    _say("ready")
+    await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
+    for task in (waiting, *tasks):
+        task.cancel()
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    if truth is not None:
+        np.savez(truth, truth=log.array())
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+
+
+async def _tell_end(recorded: RecordedHokuyoEmulator) -> None:
+    await recorded.finished.wait()
+    _say(f"recording sent, began {recorded.began}")
+    await asyncio.Event().wait()
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,96 @@
+"""Daemon, emulated devices and world on one virtual loop: for the fast demo, tests and drills."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_runtime.clock import VirtualClock
+from monstertruck_runtime.threads import inline
+from monstertruck_sim.computer import EmulatedComputer
+from monstertruck_sim.console import Emulated
+from monstertruck_sim.robot import SimulatedRobot
+from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.daemon import Daemon
+from monstertruckd.tools.drill.faults import Mishaps, Site
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.host import TruthLog
+
+
+class VirtualRig:
+    """A whole robot in one process; everything random comes from the configuration's seed.
+
+    Args:
+        config: the simulated truck's.
+        clock: of the running virtual loop.
+        tree: origins of the configuration's values.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig, clock: VirtualClock, tree: Tree | None = None) -> None:
+        self.config = config
+        self.clock = clock
+        self.began = clock.now()
+        """Start of the world, ns."""
+        self._folder = TemporaryDirectory(prefix="monstertruck-")
+        self.ports = {role: MemoryPort(role) for role in config.devices.present()}
+        self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
+        self.robot = SimulatedRobot(
+            config.sim, config, clock, self.computer.ports, self.computer.folder, offload=inline
+        )
+        self.world = self.robot.world
+        self.truth = TruthLog(self.world, clock)
+        by_path = {
+            role: port
+            for role, port in self.ports.items()
+            if not isinstance(config.devices.present()[role].port, UsbPortConfig)
+        }
+        self.daemon = Daemon(
+            config, clock, ports=by_path, computer=self.computer.computer(), tree=tree, seed=config.sim.seed
+        )
+        self.bus = self.daemon.bus
+        self._stop = asyncio.Event()
+        self._daemon_task: asyncio.Task[None] | None = None
+
+    def device(self, role: str) -> Emulated:
+        """Emulator and port of one role, to make it fail."""
+        return Emulated(self.robot.emulators[role], self.computer.ports[role])
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator["VirtualRig"]:
+        """World, devices and daemon run while the context lasts; the daemon ends first, in order.
+
+        Raises:
+            BaseException: what ended the daemon early.
+        """
+        around = [
+            asyncio.create_task(self.robot.run(), name="robot"),
+            asyncio.create_task(self.truth.run(), name="truth"),
+        ]
+        if (drill := self.config.sim.drill) is not None:
+            site = Site(self.config, self.robot, self.computer, self.clock, self.daemon.recorder)
+            around.append(asyncio.create_task(Mishaps(site, drill).run(), name="faults"))
+        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
+        try:
+            yield self
+        finally:
+            try:
+                await self.end_daemon()
+            finally:
+                for task in around:
+                    task.cancel()
+                await asyncio.wait(around)
+                self._folder.cleanup()
+
+    @property
+    def daemon_ended(self) -> bool:
+        """Whether the daemon has ended, asked to or not."""
+        return self._daemon_task is not None and self._daemon_task.done()
+
+    async def end_daemon(self) -> None:
+        """Ask the daemon to end, as SIGTERM does, and wait until it has."""
+        self._stop.set()
+        assert self._daemon_task is not None
+        await self._daemon_task

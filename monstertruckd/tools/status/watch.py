@@ -1,0 +1,114 @@
+"""Follows a robot for the live screen."""
+
+import asyncio
+import json
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NoAnswerError
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import Topic
+from monstertruckd.tools.status.screen import ScreenState, draw
+
+SHOWN: tuple[Topic[Any], ...] = (
+    topics.GATE,
+    topics.ODOMETRY,
+    topics.SCAN,
+    topics.COMPASS,
+    topics.BATTERY,
+    topics.TRACKER,
+    topics.HEALTH,
+    topics.LOOP,
+    topics.RECORDER,
+    topics.STOP,
+)
+PERIOD = 0.1
+
+
+class Follower:
+    """Keeps a ``ScreenState`` up to date from a client's subscriptions."""
+
+    def __init__(self, client: TruckClient, clock: Clock) -> None:
+        self.state = ScreenState(f"{client.robot} at {client.endpoint}", clock.now())
+        self._clock = clock
+        self._newest = [client.subscribe(topic, latest()) for topic in SHOWN]
+        self._events = client.subscribe(topics.EVENT, fifo(64))
+
+    async def run(self) -> None:
+        """Follow until cancelled."""
+        await asyncio.gather(self._sample(), self._collect())
+
+    async def _sample(self) -> None:
+        while True:
+            self.state.now = self._clock.now()
+            for mailbox in self._newest:
+                if mailbox.latest is not None:
+                    self.state.take(mailbox.latest)
+            await self._clock.sleep(PERIOD / 2)
+
+    async def _collect(self) -> None:
+        async for event in self._events:
+            self.state.take(event)
+
+
+async def watch(clock: Clock, robot: str, endpoint: str) -> None:
+    """Draw the screen until cancelled."""
+    async with TruckClient(robot, endpoint, clock=clock) as client:
+        follower = Follower(client, clock)
+        task = asyncio.create_task(follower.run())
+        try:
+            with Live(console=Console(), screen=True, auto_refresh=False) as live:
+                while True:
+                    live.update(draw(follower.state, live.console.width), refresh=True)
+                    await clock.sleep(PERIOD)
+        finally:
+            task.cancel()
+
+
+async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bool) -> None:
+    """Print the robot's state once.
+
+    Raises:
+        NoAnswerError: the robot published nothing for a second.
+    """
+    async with TruckClient(robot, endpoint, clock=clock) as client:
+        boxes = {topic.name: client.subscribe(topic, latest()) for topic in SHOWN}
+        await clock.sleep(1.2)
+        newest: dict[str, Message] = {name: box.latest for name, box in boxes.items() if box.latest is not None}
+        if not newest:
+            raise NoAnswerError(f"robot {robot!r} at {endpoint} published nothing for a second")
+        if json_output:
+            rows = {name: m.model_dump(mode="json") for name, m in newest.items() if name != topics.SCAN.name}
+            print(json.dumps(rows, indent=2))
+            return
+        state = ScreenState(robot, clock.now(), now=clock.now())
+        for message in newest.values():
+            state.take(message)
+        for line in plain(state):
+            print(line)
+
+
+def plain(state: ScreenState) -> list[str]:
+    """The state in words, for pipes."""
+    lines = []
+    if state.gate is not None:
+        reasons = ", ".join(reason.value for reason in state.gate.reasons) or "-"
+        lines.append(f"gate      {state.gate.mode.value}, driver {state.gate.holder or '-'}, why {reasons}")
+    lines += [f"stop      {line}" for line in state.why_stopped]
+    if state.odometry is not None:
+        pose = state.odometry.pose
+        lines.append(f"pose      x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.yaw:.3f} rad in {state.odometry.frame}")
+    if state.battery is not None:
+        volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.2f}"
+        lines.append(f"battery   {volts} V, {state.battery.level.value}")
+    if state.loop is not None:
+        late = state.loop
+        lines.append(f"tick      late p99 {late.lateness_p99 * 1e3:.2f} ms, max {late.lateness_max * 1e3:.2f} ms")
+    services = state.health.services if state.health is not None else ()
+    return lines + [f"service   {s.name:12} {s.state.value:9} restarts {s.restarts} {s.detail}" for s in services]

@@ -1,0 +1,58 @@
+"""Odom in map as it is shown: the newest correction, approached at a limited pace so that no tracker sees a jump."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.exchange import Vector
+from monstertruck_estimation.slam.se2 import between, compose, inverse
+
+Array = NDArray[np.float64]
+
+
+class Correction:
+    """Follows corrections where the robot is, not where odom begins: a turn about a far origin would be a jump.
+
+    Args:
+        slew: greatest speed of the change, m/s and rad/s.
+        jump: corrections of the robot's place beyond this, m, count at once.
+        settle: time constant of the approach within that, s; 0 = none. Whoever undoes the motion of a scan by these
+            poses must not see every correction as motion: matched so, the next scan would be wrong by as much.
+    """
+
+    def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:
+        self._slew = slew
+        self._settle = settle
+        self._jump = jump
+        self._target = np.zeros(3)
+        self._shown = np.zeros(3)
+
+    @property
+    def shown(self) -> Vector:
+        """Odom in map, m and rad."""
+        x, y, yaw = self._shown.tolist()
+        return x, y, yaw
+
+    def aim(self, map_from_odom: Vector, *, at_once: bool = False) -> None:
+        """Take a new correction; ``at_once``: what was shown before meant nothing."""
+        self._target = np.array(map_from_odom)
+        if at_once:
+            self._shown = self._target.copy()
+
+    def pose(self, odom: Vector, dt: float) -> Vector:
+        """Base in map for base in odom, ``dt`` seconds after the last call."""
+        base = np.array(odom)
+        now, then = compose(self._shown, base), compose(self._target, base)
+        off = between(now, then)
+        way, turn = math.hypot(off[0], off[1]), abs(float(off[2]))
+        share = min(self._slew[0] * dt / max(way, 1e-12), self._slew[1] * dt / max(turn, 1e-12))
+        if self._settle > 0:
+            share = min(share, -math.expm1(-dt / self._settle))
+        if way > self._jump or share >= 1.0:
+            now, self._shown = then, self._target.copy()
+        else:
+            now = compose(now, off * share)
+            self._shown = compose(now, inverse(base))
+        x, y, yaw = now.tolist()
+        return x, y, yaw

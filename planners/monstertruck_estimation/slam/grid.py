@@ -1,0 +1,207 @@
+"""Occupancy grid by the beam model: log odds of every cell, growing, with its changes by tiles.
+
+Inverse sensor model with constant log odds for the end of a beam and for what it passed (Thrun, Burgard, Fox:
+Probabilistic Robotics, table 9.2). A scan counts once per cell, and an end outweighs passes: otherwise walls seen at a
+grazing angle, and everything near the sensor, would be counted by the dozen.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.exchange import UNKNOWN, Patch
+from monstertruck_estimation.slam.settings import GridConfig
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int8]
+
+TILE: Final = 64
+"""Cells of a tile's edge; the grid's bounds are whole tiles."""
+SCALE: Final = 256.0
+"""Steps of the stored log odds per unit."""
+_FRACTION: Final = 16
+"""Bits behind the point while a beam is followed."""
+
+
+class OccupancyGrid:
+    """Log odds of a growing area.
+
+    Args:
+        config: cells and sensor model.
+    """
+
+    def __init__(self, config: GridConfig | None = None) -> None:
+        self.config = config = config or GridConfig()
+        self._hit, self._miss = _steps(config.hit), _steps(config.miss)
+        self._limit = _steps(config.limit)
+        self._percent = _percentages(self._limit)
+        self._published: dict[tuple[int, int], Cells] = {}
+        self._redrawn = False
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything that was seen; what was published stays known to ``changes``."""
+        self._corner = np.zeros(2, np.int64)
+        self._odds = np.zeros((0, 0), np.int16)
+        self._marks = np.zeros((0, 0), np.uint16)
+        self._mark = 0
+        self._touched: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
+        self._redrawn = True
+
+    def add(self, sensor: Array, points: Array) -> None:
+        """Take in one scan.
+
+        Args:
+            sensor: shape (2,), where the beams began, in map, m.
+            points: shape (n, 2), where they ended, in map, m; all finite.
+        """
+        if not len(points):
+            return
+        ends, low, high = _cells(points, sensor, 1.0 / self.config.resolution)
+        self._cover(low, high)
+        self._touch(low, high)
+        self._mark += 1
+        if self._mark > np.iinfo(np.uint16).max:
+            self._marks[:] = 0
+            self._mark = 1
+        _trace(
+            self._odds.ravel(),
+            self._marks.ravel(),
+            self._odds.shape[1],
+            ends,
+            self._corner,
+            self._mark,
+            (self._hit, self._miss, self._limit),
+        )
+
+    def patch(self) -> Patch:
+        """The whole grid, without unknown margins; without cells before the first scan."""
+        cells = self._percent[self._odds + self._limit]
+        rows, columns = np.flatnonzero((cells != UNKNOWN).any(axis=1)), np.flatnonzero((cells != UNKNOWN).any(axis=0))
+        if not len(rows):
+            return Patch(np.zeros((0, 0), np.int8), (0.0, 0.0), self.config.resolution)
+        cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        corner = self._corner + np.array((columns[0], rows[0]))
+        return Patch(np.ascontiguousarray(cells), self._metres(corner), self.config.resolution)
+
+    def changes(self) -> list[Patch]:
+        """The tiles that differ from what the last call told, ordered by row and column."""
+        result = []
+        known = self._published if self._redrawn else ()
+        for key in sorted({*known, *self._candidates()}):
+            cells, before = self._tile(key), self._published.get(key)
+            if before is not None and np.array_equal(cells, before):
+                continue
+            if before is None and (cells == UNKNOWN).all():
+                continue
+            self._published[key] = cells
+            row, column = key
+            result.append(Patch(cells, self._metres(np.array((column, row)) * TILE), self.config.resolution))
+        self._touched, self._redrawn = None, False
+        return result
+
+    def _candidates(self) -> Iterator[tuple[int, int]]:
+        if self._touched is None:
+            return
+        (x0, y0), (x1, y1) = (edge // TILE for edge in self._touched)
+        yield from ((row, column) for row in range(y0, y1 + 1) for column in range(x0, x1 + 1))
+
+    def _tile(self, key: tuple[int, int]) -> Cells:
+        row, column = key[0] * TILE - self._corner[1], key[1] * TILE - self._corner[0]
+        rows, columns = self._odds.shape
+        if not (0 <= row < rows and 0 <= column < columns):
+            return np.full((TILE, TILE), UNKNOWN, np.int8)
+        return self._percent[self._odds[row : row + TILE, column : column + TILE] + self._limit]
+
+    def _metres(self, corner: NDArray[np.int64]) -> tuple[float, float]:
+        return float(corner[0] * self.config.resolution), float(corner[1] * self.config.resolution)
+
+    def _touch(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        if self._touched is not None:
+            low, high = np.minimum(low, self._touched[0]), np.maximum(high, self._touched[1])
+        self._touched = low, high
+
+    def _cover(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        """Grow by whole tiles until the cells ``low`` and ``high`` are inside."""
+        size = np.array(self._odds.shape[::-1])
+        end = self._corner + size
+        if size.all():
+            if (low >= self._corner).all() and (high < end).all():
+                return
+            low, high = np.minimum(low, self._corner), np.maximum(high, end - 1)
+        corner = low // TILE * TILE
+        shape = ((high // TILE + 1) * TILE - corner)[::-1]
+        odds, marks = np.zeros(shape, np.int16), np.zeros(shape, np.uint16)
+        if size.all():
+            column, row = self._corner - corner
+            inside = np.s_[row : row + size[1], column : column + size[0]]
+            odds[inside], marks[inside] = self._odds, self._marks
+        self._corner, self._odds, self._marks = corner, odds, marks
+
+
+def _steps(probability: float) -> int:
+    return round(SCALE * math.log(probability / (1 - probability)))
+
+
+def _percentages(limit: int) -> Cells:
+    """Occupancy in percent by log odds + ``limit``; exactly zero log odds are unknown."""
+    odds = np.arange(-limit, limit + 1) / SCALE
+    percent = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
+    percent[limit] = UNKNOWN
+    return percent
+
+
+@njit(cache=True)
+def _cells(points, sensor, scale):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Cells of the sensor (row 0) and of the ends, with their bounds; (column, row) each."""
+    n = points.shape[0]
+    ends = np.empty((n + 1, 2), np.int32)
+    low, high = np.empty(2, np.int64), np.empty(2, np.int64)
+    for axis in range(2):
+        first = np.int32(math.floor(sensor[axis] * scale))
+        ends[0, axis] = first
+        least, most = first, first
+        for i in range(n):
+            cell = np.int32(math.floor(points[i, axis] * scale))
+            ends[i + 1, axis] = cell
+            least, most = min(least, cell), max(most, cell)
+        low[axis], high[axis] = least, most
+    return ends, low, high
+
+
+@njit(cache=True)
+def _trace(odds, marks, stride, ends, corner, mark, model):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Add one scan to the flat grids: its ends first, then what lies before them, every cell once."""
+    hit, miss, limit = model
+    x0, y0 = ends[0, 0] - corner[0], ends[0, 1] - corner[1]
+    n = ends.shape[0]
+    for i in range(1, n):
+        at = (ends[i, 1] - corner[1]) * stride + ends[i, 0] - corner[0]
+        if marks[at] != mark:
+            marks[at] = mark
+            odds[at] = min(odds[at] + hit, limit)
+    half = 1 << (_FRACTION - 1)
+    for i in range(1, n):
+        if i > 1 and ends[i, 0] == ends[i - 1, 0] and ends[i, 1] == ends[i - 1, 1]:
+            continue
+        dx, dy = ends[i, 0] - corner[0] - x0, ends[i, 1] - corner[1] - y0
+        across, along = abs(dx) >= abs(dy), max(abs(dx), abs(dy))
+        if along == 0:
+            continue
+        # One cell of the longer axis a step, the shorter one in fixed point: no branch but the mark's.
+        if across:
+            step, side, slope = (1 if dx > 0 else -1), stride, (dy << _FRACTION) // along
+        else:
+            step, side, slope = (stride if dy > 0 else -stride), 1, (dx << _FRACTION) // along
+        at, part = y0 * stride + x0, half
+        for _ in range(along):
+            cell = at + (part >> _FRACTION) * side
+            if marks[cell] != mark:
+                marks[cell] = mark
+                odds[cell] = max(odds[cell] + miss, -limit)
+            at += step
+            part += slope

@@ -1,0 +1,331 @@
+"""Localisation and mapping in the daemon: feeds the estimation worker, tells pose, map and how well the scans fit."""
+
+import asyncio
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.scan_tilt import Track, plane_slopes
+from monstertruck_estimation.slam.correction import Correction
+from monstertruck_estimation.slam.exchange import Estimate, ScanInput, Start, Vector, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.messages import grid_message, scan_motion, slam_health
+from monstertruck_estimation.slam.se2 import between, interpolate
+from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.transforms import planar
+from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import WorkerError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import SlamHealth, Standing
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
+from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
+from monstertruckd.config.truck import Mount
+
+TARGET: Final = "monstertruck_estimation.slam.step:EstimationWorker"
+PATIENCE: Final = 180.0
+"""Real seconds the worker may take to start: the first time it compiles."""
+HISTORY: Final = 128
+"""Poses of odometry remembered: 2.5 s at 50 Hz."""
+STALE: Final = SECOND // 5
+"""Odometry older than the scan by more than this does not count, ns."""
+FITTING: Final = frozenset({Standing.MAPPING, Standing.LOCALISED, Standing.DEGENERATE})
+
+
+class SlamService:
+    """Every scan goes to the worker with odometry at its stamp; between scans the pose follows odometry.
+
+    Args:
+        config: what is mapped, how, and where it is saved.
+        mount: of the lidar.
+        clock: time.
+        scan: lidar, bounded and counted.
+        odometry: pose in odom; None = the robot has none, the pose is then told once a scan.
+        compass: tilt of the body, to discard what hit the ground.
+        joints: of the lidar's mount.
+        pose: ``state/pose``.
+        whole: ``state/map``.
+        tiles: ``state/map_tiles``.
+        motion: ``state/scan_motion``.
+        health: ``health/slam``.
+        events: where closures, losses and unusable scans are told.
+    """
+
+    name = "slam"
+
+    def __init__(
+        self,
+        config: SlamConfig,
+        mount: Mount,
+        clock: Clock,
+        *,
+        scan: Mailbox[LaserScan],
+        odometry: Mailbox[Odometry] | None,
+        compass: Mailbox[Attitude] | None,
+        joints: Mailbox[StabiliserFeedback] | None,
+        pose: Publisher[Odometry],
+        whole: Publisher[Grid],
+        tiles: Publisher[Grid],
+        motion: Publisher[ScanMotion],
+        health: Publisher[SlamHealth],
+        events: EventSink,
+    ) -> None:
+        self._config, self._mount, self._clock = config, mount, clock
+        self._scan, self._odometry, self._compass, self._joints = scan, odometry, compass, joints
+        self._motions = motion
+        self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
+        self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
+        self._body, self._angles = Track(), Track()
+        self._correction = Correction(config.slew, config.jump)
+        self._newest: Estimate | None = None
+        self._standing: Standing | None = None
+        self._refused: str | None = None
+        self._left_out = 0
+        self._offset_told = False
+        self._due = {"tiles": 0, "whole": 0, "save": clock.now() + round(config.save_period * SECOND)}
+        self._changed = False
+        self._under_way: asyncio.Task[Any] | None = None
+
+    def frames(self) -> Iterable[Transform]:
+        """Odom in map as it is shown; without odometry, base in map."""
+        if self._odometry is not None:
+            stamp = self._history[-1][0] if self._history else 1
+            return (planar("map", "odom", stamp, self._correction.shown),)
+        if self._newest is None:
+            return ()
+        stamp = self._newest.stamp
+        return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
+
+    async def run(self, ready: Ready) -> None:
+        """Feed the worker until cancelled, then save.
+
+        Raises:
+            WorkerError: the worker failed, hung or died; the next session begins a new map where the robot is now.
+        """
+        config = self._config
+        worker = WorkerActor(
+            self.name, TARGET, self._clock, latency=config.latency, deadline=config.deadline, patience=PATIENCE
+        )
+        async with worker:
+            await worker.start()
+            ready()
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(self._map(worker))
+                    if self._odometry is not None:
+                        tasks.create_task(self._follow(self._odometry))
+            except* WorkerError as group:
+                raise group.exceptions[0] from None
+            finally:
+                await self._end(worker)
+
+    # Pose
+
+    async def _follow(self, odometry: Mailbox[Odometry]) -> None:
+        async for message in odometry:
+            before = self._history[-1][0] if self._history else message.stamp
+            if message.stamp < before:
+                self._history.clear()
+                before = message.stamp
+            odom = (message.pose.x, message.pose.y, message.pose.yaw)
+            self._history.append((message.stamp, odom))
+            x, y, yaw = self._correction.pose(odom, (message.stamp - before) / SECOND)
+            update: dict[str, Any] = {
+                "frame": "map",
+                "seq": self._pose.next_seq(),
+                "pose": Pose2D(x=x, y=y, yaw=yaw),
+            }
+            if self._newest is not None:
+                update["pose_covariance"] = np.array(self._newest.covariance)
+                update["sources"] = (*message.sources, "lidar")
+            self._pose.put(message.model_copy(update=update))
+
+    def _tell_pose(self, estimate: Estimate, scan: LaserScan) -> None:
+        """Of a robot without odometry."""
+        x, y, yaw = estimate.pose
+        self._pose.put(
+            Odometry(
+                stamp=estimate.stamp,
+                received=self._clock.now(),
+                seq=self._pose.next_seq(),
+                frame="map",
+                pose=Pose2D(x=x, y=y, yaw=yaw),
+                twist=Twist2D(vx=0.0, vy=0.0, wz=0.0),
+                pose_covariance=np.array(estimate.covariance),
+                twist_covariance=np.zeros(9),
+                age=max((self._clock.now() - scan.stamp) / SECOND, 0.0),
+                sources=("lidar",),
+            )
+        )
+
+    # Scans
+
+    async def _map(self, worker: WorkerActor) -> None:
+        started = False
+        async for scan in self._scan:
+            reason = self._unusable(scan)
+            if reason is not None:
+                self._leave_out(reason)
+                continue
+            inputs = self._inputs(scan)
+            start = None if started else Start(self._config, self._start(inputs.odom))
+            outputs = await self._step(worker, self._work(inputs, start))
+            started = True
+            self._take(outputs, scan)
+
+    async def _step(self, worker: WorkerActor, work: WorkerInput) -> WorkerOutput:
+        """Shielded: a step that is cancelled kills the worker, and with it the map that is still to be saved."""
+        self._under_way = asyncio.ensure_future(worker.step(work))
+        outputs: WorkerOutput = await asyncio.shield(self._under_way)
+        return outputs
+
+    async def _end(self, worker: WorkerActor) -> None:
+        task, self._under_way = self._under_way, None
+        if task is None or worker.pid is None:
+            return
+        if not task.done():
+            await task
+        if self._config.save is not None and self._config.mode == "mapping" and task.exception() is None:
+            # First as it is, for the joint fit takes seconds that there may not be.
+            self._told_saved(await worker.step(WorkerInput(save=self._config.save)))
+            self._told_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
+
+    def _unusable(self, scan: LaserScan) -> str | None:
+        if scan.tilt is not None and scan.tilt > self._config.max_tilt:
+            return f"tilted by {scan.tilt:.2f} rad, expected at most {self._config.max_tilt:g}"
+        if self._odometry is not None and not self._history:
+            return "no odometry yet"
+        return None
+
+    def _inputs(self, scan: LaserScan) -> ScanInput:
+        odom, twist = self._motion(scan.stamp, scan.stamp + round(scan.time_increment * len(scan.ranges) * SECOND))
+        height = self._mount.z if self._mount.z > 0 else None
+        return replace(
+            ScanInput.of(scan, self._mount.planar),
+            odom=odom,
+            twist=twist,
+            slopes=self._slopes(scan),
+            height=height,
+            ceiling=self._config.ceiling,
+        )
+
+    def _motion(self, begin: int, end: int) -> tuple[Vector | None, Vector]:
+        """Base in odom at ``begin``, and the velocity until ``end``; both ns."""
+        history = self._history
+        if not history or begin - history[-1][0] > STALE or begin < history[0][0]:
+            return None, (0.0, 0.0, 0.0)
+        first = max(bisect_left(history, begin, key=lambda row: row[0]) - 1, 0)
+        rows = list(history)[first:]
+        stamps = np.array([row[0] - begin for row in rows], np.float64)
+        until = min(end - begin, stamps[-1])
+        poses = interpolate(stamps, np.array([row[1] for row in rows]), np.array((0.0, until)))
+        x, y, yaw = poses[0].tolist()
+        if until <= 0:
+            return (x, y, yaw), (0.0, 0.0, 0.0)
+        vx, vy, wz = (between(poses[0], poses[1]) / (until / SECOND)).tolist()
+        return (x, y, yaw), (vx, vy, wz)
+
+    def _slopes(self, scan: LaserScan) -> tuple[float, float] | None:
+        if self._compass is None:
+            return None
+        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
+        middle = scan.stamp + round(scan.time_increment * len(scan.ranges) / 2 * SECOND)
+        body = self._body.at(middle)
+        if self._joints is None:
+            return None if body is None else plane_slopes(*body, yaw=self._mount.yaw)
+        self._angles.extend(
+            (f.stamp, (f.pitch, f.roll)) for f in self._joints.drain() if f.pitch is not None and f.roll is not None
+        )
+        angles = self._angles.at(middle)
+        return None if body is None or angles is None else plane_slopes(*body, *angles, yaw=self._mount.yaw)
+
+    def _start(self, odom: Vector | None) -> Vector:
+        """Where a new map begins: where the robot is believed to be."""
+        if odom is not None:
+            return self._correction.pose(odom, 0.0)
+        return (0.0, 0.0, 0.0) if self._newest is None else self._newest.pose
+
+    # What comes back
+
+    def _work(self, scan: ScanInput, start: Start | None) -> WorkerInput:
+        config, now = self._config, self._clock.now()
+        due = {name for name, at in self._due.items() if now >= at}
+        whole = start is not None or ("whole" in due and self._changed)
+        if whole:
+            due.add("tiles")
+            self._due["whole"] = now + round(config.map_period * SECOND)
+            self._changed = False
+        if "tiles" in due:
+            self._due["tiles"] = now + round(config.tiles_period * SECOND)
+        save = config.save if "save" in due and config.mode == "mapping" else None
+        if "save" in due:
+            self._due["save"] = now + round(config.save_period * SECOND)
+        return WorkerInput(start=start, scan=scan, tiles="tiles" in due, whole=whole, save=save)
+
+    def _take(self, outputs: WorkerOutput, scan: LaserScan) -> None:
+        if outputs.refused is not None:
+            self._leave_out(outputs.refused)
+        self._told_saved(outputs)
+        now = self._clock.now()
+        self._changed |= bool(outputs.tiles)
+        if outputs.whole is not None and outputs.whole.cells.size:
+            self._whole.put(grid_message(outputs.whole, now, self._whole.next_seq()))
+        else:
+            for tile in outputs.tiles:
+                self._tiles.put(grid_message(tile, now, self._tiles.next_seq()))
+        estimate = outputs.estimate
+        if estimate is None:
+            return
+        self._refused = None
+        found = self._standing is not None and self._standing not in FITTING and estimate.standing in FITTING
+        if estimate.map_from_odom is not None and estimate.standing is not Standing.SEARCHING:
+            self._correction.aim(estimate.map_from_odom, at_once=found or self._newest is None)
+        self._newest = estimate
+        if estimate.moved is not None:
+            self._motions.put(scan_motion(estimate.stamp, estimate.moved, now, self._motions.next_seq()))
+        self._report(estimate, outputs)
+        if self._odometry is None:
+            self._tell_pose(estimate, scan)
+
+    def _report(self, estimate: Estimate, outputs: WorkerOutput) -> None:
+        self._health.put(
+            slam_health(
+                estimate, outputs.counts, (self._left_out, self._scan.drops), self._clock.now(), self._health.next_seq()
+            )
+        )
+        if "closed" in estimate.events:
+            self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, f"closure {outputs.counts['closures']}")
+        if estimate.offset is not None and not self._offset_told:
+            self._offset_told = True
+            text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"
+            self._events(Reason.TIME_OFFSET, Severity.WARNING, self.name, text, offset=estimate.offset)
+        if estimate.standing is self._standing:
+            return
+        before, self._standing = self._standing, estimate.standing
+        if estimate.standing is Standing.DEGENERATE:
+            text = f"along {estimate.direction:.2f} rad in map"
+            self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)
+        elif estimate.standing not in FITTING:
+            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, str(estimate.standing))
+        elif before is not None:
+            self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.standing))
+
+    def _leave_out(self, why: str) -> None:
+        self._left_out += 1
+        kind = why.partition(" ")[0]
+        if kind != self._refused:
+            self._refused = kind
+            self._events(Reason.SCAN_LEFT_OUT, Severity.WARNING, self.name, why)
+
+    def _told_saved(self, outputs: WorkerOutput) -> None:
+        if outputs.saved is not None:
+            self._events(Reason.MAP_SAVED, Severity.INFO, self.name, outputs.saved)
+        if outputs.error is not None:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")

@@ -1,0 +1,122 @@
+"""Worker that maps or localises: ``monstertruck_estimation.slam.step:EstimationWorker``.
+
+A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
+"""
+
+import numpy as np
+
+from monstertruck_estimation.slam import storage
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.estimator import Estimator, MappingEstimator, mapper_config, prepared
+from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.frontend import FrontEnd
+from monstertruck_estimation.slam.localise import LocalisingEstimator
+from monstertruck_estimation.slam.mapper import Event
+from monstertruck_estimation.slam.settings import GridConfig, SlamConfig
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.memory import give_back
+
+FEWEST = 3
+"""Points without which a scan is left out."""
+
+
+class EstimationWorker:
+    """Keeps the map; compiled once it is built."""
+
+    def __init__(self) -> None:
+        self._estimator: Estimator | None = None
+        self._longest = np.inf
+        self._geometry: tuple[float, ...] | None = None
+        self._newest: int | None = None
+        _warm_up()
+
+    def step(self, inputs: WorkerInput) -> WorkerOutput:
+        """Do what is asked for.
+
+        Raises:
+            InputError: the saved map is not readable, or no start came first.
+        """
+        if inputs.start is not None:
+            self._begin(inputs.start)
+        estimator = self._estimator
+        if estimator is None:
+            msg = "estimation: expected a start before anything else"
+            raise InputError(msg)
+        made, refused = None, None
+        if inputs.scan is not None:
+            refused = self._refusal(inputs.scan)
+            if refused is None:
+                scan = prepared(inputs.scan, self._longest, estimator.twist)
+                if len(scan) < FEWEST:
+                    refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
+                else:
+                    made = estimator.step(scan, inputs.scan)
+                    if made is not None and Event.THINNED in made.events:
+                        give_back()
+        if inputs.finish:
+            estimator.finish()
+        tiles, redrawn = estimator.changes() if inputs.tiles else ([], False)
+        whole = estimator.patch() if inputs.whole or redrawn else None
+        saved, error = self._save(inputs, estimator)
+        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, dict(estimator.counts), saved, error)
+
+    def _begin(self, start: Start) -> None:
+        config = start.config
+        assert isinstance(config, SlamConfig)
+        settings = mapper_config(config)
+        self._longest = settings.longest
+        if config.mode == "localisation":
+            assert config.map is not None
+            self._estimator = LocalisingEstimator(storage.load(config.map), settings)
+        else:
+            self._estimator = MappingEstimator(settings, config.grid, front_of(config.front), start.pose)
+
+    def _refusal(self, scan: ScanInput) -> str | None:
+        """Why a scan is not for this map; None = it is."""
+        geometry = (len(scan.ranges), scan.start_angle, scan.angle_increment, *scan.mount)
+        if self._geometry is None:
+            self._geometry = geometry
+        elif geometry != self._geometry:
+            now, before = f"{geometry[0]:g} beams from {geometry[1]:.3f} rad", f"{self._geometry[0]:g}"
+            return f"another geometry: {now}, expected {before} beams from {self._geometry[1]:.3f} rad"
+        if self._newest is not None and scan.stamp <= self._newest:
+            return f"not later than the scan before ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
+        self._newest = scan.stamp
+        return None
+
+    def _save(self, inputs: WorkerInput, estimator: Estimator) -> tuple[str | None, str | None]:
+        if inputs.save is None:
+            return None, None
+        try:
+            storage.save(inputs.save, estimator.patch(), estimator.graph())
+        except (OSError, InputError) as error:
+            return None, str(error)
+        return str(inputs.save), None
+
+
+def front_of(kind: str) -> FrontEnd | None:
+    """The scan front end of this name; None = the mapper's own."""
+    if kind == "planar":
+        return None
+    from monstertruck_estimation.slam.kiss import Kiss  # noqa: PLC0415  # its library is for this kind only
+
+    return Kiss()
+
+
+def _warm_up() -> None:
+    """Compile everything before the first scan is due."""
+    angles = np.linspace(-2.0, 2.0, 200)
+    estimator = MappingEstimator(MapperConfig(), GridConfig())
+    for i in range(4):
+        ranges = 2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+        inputs = ScanInput(
+            stamp=(i + 1) * 10**8,
+            ranges=ranges,
+            start_angle=-2.0,
+            angle_increment=float(angles[1] - angles[0]),
+            range_min=0.02,
+            range_max=5.6,
+            odom=(0.2 * i, 0.0, 0.0),
+        )
+        estimator.step(prepared(inputs, 30.0), inputs)
+    estimator.changes()

@@ -1,0 +1,169 @@
+"""Saved maps: a folder with the grid for everybody (map_server: ``map.yaml``, ``map.png``) and our ``graph.npz``.
+
+The graph holds key scans, their poses and the relations between them as plain arrays, no pickles. Every file is
+replaced whole, the YAML last.
+"""
+
+import dataclasses
+import io
+import itertools
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.exchange import Patch
+from monstertruck_estimation.slam.mapper import Mapper
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
+from monstertruck_runtime.small_files import replace_file
+
+Array = NDArray[np.float64]
+
+YAML, GRAPH = "map.yaml", "graph.npz"
+VERSION: Final = 1
+ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
+"""Arrays of a scan: of a file that was written before there were so many, the others are zeros."""
+OCCUPIED_FROM, FREE_TO = 65, 19
+"""Percent, as in the thresholds of map_server."""
+_SHAPES: Final[dict[str, tuple[int, ...]]] = {
+    "stamps": (),
+    "poses": (3,),
+    "points": (2,),
+    "normals": (2,),
+    "variances": (2,),
+    "edge_ends": (2,),
+    "edge_measured": (3,),
+    "edge_information": (3, 3),
+    "edge_spread": (2,),
+    "edge_loop": (),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """Key scans and the relations between them."""
+
+    stamps: NDArray[np.int64]
+    """Shape (n,), ns."""
+    poses: Array
+    """Shape (n, 3), base in map."""
+    scans: tuple[Scan, ...]
+    """In base."""
+    edges: dict[str, NDArray[Any]]
+    """``edge_*`` arrays of the file: ends (m, 2), measured (m, 3), information (m, 3, 3), spread (m, 2), loop (m,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavedMap:
+    """What a folder holds."""
+
+    grid: WorldMap
+    graph: Graph | None
+    """None for a map of others: grid only."""
+
+
+def elements(points: Array, **known: Array) -> Scan:
+    """Surface elements at ``points``, shape (n, 2); of what is not known of them, zeros."""
+    every = {name: known.get(name, np.zeros(len(points))) for name in ELEMENTS if name != "points"}
+    return Scan(points=points, **every)
+
+
+def graph_of(mapper: Mapper) -> Graph:
+    """The mapper's graph as it is now."""
+    known = mapper.map
+    edges = known.edges.edges()
+    return Graph(
+        np.array([key.stamp for key in known.keys], np.int64),
+        known.poses.copy(),
+        tuple(key.scan for key in known.keys),
+        {
+            "edge_ends": np.stack((edges.origin, edges.target), axis=-1),
+            "edge_measured": np.array(edges.measured),
+            "edge_information": np.array(edges.information),
+            "edge_spread": np.array(known.edges.spread),
+            "edge_loop": np.array(edges.loop),
+        },
+    )
+
+
+def trinary(patch: Patch) -> WorldMap:
+    """Free, occupied, unknown."""
+    cells = np.full(patch.cells.shape, UNKNOWN, np.int8)
+    cells[patch.cells >= OCCUPIED_FROM] = OCCUPIED
+    cells[(patch.cells >= 0) & (patch.cells <= FREE_TO)] = FREE
+    return WorldMap(cells, patch.resolution, patch.origin)
+
+
+def save(folder: Path, patch: Patch, graph: Graph | None) -> None:
+    """Write a map.
+
+    Raises:
+        InputError: there is nothing to save yet.
+        OSError: a file could not be written.
+    """
+    if not patch.cells.size:
+        msg = f"{folder}: nothing is mapped yet"
+        raise InputError(msg)
+    folder.mkdir(parents=True, exist_ok=True)
+    if graph is not None and graph.scans:
+        counts = [len(scan) for scan in graph.scans]
+        every: dict[str, Any] = {
+            name: np.concatenate([getattr(scan, name) for scan in graph.scans]).astype(np.float32) for name in ELEMENTS
+        }
+        every |= graph.edges
+        data = io.BytesIO()
+        np.savez_compressed(
+            data,
+            version=np.array(VERSION),
+            stamps=graph.stamps,
+            poses=graph.poses,
+            starts=np.concatenate(([0], np.cumsum(counts, dtype=np.int64))),
+            **every,
+        )
+        replace_file(folder / GRAPH, data.getvalue())
+    save_map(trinary(patch), folder / YAML)
+
+
+def load(place: Path) -> SavedMap:
+    """Read a saved map: its folder, or the YAML file of anybody's.
+
+    Raises:
+        InputError: file, key and expectation of whatever is wrong.
+    """
+    if not place.is_dir():
+        return SavedMap(load_map(place), None)
+    graph = place / GRAPH
+    return SavedMap(load_map(place / YAML), _read_graph(graph) if graph.exists() else None)
+
+
+def _read_graph(path: Path) -> Graph:
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        msg = f"{path}: not a graph: {error}"
+        raise InputError(msg) from error
+    if arrays.get("version") is None or int(arrays["version"]) != VERSION:
+        msg = f"{path}: version: expected {VERSION}, got {arrays.get('version')}"
+        raise InputError(msg)
+    for name, shape in {**_SHAPES, "starts": ()}.items():
+        if name not in arrays or arrays[name].shape[1:] != shape or arrays[name].ndim != len(shape) + 1:
+            found = arrays[name].shape if name in arrays else "nothing"
+            msg = f"{path}: {name}: expected rows of shape {shape}, got {found}"
+            raise InputError(msg)
+    starts, count = arrays["starts"], len(arrays["poses"])
+    whole = len(starts) == count + 1 and starts[0] == 0 and (np.diff(starts) >= 0).all()
+    if not whole or starts[-1] != len(arrays["points"]) or len(arrays["stamps"]) != count:
+        msg = f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}"
+        raise InputError(msg)
+    every = {name: arrays[name].astype(np.float64) for name in ELEMENTS if name in arrays}
+    scans = tuple(
+        elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)
+    )
+    edges = {name: values for name, values in arrays.items() if name.startswith("edge_")}
+    return Graph(arrays["stamps"], arrays["poses"], scans, edges)

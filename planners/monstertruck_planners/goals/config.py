@@ -1,0 +1,123 @@
+"""Settings of the way to a goal: route planner, map, recovery ladder. Light."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_planners.local.config import AnyDeformer
+from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.plan import Steering
+
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0)]
+
+RouteKind = Annotated[HybridConfig | LatticeConfig, Field(discriminator="kind")]
+"""The planners whose routes can be driven as they are."""
+
+Rung = Literal["clear", "back_out", "wait", "replan"]
+
+DRIVEN: dict[Literal["2ws", "counter", "4ws"], tuple[Steering, ...]] = {
+    "2ws": ("front",),
+    "counter": ("counter",),
+    "4ws": ("counter", "crab"),
+}
+"""Ways of steering in the routes of each kind of vehicle."""
+
+
+class EscapeConfig(Schema):
+    """Backing out, as by car_maneuver_recovery: away from the sides of the footprint that are not free."""
+
+    room: Positive = 0.15
+    """A side is free if there is nothing this near beside it, m."""
+    distance: Positive = 0.5
+    """Driven at most, m."""
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.4
+    """Of the axles, away from a blocked side, rad."""
+    crab: bool = True
+    """Both axles alike, where the vehicle can; else they turn the truck."""
+    margin: Share = 0.03
+    """Kept to obstacles on the way, m; those that are nearer already may not come nearer."""
+
+
+class LocalConfig(Schema):
+    """When routes are deformed, and what is made of it."""
+
+    clearance: Share = 0.02
+    """A route with something nearer than this beside it is deformed, m; what the gate keeps beside the truck."""
+    rejoin: Share = 0.03
+    """More than that is needed to go back to the route, m..."""
+    beside: Positive = 0.06
+    """...and the truck may be this far from it, m, counting 0.3 m a radian."""
+    patience: Positive = 2.0
+    """Seconds without a way round something after which the route counts as blocked."""
+    detour: Positive = 45.0
+    """Seconds of deformation that do not bring the truck on along its route, after which the same holds."""
+    latency: Positive = 0.05
+    """Seconds a deformation takes on the virtual clock"""
+    deadline: Positive = 5.0
+    """Seconds after which a silent worker is killed"""
+
+
+class PlannerConfig(Schema):
+    """How goals are reached."""
+
+    route: RouteKind = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
+    """Route planner; its margin has to exceed what the gate keeps beside the truck; backward the lidar sees nothing"""
+    steering: Literal["2ws", "counter", "4ws"] = "4ws"
+    """Front axle alone, both opposite, or both in every way"""
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.36
+    """Greatest axle angle of routes, rad; what the truck has beyond is left to the tracker"""
+    map: Path | None = None
+    """map_server YAML file to plan on where there is no slam"""
+    deform: AnyDeformer | None = None
+    """What leads the truck round things that stand on its route; null = the route is planned anew"""
+    local: LocalConfig = LocalConfig()
+    rate: Annotated[float, Field(ge=1, le=20)] = 10.0
+    """Decisions per second."""
+    position_tolerance: Positive = 0.2
+    """The goal is reached if the truck stands this near, m..."""
+    yaw_tolerance: Positive = 0.2
+    """...and is turned away from it by no more than this, rad."""
+    waypoint_radius: Positive = 0.3
+    """A waypoint has been passed if the truck was this near, m."""
+    aim: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Share of these beyond which it corrects its place first."""
+    corrections: Annotated[int, Field(ge=0)] = 1
+    """How often it does so."""
+    timeout: Positive = 600.0
+    """Seconds for a goal; those in which the truck is not armed or the goal is paused do not count."""
+    unarmed_timeout: Positive = 300.0
+    """Seconds a goal waits for the truck to be armed."""
+    stuck: Positive = 4.0
+    """Seconds without progress after which the recovery ladder begins."""
+    progress: Positive = 0.03
+    """Metres along the path that are progress."""
+    look_ahead: Positive = 1.5
+    """Way ahead that is compared with the newest scan, m."""
+    sightings: Annotated[int, Field(ge=1)] = 3
+    """Looks in a row that have to show the way blocked."""
+    ladder: Annotated[tuple[Rung, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
+    """What is tried in turn to get out of trouble, before the goal is given up"""
+    wait: Positive = 5.0
+    """Seconds of the step "wait"."""
+    recovered: Positive = 0.5
+    """Metres nearer to the goal along the route than ever before, after which the ladder begins anew"""
+    routes: Annotated[int, Field(ge=1)] = 30
+    """Routes for one goal at most."""
+    max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
+    """A scan tilted more than this says nothing about the way, rad: it looks over obstacles, or onto the ground"""
+    scan_tolerance: Share = 0.08
+    """Returns this near to an obstacle of the map are taken for it, m."""
+    escape: EscapeConfig = EscapeConfig()
+    latency: Positive = 0.5
+    """Seconds a route takes on the virtual clock"""
+    deadline: Positive = 30.0
+    """Seconds after which a silent worker is killed"""
+
+    @model_validator(mode="after")
+    def _in_time(self) -> Self:
+        if self.route.budget >= self.deadline:
+            raise ValueError(f"deadline {self.deadline} s: expected more than route.budget, {self.route.budget} s")
+        return self

@@ -1,0 +1,200 @@
+"""The route under deformation: every scan goes to the deforming step, and what comes of it is told."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup, Way
+from monstertruck_planners.goals.parts import level, pose_of
+from monstertruck_runtime.actors.placement import Actor
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import WorkerError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Subscription
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid, Odometry
+from monstertruck_schemas.topics import ODOMETRY
+
+Array = NDArray[np.float64]
+
+ONWARD: Final = 0.05
+"""Metres along the route that are progress."""
+
+
+class Deformation:
+    """Keeps the route that is driven and what the deforming step said of it last.
+
+    Args:
+        setup: how, and the truck.
+        clock: time.
+        actor: where it is deformed.
+        scan: every one is taken in.
+        pose: of the truck, in the frame of the routes.
+        grid: the map; None = the configured one.
+        events: where events go.
+    """
+
+    name = "goals"
+
+    def __init__(
+        self,
+        setup: Setup,
+        clock: Clock,
+        actor: Actor,
+        *,
+        scan: Mailbox[LaserScan],
+        pose: Subscription[Odometry],
+        grid: Subscription[Grid] | None,
+        events: EventSink,
+    ) -> None:
+        self._setup, self._local, self._clock, self._actor = setup, setup.config.local, clock, actor
+        self._scan, self._pose, self._grid, self._events = scan, pose, grid, events
+        self._fresh = True
+        self._sent_grid: Grid | None = None
+        self._number = 0
+        self._route: PlanAnswer | None = None
+        self._travelled: Array = np.zeros(1)
+        self._sent_way = 0
+        self._answer: DeformAnswer | None = None
+        self._since = 0
+        """When what stands on the route began to block it, ns."""
+        self._furthest = 0.0
+        self._onward = 0
+        """When the truck last came on along the route, ns."""
+
+    async def run(self, tell: Callable[[Finding, DeformAnswer], None]) -> None:
+        """Have every scan taken in until cancelled; while one is worked on, newer ones replace each other.
+
+        Args:
+            tell: is given what had become of the present route, and what does now.
+        """
+        async with self._actor as actor:
+            await actor.start()
+            self._fresh = True
+            while True:
+                task = self._task(await self._scan.next())
+                if task is None:
+                    continue
+                try:
+                    answer: DeformAnswer = await actor.step(task)
+                except WorkerError as error:
+                    self._fresh = True
+                    self._events(error.reason, Severity.ERROR, self.name, str(error))
+                    continue
+                if self._route is not None and answer.number == self._number:
+                    was = self._finding
+                    self._note(answer)
+                    tell(was, answer)
+
+    def begin(self, route: PlanAnswer) -> None:
+        """Another route is driven from now on."""
+        assert route.poses is not None
+        self._number += 1
+        self._route, self._answer = route, None
+        steps = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
+        self._travelled = np.concatenate(([0.0], np.cumsum(steps)))
+        self._furthest, self._onward = 0.0, self._clock.now()
+
+    def end(self) -> None:
+        """No route is driven."""
+        self._route = self._answer = None
+
+    @property
+    def _finding(self) -> Finding:
+        return "idle" if self._answer is None else self._answer.finding
+
+    @property
+    def deformed(self) -> bool:
+        """Whether something else than the route is driven."""
+        return self._finding not in ("idle", "free")
+
+    @property
+    def up(self) -> bool:
+        """Whether it has a say about the present route."""
+        return self._answer is not None
+
+    @property
+    def complete(self) -> bool:
+        """Whether what is driven leads to the route's end."""
+        return self._answer is None or self._answer.complete
+
+    @property
+    def held_up(self) -> bool:
+        """Whether there is no way round for now."""
+        return self._finding == "blocked"
+
+    def blocked(self, now: int) -> bool:
+        """Whether the route leads nowhere: no way round for some time, or a detour without end."""
+        return (self.held_up and now - self._since > self._local.patience * SECOND) or (
+            self.deformed and now - self._onward > self._local.detour * SECOND
+        )
+
+    @property
+    def left(self) -> float:
+        """Metres of the route ahead; 0 without one."""
+        if self._answer is None:
+            return 0.0
+        return float(self._travelled[-1] - self._travelled[self._answer.place])
+
+    def rest(self) -> PlanAnswer:
+        """The route from the truck on."""
+        route, answer = self._route, self._answer
+        assert route is not None
+        assert answer is not None
+        assert route.poses is not None
+        assert route.directions is not None
+        at = min(answer.place, len(route.poses) - 2)
+        return PlanAnswer(
+            Reason.OK, "", route.poses[at:], route.directions[at:], route.steering[at:], self.left, self.left
+        )
+
+    def _task(self, scan: LaserScan) -> DeformTask | None:
+        odometry = self._pose.latest
+        if not level(scan, self._setup.config):
+            return None
+        if odometry is None or self._clock.now() - odometry.received > ODOMETRY.fresh_for() * SECOND:
+            return None
+        grid = None if self._grid is None else self._grid.latest
+        way = None
+        if self._route is not None and (self._fresh or self._sent_way != self._number):
+            assert self._route.poses is not None
+            assert self._route.directions is not None
+            way = Way(self._number, self._route.poses, self._route.directions)
+            self._sent_way = self._number
+        task = DeformTask(
+            scan,
+            pose_of(odometry),
+            setup=self._setup if self._fresh else None,
+            grid=grid if self._fresh or grid is not self._sent_grid else None,
+            way=way,
+        )
+        self._fresh, self._sent_grid = False, grid
+        return task
+
+    def _note(self, answer: DeformAnswer) -> None:
+        now = self._clock.now()
+        if answer.finding == "blocked" and not self.held_up:
+            self._since = now
+        along = float(self._travelled[answer.place])
+        if answer.finding == "free" or along > self._furthest + ONWARD:
+            self._furthest, self._onward = max(along, self._furthest), now
+        self._answer = answer
+
+
+def told_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str] | None:
+    """What an event says when it comes to another finding; None if there is nothing new."""
+    text = answer.text or answer.reason.text
+    match answer.finding:
+        case "blocked" if was != "blocked":
+            return answer.reason, Severity.WARNING, f"no way round what stands on the route ({text})"
+        case "new" if was in ("idle", "free", "blocked"):
+            partly = answer.reason is Reason.PATH_PARTIAL
+            how = f"only so far ({text})" if partly else "round what stands on it"
+            return Reason.ROUTE_DEFORMED, Severity.INFO, f"the route is deformed, {how}"
+        case "free" if was not in ("idle", "free"):
+            return Reason.ROUTE_FREE, Severity.INFO, "back on the route"
+    return None

@@ -1,0 +1,142 @@
+"""The deforming step: a scan in, and what becomes of the route: free, or a path round what stands on it. Compiled.
+
+While the route is free it is driven as it was planned: the deformer has a say only from the moment something comes into
+it until the truck is back on it.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points
+from monstertruck_planners.goals.escape import placed, seen_from
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
+from monstertruck_planners.goals.planning import answer_of
+from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
+from monstertruck_planners.local.catalog import make_deformer
+from monstertruck_planners.local.planner import passed
+from monstertruck_planners.local.window import Window
+from monstertruck_planners.route.api import Vehicle
+from monstertruck_planners.route.motion import moved
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import load_map
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid
+
+Array = NDArray[np.float64]
+
+LOOK_BACK: Final = 0.5
+"""Metres of route behind the truck that still count as near."""
+SHORTEST: Final = 0.02
+"""A deformed path shorter than this is none, m."""
+
+
+class DeformStep:
+    """Answers scan by scan; equal scans give equal answers."""
+
+    def __init__(self) -> None:
+        self._setup: Setup | None = None
+        self._known: DistanceField | None = None
+        self._way: Way | None = None
+        self._rest: Guide | None = None
+        """The route from where its deformation began; None while it is free."""
+
+    def step(self, task: DeformTask) -> DeformAnswer:
+        """Take in a scan, and say what becomes of the route.
+
+        Raises:
+            InputError: no setup came first, no deformer is configured, or the map is not readable.
+        """
+        if task.setup is not None:
+            self._set_up(task.setup)
+        setup = self._setup
+        if setup is None:
+            raise InputError("deforming: expected a setup before anything else")
+        if task.grid is not None:
+            self._known = _walls(task.grid)
+        points = self._look(setup, task.scan, task.pose)
+        if task.way is not None:
+            self._begin(task.way)
+        if self._way is None:
+            return DeformAnswer(0, "idle")
+        here = self._vehicle.reference_pose(task.pose)
+        self._advance(here)
+        if self._free(setup, here, task.pose, points):
+            self._rest, self._memory = None, Memory()
+            return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
+        if self._rest is None:
+            self._rest = self._guide.part(self._place, len(self._guide.poses))
+        result = self._deformer.deform(self._rest, self._window.field(self._known), here, self._memory)
+        self._memory = result.memory
+        return self._told(result)
+
+    def _set_up(self, setup: Setup) -> None:
+        config = setup.config
+        if config.deform is None:
+            raise InputError("deforming: expected planner.deform")
+        self._setup, self._way = setup, None
+        self._vehicle = Vehicle.truck(
+            config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
+        )
+        self._deformer = make_deformer(self._vehicle, config.deform)
+        self._window = Window()
+        if config.map is not None:
+            world = load_map(config.map)
+            self._known = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
+
+    def _begin(self, way: Way) -> None:
+        self._way, self._place = way, 0
+        self._guide = Guide(moved(way.poses, self._vehicle.reference), way.directions)
+        self._travelled = self._guide.travelled
+        self._rest, self._memory = None, Memory()
+
+    def _look(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
+        """Put a scan into the window; returns its points in base. Beams without a return say nothing."""
+        points = scan_points(scan, setup.lidar)
+        (sensor,) = placed(np.array([setup.lidar]), pose)
+        ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
+        return points
+
+    def _advance(self, here: Array) -> None:
+        """Find the truck's place on the route: near the last one, not beyond a cusp that it has not reached."""
+        guide, travelled, at = self._guide, self._travelled, self._place
+        reach = np.array([-LOOK_BACK, self._window.config.size / 2])
+        first, last = np.searchsorted(travelled, travelled[at] + reach).tolist()
+        cusps = np.flatnonzero(np.diff(guide.directions[first : at + 2]))
+        first += int(cusps[-1]) if len(cusps) else 0
+        directions = guide.directions[first : last + 1].copy()
+        directions[:1] = directions[1:2] if len(directions) > 1 else directions
+        self._place = first + passed(Guide(guide.poses[first : last + 1], directions), here)
+
+    def _free(self, setup: Setup, here: Array, pose: Pose, points: Array) -> bool:
+        """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked."""
+        local, guide, at = setup.config.local, self._guide, self._place
+        deformed = self._rest is not None
+        if deformed and apart(guide.poses[at], here) > local.beside:
+            return False
+        end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
+        way = np.vstack((here, guide.poses[at + 1 : end]))
+        margin = local.clearance + (local.rejoin if deformed else 0.0)
+        relative = np.column_stack((seen_from(moved(way, -self._vehicle.reference)[:, :2], pose), way[:, 2] - pose[2]))
+        return first_contact(setup.footprint, relative, points, margin) is None
+
+    def _told(self, result: DeformResult) -> DeformAnswer:
+        assert self._way is not None
+        number, path = self._way.number, result.path
+        if path is not None and path.length < SHORTEST and self._place == len(self._guide.poses) - 1:
+            return DeformAnswer(number, "kept", result.reason, place=self._place, complete=True)
+        if path is None or path.length < SHORTEST:
+            why = Reason.PATH_BLOCKED if result.reason is Reason.OK else result.reason
+            return DeformAnswer(number, "blocked", why, result.text, self._place)
+        if result.statistics.get("kept"):
+            return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
+        answer = answer_of(path, cost=path.length)
+        return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
+
+
+def _walls(grid: Grid) -> DistanceField:
+    cells = grid.cells.reshape(grid.height, grid.width)
+    return DistanceField(cells >= OCCUPIED, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))

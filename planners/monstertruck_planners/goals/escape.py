@@ -1,0 +1,125 @@
+"""Backing out of a tight place, as by car_maneuver_recovery (G. Kouros), with its slips put right.
+
+The rule is its own: of the footprint's four sides those are found that are not free. With both ends blocked there is no
+way out; else the truck drives forward if it can, backward otherwise, steering away from the side that is blocked. Three
+things differ. Speeds follow from the axle angles by the truck's kinematics, where the package's forward speed had
+sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the way is checked as a whole.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, first_contact, swept_poses
+from monstertruck_planners.goals.config import EscapeConfig
+from monstertruck_schemas.plan import Steering
+
+Array = NDArray[np.float64]
+
+STEP = 0.02
+"""Metres between two poses of the way."""
+SHORTEST = 0.04
+"""Less than this is no way, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sides:
+    """Which sides of the footprint have something within reach."""
+
+    front: bool
+    rear: bool
+    left: bool
+    right: bool
+
+    @property
+    def any(self) -> bool:
+        """Whether one of them has."""
+        return self.front or self.rear or self.left or self.right
+
+
+@dataclass(frozen=True)
+class Escape:
+    """A way out."""
+
+    poses: Array
+    """Shape (n, 3): of the base, in the frame of the truck at its start."""
+    direction: int
+    """+1 or -1."""
+    steering: Steering
+
+
+def blocked_sides(footprint: Footprint, points: Array, room: float) -> Sides:
+    """Sides with a point nearer than ``room``, m; points have shape (n, 2) and are in the base frame."""
+    x, y = points[:, 0] - footprint.offset, points[:, 1]
+    length, width = footprint.half_length, footprint.half_width
+    beside, along = np.abs(y) <= width, np.abs(x) <= length
+    return Sides(
+        front=bool((beside & (x > 0) & (x - length < room)).any()),
+        rear=bool((beside & (x < 0) & (-x - length < room)).any()),
+        left=bool((along & (y > 0) & (y - width < room)).any()),
+        right=bool((along & (y < 0) & (-y - width < room)).any()),
+    )
+
+
+def escape(
+    config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, *, crab: bool, rear: bool
+) -> Escape | None:
+    """A way out, or None if both ends are blocked or the way is too short.
+
+    Args:
+        config: distances and angle.
+        geometry: the truck's.
+        footprint: its outline.
+        points: shape (n, 2), obstacles in the base frame, m.
+        crab: the vehicle can set both axles alike.
+        rear: the rear axle steers.
+    """
+    sides = blocked_sides(footprint, points, config.room)
+    ahead, behind = not sides.front, not sides.rear
+    away = 0.0 if sides.left == sides.right else (-config.angle if sides.left else config.angle)
+    ways = ([1] if ahead else []) + ([-1] if behind else [])
+    if sides.front and not sides.rear:
+        ways = [-1]
+    for direction in ways:
+        for angle in dict.fromkeys((away, 0.0)):
+            way = _way(config, geometry, footprint, points, direction, angle, crab=crab and config.crab, rear=rear)
+            if way is not None:
+                return way
+    return None
+
+
+def _way(
+    config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, direction: int,
+    away: float, *, crab: bool, rear: bool,
+) -> Escape | None:  # fmt: skip
+    front = direction * away
+    behind = front if crab else (-front if rear else 0.0)
+    steering: Steering = "crab" if crab else ("counter" if rear else "front")
+    distances = direction * np.arange(0.0, config.distance + STEP / 2, STEP)
+    poses = swept_poses(geometry, front, behind, distances)
+    contact = first_contact(footprint, poses, points, config.margin)
+    if contact is not None:
+        poses = poses[:contact]
+    if (len(poses) - 1) * STEP < SHORTEST:
+        return None
+    return Escape(poses, direction, steering)
+
+
+def placed(poses: Array, at: tuple[float, float, float]) -> Array:
+    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
+    x, y, yaw = at
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.column_stack(
+        (x + c * poses[:, 0] - s * poses[:, 1], y + s * poses[:, 0] + c * poses[:, 1], yaw + poses[:, 2])
+    )
+
+
+def seen_from(points: Array, at: tuple[float, float, float]) -> Array:
+    """Points (n, 2) in the frame of ``at``."""
+    x, y, yaw = at
+    c, s = math.cos(yaw), math.sin(yaw)
+    dx, dy = points[:, 0] - x, points[:, 1] - y
+    return np.column_stack((c * dx + s * dy, c * dy - s * dx))

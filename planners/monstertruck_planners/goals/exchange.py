@@ -1,0 +1,126 @@
+"""What goes to the planning step and what comes back; picklable, and light."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_schemas.plan import Steering
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid
+
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+Place = tuple[float, float, float | None]
+"""x, y (m), and yaw (rad) if it matters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What planning and deforming are made for; comes first, and again after every restart."""
+
+    config: PlannerConfig
+    geometry: FourWheelSteering
+    footprint: Footprint
+    lidar: Pose = (0.0, 0.0, 0.0)
+    """In base."""
+    timed: bool = False
+    """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanTask:
+    """One thing to plan."""
+
+    what: Literal["route", "escape"]
+    pose: Pose
+    """Of the base, in the map's frame."""
+    goal: Pose
+    """Of the base."""
+    points: Array
+    """Shape (n, 2): returns of the newest scan in the map's frame, m."""
+    setup: Setup | None = None
+    grid: Grid | None = None
+    """A newer map than before."""
+    clear: bool = False
+    """Forget obstacles of older scans, but for those near the truck, and the route so far."""
+    afresh: bool = False
+    """Forget the route so far."""
+    via: tuple[Place, ...] = ()
+    """Places of the base to be passed before the goal."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanAnswer:
+    """A way to drive, or why there is none."""
+
+    reason: Reason
+    text: str = ""
+    poses: Array | None = None
+    """Shape (n, 3): of the base along the way."""
+    directions: Array | None = None
+    """Shape (n,): +1 or -1."""
+    steering: tuple[Steering, ...] = ()
+    """n of them."""
+    length: float = 0.0
+    """Metres."""
+    cost: float = 0.0
+    """Metres, with all prices."""
+    kept: bool = False
+    """It is the rest of the route before."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is something to drive."""
+        return self.reason is Reason.OK and self.poses is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A route to be deformed."""
+
+    number: int
+    """Tells it from others."""
+    poses: Array
+    """Shape (n, 3): of the base."""
+    directions: Array
+    """Shape (n,): +1 or -1."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeformTask:
+    """One scan, with what is newer than at the scan before."""
+
+    scan: LaserScan
+    pose: Pose
+    """Of the base, in the map's frame."""
+    setup: Setup | None = None
+    grid: Grid | None = None
+    way: Way | None = None
+
+
+Finding = Literal["idle", "free", "kept", "new", "blocked"]
+"""No route yet; the route is free; the deformed path is kept; here is a new one; there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeformAnswer:
+    """What becomes of the route."""
+
+    number: int
+    """The route's."""
+    finding: Finding
+    reason: Reason = Reason.OK
+    """Of a new path PATH_PARTIAL if only its beginning is free; of none why."""
+    text: str = ""
+    place: int = 0
+    """Index of the route's pose that the truck has come to."""
+    complete: bool = False
+    """The path leads to the route's end."""
+    path: PlanAnswer | None = None
+    """The new path."""

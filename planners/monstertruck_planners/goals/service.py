@@ -1,0 +1,350 @@
+"""Goals in the daemon: requests and facts to the state machine, its decisions to planner, tracker and events."""
+
+import asyncio
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.collision import scan_points
+from monstertruck_planners.goals import mission as machine
+from monstertruck_planners.goals.deform import Deformation, told_of
+from monstertruck_planners.goals.escape import placed
+from monstertruck_planners.goals.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup
+from monstertruck_planners.goals.lead import ACTIVE, AT_REST, Lead
+from monstertruck_planners.goals.lookout import blocked, way_ahead
+from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
+from monstertruck_planners.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
+from monstertruck_runtime.actors.placement import Actor
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import RequestRefusedError, WorkerError
+from monstertruck_runtime.ports import Ready
+from monstertruck_runtime.schedule import Schedule
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Grid, Odometry
+from monstertruck_schemas.topics import ODOMETRY, SCAN
+from monstertruckd.gate.sources import Sequences, refusal
+
+Array = NDArray[np.float64]
+
+REPORT: Final = SECOND // 2
+"""Between two reports without news, ns."""
+
+
+class GoalService:
+    """Drives to goals, one at a time; a new one takes the place of the old.
+
+    While it thinks and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
+
+    Args:
+        setup: how, and the truck.
+        clock: time.
+        actor: where it is planned.
+        deceleration: with which the tracker brakes, m/s^2.
+        max_age: see ``GateConfig.max_request_age``.
+        inputs: topics read.
+        outputs: topics written.
+        deformation: of the routes; None = they are driven as they are.
+    """
+
+    name = "goals"
+
+    def __init__(
+        self,
+        setup: Setup,
+        clock: Clock,
+        actor: Actor,
+        *,
+        deceleration: float,
+        max_age: float,
+        inputs: Inputs,
+        outputs: Outputs,
+        deformation: Deformation | None = None,
+    ) -> None:
+        self._setup, self._config, self._clock = setup, setup.config, clock
+        self._in, self._out, self._max_age = inputs, outputs, max_age
+        self._place, self._deformation = actor, deformation
+        self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
+        self._mission: Mission | None = None
+        self._number = 0
+        self._lead = Lead(clock, inputs, outputs, deceleration)
+        self._told: GoalState | None = None
+        self._planning: asyncio.Task[PlanAnswer] | None = None
+        self._actor: Actor | None = None
+        self._tasks: asyncio.TaskGroup | None = None
+        self._fresh = True
+        self._sent_grid: Grid | None = None
+        self._scanned: LaserScan | None = None
+        self._points: Array = np.empty((0, 2))
+        self._changed = asyncio.Event()
+
+    async def run(self, ready: Ready) -> None:
+        """Serve goals until cancelled."""
+        async with self._place as actor:
+            await actor.start()
+            async with asyncio.TaskGroup() as tasks:
+                self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
+                if self._deformation is not None:
+                    tasks.create_task(self._deformation.run(self._deformed))
+                self._report(self._clock.now())
+                ready()
+                await self._serve()
+
+    async def _serve(self) -> None:
+        schedule = Schedule(self._clock, self._config.rate)
+        while True:
+            await schedule.next()
+            self._listen()
+            self._tick(self._clock.now())
+
+    # Requests
+
+    def _listen(self) -> None:
+        for goal in self._in.goals.drain():
+            self._heed(lambda goal=goal: self.take(goal), goal, "goal")
+        for control in self._in.controls.drain():
+            self._heed(lambda control=control: self.control(control), control, control.order)
+
+    def _heed(self, what: Any, request: Request, name: str) -> None:
+        try:
+            what()
+        except RequestRefusedError as error:
+            self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
+
+    def take(self, request: GoalRequest) -> int:
+        """Take on a goal; returns its number. Whether a way leads there shows later.
+
+        Raises:
+            RequestRefusedError: the sender may not, or the goal is none.
+        """
+        self._examine(request, "goal", moves=True)
+        pose = self._in.pose.latest
+        if self._actor is None or pose is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no pose, or the planner is not up yet")
+        if request.frame not in (pose.frame, "map"):
+            raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {pose.frame!r}")
+        goal = (request.goal.x, request.goal.y, request.goal.yaw)
+        if not all(map(math.isfinite, goal)):
+            raise RequestRefusedError(Reason.NOT_FINITE, "goal: expected finite numbers")
+        if self._mission is not None and self._mission.active:
+            self._do(machine.order(self._mission, GoalOrder.CANCEL, request.source, self._seconds()))
+        self._number += 1
+        via = tuple((place.x, place.y, place.yaw) for place in request.waypoints)
+        self._do(machine.begin(self._number, goal, request.source, self._seconds(), via))
+        return self._number
+
+    def control(self, request: GoalControl) -> None:
+        """Pause, resume or cancel the present goal.
+
+        Raises:
+            RequestRefusedError: the sender may not, or there is no goal.
+        """
+        self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
+        if self._mission is None or not self._mission.active:
+            raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
+        self._do(machine.order(self._mission, request.order, request.source, self._seconds()))
+
+    async def settled(self, number: int) -> GoalState:
+        """State of a goal once it is known whether a way leads there.
+
+        Raises:
+            RequestRefusedError: none does.
+        """
+        while self._told is None or (self._told.number == number and self._undecided(self._told)):
+            await self._changed.wait()
+        state = self._told
+        if state.number == number and state.routes == 0 and state.phase is GoalPhase.IDLE:
+            raise RequestRefusedError(state.outcome, state.text)
+        return state
+
+    @staticmethod
+    def _undecided(state: GoalState) -> bool:
+        return state.phase is GoalPhase.PLANNING and state.routes == 0 and state.recoveries == 0
+
+    def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
+        reason = refusal(
+            request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
+        )
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+
+    # Facts
+
+    def _tick(self, now: int) -> None:
+        mission = self._mission
+        if mission is not None and mission.active:
+            if self._lead.displaced:
+                self._do(machine.displaced(mission, "another path is followed now"))
+                if self._deformation is not None:
+                    self._deformation.end()
+            else:
+                self._do(machine.tick(mission, self._facts(now), self._config))
+            self._stand_still(self._mission or mission)
+        self._report(now)
+
+    def _facts(self, now: int) -> Facts:
+        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._lead.followed
+        answer = None
+        if self._planning is not None and self._planning.done():
+            answer, self._planning = self._planning.result(), None
+        report = None if followed is None else followed.told(self._in.tracker.latest)
+        along = 0.0 if report is None else report.along
+        return Facts(
+            now=now / SECOND,
+            armed=gate is not None and gate.mode in ACTIVE and odometry is not None,
+            at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
+            pose=None if odometry is None else pose_of(odometry),
+            answer=answer,
+            outcome=None if report is None else self._outcome(report.outcome),
+            along=along if followed is None else followed.before + along,
+            left=self._left(followed, along),
+            blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
+        )
+
+    def _left(self, followed: Followed | None, along: float) -> float:
+        """Metres of the route ahead; of none, infinitely many."""
+        if self._deformation is not None and self._deformation.up:
+            return self._deformation.left
+        return math.inf if followed is None else max(float(followed.travelled[-1]) - along, 0.0)
+
+    def _odometry(self, now: int) -> Odometry | None:
+        odometry = self._in.pose.latest
+        return odometry if odometry is not None and now - odometry.received <= ODOMETRY.fresh_for() * SECOND else None
+
+    def _outcome(self, outcome: Reason) -> Reason:
+        """The end of a deformed path is not that of the route."""
+        on_the_way = self._deformation is not None and not self._deformation.complete
+        return Reason.DRIVING if on_the_way and outcome is Reason.GOAL_REACHED else outcome
+
+    def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
+        if self._deformation is not None and self._deformation.up:
+            return self._deformation.blocked(now)
+        points = self._scan(now)
+        if not len(points):
+            return False
+        pose = pose_of(odometry)
+        way = way_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, np.array(pose))
+        return blocked(self._setup.footprint, way, points, pose)
+
+    def _scan(self, now: int) -> Array:
+        """Returns of the newest scan in base; none if it is old or tilted."""
+        scan = None if self._in.scan is None else self._in.scan.latest
+        if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
+            return np.empty((0, 2))
+        if scan is not self._scanned:
+            points = scan_points(scan, self._setup.lidar) if level(scan, self._config) else np.empty((0, 2))
+            self._scanned, self._points = scan, points
+        return self._points
+
+    # Decisions
+
+    def _do(self, step: tuple[Mission, tuple[Action, ...]]) -> None:
+        self._mission, actions = step
+        for action in actions:
+            match action:
+                case Tell(reason, severity, text):
+                    self._out.events(reason, severity, self.name, text, goal=self._mission.number)
+                case Plan():
+                    self._plan(self._mission, action)
+                case Follow(answer):
+                    self._follow(answer)
+                case Halt():
+                    self._halt()
+        if actions:
+            self._report(self._clock.now())
+
+    def _plan(self, mission: Mission, plan: Plan) -> None:
+        now = self._clock.now()
+        odometry = self._odometry(now)
+        assert self._tasks is not None
+        if odometry is None:
+            self._planning = self._tasks.create_task(_known(PlanAnswer(Reason.NO_MAP, "no fresh pose")))
+            return
+        pose = pose_of(odometry)
+        points = placed(np.column_stack((points := self._scan(now), np.zeros(len(points)))), pose)[:, :2]
+        grid = None if self._in.grid is None else self._in.grid.latest
+        task = PlanTask(
+            plan.what,
+            pose,
+            mission.goal,
+            points,
+            setup=self._setup if self._fresh else None,
+            grid=grid if grid is not self._sent_grid or self._fresh else None,
+            clear=plan.clear,
+            afresh=plan.afresh,
+            via=mission.via,
+        )
+        self._fresh, self._sent_grid = False, grid
+        self._planning = self._tasks.create_task(self._ask(task))
+
+    async def _ask(self, task: PlanTask) -> PlanAnswer:
+        """The planner's answer; of one that failed and begins anew: that it did."""
+        assert self._actor is not None
+        try:
+            answer: PlanAnswer = await self._actor.step(task)
+        except WorkerError as error:
+            self._fresh = True
+            self._out.events(error.reason, Severity.ERROR, self.name, str(error))
+            return PlanAnswer(error.reason, str(error).partition("\n")[0])
+        return answer
+
+    def _follow(self, answer: PlanAnswer) -> None:
+        mission, deformation = self._mission, self._deformation
+        assert mission is not None
+        if deformation is not None:
+            deformation.end()
+            if mission.planned == "route":
+                deformation.begin(answer)
+        self._lead.follow(answer, f"goal-{self._number}")
+
+    def _deformed(self, was: Finding, answer: DeformAnswer) -> None:
+        """Drive what became of the route."""
+        followed, mission, deformation = self._lead.followed, self._mission, self._deformation
+        assert deformation is not None
+        if followed is None or mission is None or mission.phase is GoalPhase.BACKING_OUT:
+            return
+        before, name = followed.before + followed.along(self._in.tracker.latest), f"goal-{self._number}"
+        if answer.path is not None:
+            self._lead.follow(answer.path, f"{name}-deformed", before)
+        elif answer.finding == "free" and was not in ("idle", "free"):
+            self._lead.follow(deformation.rest(), name, before)
+        elif answer.finding == "blocked" and was != "blocked":
+            self._lead.brake(f"{name}-held-up")
+        told = told_of(was, answer)
+        if told is not None:
+            self._out.events(*told[:2], self.name, f"goal {mission.number}: {told[2]}", goal=mission.number)
+
+    def _halt(self) -> None:
+        if self._deformation is not None:
+            self._deformation.end()
+        self._lead.halt(f"halt-{self._number}")
+
+    def _stand_still(self, mission: Mission) -> None:
+        """Keep the truck armed while nothing is driven: a way is looked for, or what there was of one has ended."""
+        if mission.active and mission.phase is not GoalPhase.PAUSED:
+            self._lead.stand_still()
+
+    def _report(self, now: int) -> None:
+        left = 0.0 if self._deformation is None else self._deformation.left
+        state = goal_state(self._mission, now, self._lead.followed, self._in, left)
+        same = ("phase", "outcome", "number", "routes", "recoveries")
+        told = self._told
+        unchanged = told is not None and all(getattr(told, name) == getattr(state, name) for name in same)
+        if told is not None and unchanged and (now - told.stamp < REPORT or state.phase is GoalPhase.IDLE):
+            return
+        self._told = state.model_copy(update={"seq": self._out.state.next_seq()})
+        self._out.state.put(self._told)
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()
+
+    def _seconds(self) -> float:
+        return self._clock.now() / SECOND
+
+
+async def _known(answer: PlanAnswer) -> PlanAnswer:
+    return answer

@@ -1,0 +1,116 @@
+"""The wire codec: topic messages to bytes and back, the same bytes for Zenoh and for MCAP.
+
+Topics with a well-known schema travel as protobuf, all others as JSON with JSON Schema. The wire ignores
+fields it does not know and only ever grows.
+"""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, TypeVar
+
+from pydantic import ValidationError
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.wire.foxglove import BINDINGS
+from monstertruck_runtime.wire.schema import descriptor_set
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import Topic
+
+M = TypeVar("M", bound=Message)
+
+VERSION: Final = 1
+"""Version of every schema; counts changes that are not plain growth."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireSchema:
+    """Schema of a topic in its own encoding."""
+
+    name: str
+    encoding: str
+    """``protobuf`` (data: serialized FileDescriptorSet) or ``jsonschema`` (data: JSON text)."""
+    data: bytes
+    message_encoding: str
+    """``protobuf`` or ``json``."""
+
+
+def encode(topic: Topic[M], message: M) -> bytes:
+    """Serialize ``message``.
+
+    Raises:
+        InputError: the message is not of the topic's type or contradicts itself.
+    """
+    if type(message) is not topic.model:
+        msg = f"{topic.name}: expected {topic.model.__name__}, got {type(message).__name__}"
+        raise InputError(msg)
+    if topic.foxglove is None:
+        return message.__pydantic_serializer__.to_json(message, exclude_none=True)
+    return BINDINGS[topic.model].encode(message)
+
+
+def decode(topic: Topic[M], data: bytes) -> M:
+    """Parse and validate the bytes of one message; unknown fields are ignored.
+
+    Raises:
+        InputError: truncated, invalid, or out of the model's range; the text names topic and field.
+    """
+    try:
+        if topic.foxglove is None:
+            return topic.model.model_validate_json(data, extra="ignore")
+        message = BINDINGS[topic.model].decode(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        msg = f"{topic.name}: {where + ': ' if where else ''}{first['msg']}"
+        raise InputError(msg) from None
+    except InputError as error:
+        msg = f"{topic.name}: {error}"
+        raise InputError(msg) from None
+    assert isinstance(message, topic.model)
+    return message
+
+
+@cache
+def encoding(topic: Topic[Any]) -> str:
+    """Zenoh encoding: media type, schema name and version."""
+    media = "application/json" if topic.foxglove is None else "application/protobuf"
+    return f"{media};{topic.schema_name};v={VERSION}"
+
+
+@cache
+def schema(topic: Topic[Any]) -> WireSchema:
+    """Schema of the topic, as MCAP and the schema queryable carry it."""
+    if topic.foxglove is None:
+        text = json.dumps(_flat(topic.model.model_json_schema()), separators=(",", ":"))
+        return WireSchema(topic.schema_name, "jsonschema", text.encode(), "json")
+    return WireSchema(topic.schema_name, "protobuf", descriptor_set(BINDINGS[topic.model].layout), "protobuf")
+
+
+def _flat(root: dict[str, Any]) -> dict[str, Any]:
+    """JSON Schema without references and unions, which viewers of logs do not read.
+
+    An optional value is one that may be missing: ``encode`` writes no nulls.
+    """
+    definitions = root.pop("$defs", {})
+
+    def flatten(node: Any) -> Any:
+        if isinstance(node, list):
+            return [flatten(item) for item in node]
+        if not isinstance(node, dict):
+            return node
+        if "$ref" in node:
+            target = definitions[node["$ref"].rpartition("/")[2]]
+            return flatten(target | {key: value for key, value in node.items() if key != "$ref"})
+        present = [option for option in node.get("anyOf", ()) if option.get("type") != "null"]
+        if len(present) == 1:
+            rest = {key: value for key, value in node.items() if key not in {"anyOf", "default"}}
+            return flatten(present[0] | rest)
+        flat = {key: flatten(value) for key, value in node.items()}
+        if flat.get("type") == "object":
+            flat.setdefault("properties", {})
+            flat.pop("additionalProperties", None)
+        return flat
+
+    flat: dict[str, Any] = flatten(root)
+    return flat

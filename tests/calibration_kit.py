@@ -1,0 +1,304 @@
+"""Calibration against a world that hides the true values: an operator with tape, string and meter, and the judge."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
+from monstertruckd.config.calibration.apply import store_of, with_values
+from monstertruckd.config.calibration.record import Result, Value, WizardName
+from monstertruckd.daemon import Daemon
+from monstertruckd.tools.calibrate.guide import Wizard, calibrate
+from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.drill.stages import with_overlay
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.rig import VirtualRig
+
+STOPPED: Final = 0.2
+"""Chance that something stops a servo on its way to one side."""
+START_UP: Final = 3.0
+"""Seconds in which every device of the emulated truck is up."""
+
+
+class LocalTruck(LocalOperator):
+    """What a wizard needs of a client, inside the daemon's process."""
+
+    def __init__(self, daemon: Daemon, clock: Clock, source: str = "calibrate") -> None:
+        super().__init__(daemon.bus, clock, source)
+        self.source = source
+        self._daemon = daemon
+        self._requests = 0
+
+    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
+        """Inject a drive request as the bridge to Zenoh does."""
+        self._requests += 1
+        header = await self._header(self._requests, Role.STATION, lease)
+        self._bus.inject(topics.REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
+
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Call one of the daemon's."""
+        return await self._daemon.rpc.call(rpc, payload or {})
+
+
+@dataclass(frozen=True, slots=True)
+class Hands:
+    """How well the operator measures; standard deviations unless it says bounds."""
+
+    tape: float = 0.002
+    """One reading of the tape, m"""
+    string: float = 0.0035
+    """Direction of a string laid along the truck's side, rad"""
+    meter_share: float = 0.005
+    """Bound of the meter's scale error"""
+    meter_volts: float = 0.02
+    """Bound of its other errors, V"""
+
+
+class SimulatedOperator:
+    """A ``Panel`` that looks at the world's truth with a tape, a string and a meter.
+
+    Args:
+        rig: the truck.
+        rng: of the operator's errors.
+        hands: how large they are.
+        charges: of packs to be put in between two readings of the meter.
+    """
+
+    def __init__(
+        self,
+        rig: VirtualRig,
+        rng: np.random.Generator,
+        hands: Hands = Hands(),
+        charges: tuple[float, ...] = (),
+    ) -> None:
+        self.said: list[str] = []
+        self._rig = rig
+        self._rng = rng
+        self._hands = hands
+        self._charges = list(charges)
+        self._meter = float(rng.uniform(-hands.meter_share, hands.meter_share))
+        self._mark = (0.0, 0.0)
+        self._string = (0.0, 0.0, 0.0)
+        self._before = self._truth()
+
+    def say(self, text: str) -> None:
+        """Listen."""
+        self.said.append(text)
+
+    def progress(self, name: str, done: float, total: float) -> None:
+        """Wait."""
+
+    async def number(self, step: Number) -> float:
+        """Measure what is asked for."""
+        truth = self._truth()
+        match step.name:
+            case "distance":
+                x, y = self._bumper()
+                return math.dist((x, y), self._mark) + self._error(self._hands.tape)
+            case "offset":
+                x, y, along = self._string
+                across = -math.sin(along) * (truth.x - x) + math.cos(along) * (truth.y - y)
+                return 100 * (across + self._error(self._hands.tape))
+            case "meter":
+                error = float(self._rng.uniform(-1, 1)) * self._hands.meter_volts
+                return round(truth.supply_v * (1 + self._meter) + error, 2)
+        raise AssertionError(step)
+
+    async def confirm(self, step: Confirm) -> bool:
+        """Do or see what is asked for."""
+        truth = self._truth()
+        match step.name:
+            case "mark":
+                x, y = self._bumper()
+                self._mark = (x + self._error(self._hands.tape), y)
+            case "string":
+                self._string = (truth.x, truth.y, truth.yaw + self._error(self._hands.string))
+            case "forward":
+                before = self._before
+                along = math.cos(before.yaw) * (truth.x - before.x) + math.sin(before.yaw) * (truth.y - before.y)
+                return along > 0
+            case "another":
+                if self._charges:
+                    self._rig.world.set_charge(self._rig.clock.now(), self._charges.pop(0))
+                    await self._rig.clock.sleep(2.0)
+                    return True
+                return False
+        self._before = truth
+        return True
+
+    def _truth(self) -> TruthState:
+        return self._rig.world.truth(self._rig.clock.now())
+
+    def _bumper(self) -> tuple[float, float]:
+        """Middle of the front bumper on the floor."""
+        truth, ahead = self._truth(), self._rig.config.sim.world.truck.length / 2
+        return truth.x + math.cos(truth.yaw) * ahead, truth.y + math.sin(truth.yaw) * ahead
+
+    def _error(self, sigma: float) -> float:
+        return sigma * float(self._rng.standard_normal())
+
+
+def hidden(
+    config: SimulatedTruckConfig,
+    rng: np.random.Generator,
+    seed: int,
+    parts: Collection[WizardName] = ("battery", "compass", "drive", "steering"),
+) -> SimulatedTruckConfig:
+    """``config`` with a truck whose true values differ from what the daemon believes.
+
+    Args:
+        config: the believed truck.
+        rng: of the differences.
+        seed: of the world.
+        parts: what differs, by the wizard that has to find it.
+    """
+    truck: dict[str, Any] = {}
+    world: dict[str, Any] = {"truck": truck}
+    if "battery" in parts:
+        world["battery"] = {"divider": 10 * rng.uniform(0.94, 1.06), "analog_offset": rng.uniform(-0.009, 0.009)}
+    if "compass" in parts:
+        hard = dict(zip(("hard_x", "hard_y", "hard_z"), rng.uniform(-70, 70, 3).tolist(), strict=True))
+        soft = dict(zip(("soft_x", "soft_y", "soft_z"), rng.uniform(0.88, 1.12, 3).tolist(), strict=True))
+        world["compass"] = {"iron": {**hard, **soft, "soft_xy": rng.uniform(-0.06, 0.06)}}
+    if "drive" in parts:
+        truck["wheel_radius"] = 0.075 * rng.uniform(0.95, 1.05)
+        truck["motor"] = {"ratio": rng.uniform(500, 680), "inverted": bool(rng.integers(2))}
+    if "steering" in parts:
+        truck["front_servo"], truck["rear_servo"] = _servo(1, rng), _servo(0, rng)
+    return with_overlay(config, {"sim": {"seed": seed, "world": world}})
+
+
+def _servo(channel: int, rng: np.random.Generator) -> dict[str, Any]:
+    def stop() -> float:
+        return float(rng.uniform(23, 30)) if rng.random() < STOPPED else 45.0
+
+    return {
+        "channel": channel,
+        "centre_us": 1439.2 + rng.uniform(-40, 40),
+        "us_per_degree": float(rng.choice((-1, 1))) * 10.48 * rng.uniform(0.9, 1.1),
+        "left_stop_deg": stop(),
+        "right_stop_deg": stop(),
+    }
+
+
+def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
+    """True values of what the wizards estimate, by wizard and name."""
+    world = config.sim.world
+    truck, iron = world.truck, world.compass.iron
+    rolling = truck.slip_per_newton * truck.rolling_resistance * truck.mass * GRAVITY
+    turns = truck.motor.ratio / (2 * math.pi * truck.wheel_radius) / (1 - rolling)
+    soft = np.linalg.inv(((iron.soft_x, iron.soft_xy), (iron.soft_xy, iron.soft_y)))
+    soft /= math.sqrt(np.linalg.det(soft))
+    steering: dict[str, Value] = {}
+    linkage = truck.chassis().linkage
+    assert linkage is not None
+    axles = (("front", truck.front_servo, linkage.front), ("rear", truck.rear_servo, linkage.rear))
+    for name, servo, polynomials in axles:
+        stops = math.radians(servo.left_stop_deg), -math.radians(servo.right_stop_deg)
+        left, right = (math.degrees(float(polynomials.axle_from_servo(stop))) for stop in stops)
+        steering |= {
+            f"{name}_centre": servo.centre_us,
+            f"{name}_scale": abs(servo.us_per_degree),
+            f"{name}_direction": 1 if servo.us_per_degree > 0 else -1,
+            f"{name}_left_travel": left,
+            f"{name}_right_travel": right,
+        }
+    drive = config.devices.drive
+    assert drive is not None
+    return {
+        "battery": {
+            "gain": world.battery.divider / 10,
+            "offset": -world.battery.divider * world.battery.analog_offset,
+        },
+        "compass": {
+            "hard_x": 0.1 * iron.hard_x,
+            "hard_y": 0.1 * iron.hard_y,
+            "soft_xx": float(soft[0, 0]),
+            "soft_xy": float(soft[0, 1]),
+            "soft_yy": float(soft[1, 1]),
+        },
+        "drive": {
+            "inverted": truck.motor.inverted,
+            "drive_ratio": truck.motor.ratio * config.geometry.wheel_radius / truck.wheel_radius,
+            "turns_per_metre": turns,
+            "ticks_per_metre": 4 * (drive.driver.encoder_pulses_per_turn or 0) * turns,
+        },
+        "steering": steering,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One run of a wizard on a simulated truck."""
+
+    result: Result
+    file: Path
+    seconds: float
+    """It took, on the truck's clock."""
+
+
+def run_session(
+    config: SimulatedTruckConfig,
+    wizard: Wizard,
+    rng: np.random.Generator,
+    *,
+    hands: Hands = Hands(),
+    charges: tuple[float, ...] = (),
+) -> Session:
+    """Start the truck with the calibration in its state directory, run one wizard, end it, on a virtual clock.
+
+    Raises:
+        TruckError: whatever ended the wizard.
+    """
+    current = store_of(config).current()
+    known = current.results if current is not None else {}
+    calibrated = with_values(config, known.values(), "calibration")
+
+    async def main(clock: VirtualClock) -> Session:
+        rig = VirtualRig(calibrated, clock)
+        async with rig.running():
+            await clock.sleep(START_UP)
+            operator = SimulatedOperator(rig, rng, hands, charges)
+            began = clock.now()
+            truck = LocalTruck(rig.daemon, clock)
+            result, file = await calibrate(wizard, truck, operator, clock, calibrated, known)
+            return Session(result, Path(file), (clock.now() - began) / SECOND)
+
+    return run_virtual(main)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One estimate beside its truth."""
+
+    name: str
+    """wizard.estimate"""
+    value: Value
+    low: float | None
+    high: float | None
+    truth: Value
+
+    @property
+    def holds(self) -> bool:
+        """Whether the truth lies in the stated interval; what has none must be right."""
+        if self.low is None or self.high is None:
+            return self.value == self.truth
+        return self.low <= self.truth <= self.high
+
+
+def verdicts(result: Result, config: SimulatedTruckConfig) -> list[Verdict]:
+    """Every estimate of ``result`` whose truth is known; travel counts where something stopped the wheels."""
+    known = truths(config)[result.wizard]
+    return [
+        Verdict(f"{result.wizard}.{e.name}", e.value, e.low, e.high, known[e.name])
+        for e in result.estimates
+        if e.name in known and not (e.name.endswith("_travel") and e.low is None)
+    ]
