@@ -20,8 +20,8 @@ import numpy as np
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas.req import Order
+from monstertruck_sim.faults import hubs_of
 from monstertruckd.config.validate import load_config
-from monstertruckd.tools.drill.faults import hubs_of
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -80,7 +80,7 @@ async def _arm_for_ever(operator: LocalOperator, clock: VirtualClock) -> None:
 
 
 async def _replug(rig: VirtualRig, rng: np.random.Generator) -> None:
-    hubs = hubs_of(rig.config)
+    hubs = hubs_of(rig.config.devices)
     pause = float(rng.uniform(0.05, 1.5))
     if hubs and rng.random() < 0.2:
         hub = hubs[rng.integers(len(hubs))]

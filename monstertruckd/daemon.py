@@ -13,9 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.config import SHAFTS
 from monstertruck_drivers.link import Port
 from monstertruck_planners.goals import rpc as goal_rpc
 from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.placement import Places
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
 from monstertruck_runtime.actors.remote import RemoteDesk
@@ -32,13 +35,13 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners, calibration
-from monstertruckd.assembly.cabling import Cabling, Computer
+from monstertruckd.assembly.cabling import Cabling
 from monstertruckd.assembly.devices import build_drivers, build_monitors
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config.calibration import rpc as calibration_rpc
-from monstertruckd.config.truck import SHAFTS, TruckConfig
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.validate import resolved
 from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.gate.core import Gate
@@ -109,7 +112,7 @@ class Daemon:
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
-        self._desk = RemoteDesk()
+        self._desk = RemoteDesk(CODEC)
         self._places = Places(clock, self._desk)
         self.rpc = self._build_rpc()
         self._attachments = self._describe()

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.config import Devices
 from monstertruck_drivers.host_health.readings import Disk
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.tree import ancestors
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
-from monstertruckd.assembly.cabling import Computer
-from monstertruckd.config.truck import Devices
 
 IDENTITIES = {
     "hokuyo_urg": ("15d1:0000", "URG-Series USB Driver", "ttyACM"),

@@ -12,7 +12,9 @@ from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.ax12.protocol import BAUD, STEP
 from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.battery.emulator import IioEmulator
+from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.cable import EmulatedPort
+from monstertruck_drivers.config import SHAFTS, Devices, Monitors
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, RecordedRanges
@@ -23,11 +25,9 @@ from monstertruck_drivers.os4000.emulator import Os4000Emulator
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_sim.config import SimConfig
 from monstertruck_sim.console import FileEmulator
 from monstertruck_sim.world.world import World
-from monstertruckd.assembly.devices import CONVERTERS
-from monstertruckd.config.truck import SHAFTS, TruckConfig
-from monstertruckd.tools.simulation.config import SimConfig
 
 LINE_BAUD = {**dict.fromkeys(SHAFTS, 38400), "stabiliser": BAUD}
 """Serial lines whose speed is felt; the others are USB from end to end, or have a byte now and then."""
@@ -38,7 +38,8 @@ class SimulatedRobot:
 
     Args:
         config: the simulated side's settings.
-        truck: which devices and monitors the truck has, and how they are configured.
+        devices: the robot's, with their settings.
+        monitors: what of the computer is watched.
         clock: time of world and devices.
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.
@@ -48,7 +49,8 @@ class SimulatedRobot:
     def __init__(
         self,
         config: SimConfig,
-        truck: TruckConfig,
+        devices: Devices,
+        monitors: Monitors,
         clock: Clock,
         ports: Mapping[str, EmulatedPort],
         root: Path,
@@ -57,10 +59,10 @@ class SimulatedRobot:
         self.world = World(config.world, config.seed)
         self.ports = ports
         self.emulators: dict[str, Emulator] = {}
-        self.monitored = self._monitored(config, truck, clock, root)
+        self.monitored = self._monitored(config, monitors, clock, root)
         """What the computer's files show, by monitor."""
         self.recorded: RecordedHokuyoEmulator | None = None
-        devices, present = truck.devices, truck.devices.present()
+        present = devices.present()
         if "lidar" in present and config.recording is not None:
             self.recorded = RecordedHokuyoEmulator(clock, RecordedRanges.load(config.recording), seed=config.seed)
             self.emulators["lidar"] = self.recorded
@@ -90,8 +92,8 @@ class SimulatedRobot:
             port = ports["camera"]
             self.emulators["camera"] = WebcamEmulator(clock, self.world.view, offload=offload, usb=port)
 
-    def _monitored(self, config: SimConfig, truck: TruckConfig, clock: Clock, root: Path) -> dict[str, FileEmulator]:
-        monitors, channel = truck.monitors, config.world.battery.channel
+    def _monitored(self, config: SimConfig, monitors: Monitors, clock: Clock, root: Path) -> dict[str, FileEmulator]:
+        channel = config.world.battery.channel
         found: dict[str, FileEmulator] = {}
         if (iio := monitors.battery) is not None:
             found["battery"] = IioEmulator(

@@ -13,9 +13,10 @@ from monstertruck_estimation.transforms import TransformService, compose, invert
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.stabiliser import StabiliserService
 from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_planners.steps import STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
-from monstertruck_planners.track.placed import TARGET, PlacedTracker
+from monstertruck_planners.track.placed import PlacedTracker
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_planners.track.step import TrackSetup
 from monstertruck_runtime.actors.placement import Places
@@ -187,7 +188,7 @@ def _build_tracker(
             scan="scan" in inputs,
             attitude="attitude" in inputs,
         )
-        actor = places.actor(placement, "tracking", TARGET, latency=0.0, deadline=STEP_DEADLINE)
+        actor = places.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
         return PlacedTracker(setup, clock, actor, inputs=inputs, drive=wishes, tracker=told, events=events)
     return TrackerService(
         tracker,

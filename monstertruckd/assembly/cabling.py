@@ -1,11 +1,9 @@
 """Where the devices hang: from the configuration's ports, by path or by hub and port, to what drivers open."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Self
+from collections.abc import Mapping
 
-from monstertruck_drivers.host_health.readings import Disk, disk_of
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.link import Port, SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator
@@ -13,38 +11,13 @@ from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.port import HubNode, HubPort
 from monstertruck_drivers.usb.power import PortPower
 from monstertruck_drivers.usb.service import UsbService
-from monstertruck_drivers.usb.sysfs import Sysfs
-from monstertruck_drivers.usb.watch import NoWatcher, Watcher, open_watcher
 from monstertruck_drivers.webcam.path_source import PathSource
 from monstertruck_drivers.webcam.rendered_source import RenderedSource
 from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
-from monstertruck_runtime.clock import Clock
 from monstertruck_schemas import topics
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.config.truck import AnyPort, TruckConfig
-
-ROOT = Path("/")
-
-
-@dataclass(frozen=True, slots=True)
-class Computer:
-    """The computer the daemon runs on; an emulated one stands in for it in simulations."""
-
-    machine: Machine
-    """Its USB tree."""
-    root: Path = ROOT
-    """Folder with its proc and sys."""
-    watch: Callable[[], Watcher] = open_watcher
-    """Opens the source of USB announcements."""
-    disk: Callable[[Path], Disk] = disk_of
-    """Its file system at a path."""
-
-    @classmethod
-    def at(cls, root: Path, clock: Clock) -> Self:
-        """The real computer, or the one another process emulates in the folder ``root``, which announces nothing."""
-        machine = Machine(clock, Sysfs(root / "sys"), root / "dev")
-        return cls(machine, root, open_watcher if root == ROOT else NoWatcher)
+from monstertruckd.config.truck import TruckConfig
 
 
 class Cabling:

@@ -4,7 +4,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from monstertruck_drivers.battery.driver import IioBatteryDriver
+from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.catalog import BY_NAME
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.config import SHAFTS
 from monstertruck_drivers.host_health.driver import HostHealthDriver
 from monstertruck_drivers.link_quality.driver import LinkQualityDriver
 from monstertruck_estimation.scan_tilt import TiltStamper
@@ -15,11 +18,10 @@ from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Writer
-from monstertruckd.assembly.cabling import Cabling, Computer
+from monstertruckd.assembly.cabling import Cabling
 from monstertruckd.bus.local import Bus
-from monstertruckd.config.truck import SHAFTS, TruckConfig
+from monstertruckd.config.truck import TruckConfig
 
-CONVERTERS = "sys/bus/iio/devices"
 RECENT = Delivery(16, counted=False)
 """Enough of the past for the tilt in the middle of a scan."""
 

@@ -9,6 +9,7 @@ from monstertruck_planners.goals.deform import Deformation
 from monstertruck_planners.goals.exchange import Setup
 from monstertruck_planners.goals.parts import Inputs, Outputs
 from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS
 from monstertruck_runtime.actors.placement import Places
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.mailbox import fifo, latest
@@ -20,8 +21,6 @@ from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 
-TARGET: Final = "monstertruck_planners.goals.planning_worker:PlanningWorker"
-DEFORMER: Final = "monstertruck_planners.goals.deforming_worker:DeformingWorker"
 PATIENCE: Final = 180.0
 """Real seconds the worker may take to start: the first time it compiles."""
 
@@ -48,8 +47,8 @@ def build_goals(
         clock,
         places.actor(
             config.placement.planner,
-            "planning",
-            TARGET,
+            PLANNING,
+            STEPS[PLANNING],
             latency=planner.latency,
             deadline=planner.deadline,
             patience=PATIENCE,
@@ -80,8 +79,8 @@ def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, plac
         clock,
         places.actor(
             config.placement.deformer,
-            "deforming",
-            DEFORMER,
+            DEFORMING,
+            STEPS[DEFORMING],
             latency=local.latency,
             deadline=local.deadline,
             patience=PATIENCE,

@@ -2,19 +2,16 @@
 
 import json
 import logging
-from collections.abc import Awaitable, Callable
 from typing import Any
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.ports import Handler
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
 
 log = logging.getLogger(__name__)
-
-Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Gets the caller's JSON object, returns the answer; refuses by raising ``TruckError``."""
 
 
 class Rpc:

@@ -1,15 +1,15 @@
-"""Loads a truck's configuration file, simulated or not, with the truck's calibration over it."""
+"""Loads a robot's configuration file, with the robot's calibration over it."""
 
 from pathlib import Path
 
 from monstertruckd.config.calibration.apply import calibrated
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.validate import load_config
-from monstertruckd.config.yaml_tree import Tree, load_tree
+from monstertruckd.config.yaml_tree import Tree
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
-    """The configuration at ``path``, calibrated; with a section ``sim`` the world's settings are checked too.
+    """The configuration at ``path``, calibrated.
 
     Raises:
         ConfigError: one line per mistake, in the file or in its calibration.
@@ -23,10 +23,4 @@ def load_uncalibrated(path: Path) -> tuple[TruckConfig, Tree]:
     Raises:
         ConfigError: one line per mistake.
     """
-    model: type[TruckConfig] = TruckConfig
-    if "sim" in load_tree(path).data:
-        # Only a simulated run may load the world.
-        from monstertruckd.tools.simulation.config import SimulatedTruckConfig  # noqa: PLC0415
-
-        model = SimulatedTruckConfig
-    return load_config(path, model)
+    return load_config(path, TruckConfig)

@@ -2,21 +2,13 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
-from monstertruck_drivers.ax12.config import Ax12Config
-from monstertruck_drivers.battery.config import IioConfig
+from monstertruck_drivers.config import SHAFTS, Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.link_quality.config import LinkQualityConfig
-from monstertruck_drivers.maestro.config import MaestroConfig
-from monstertruck_drivers.os4000.config import Os4000Config
-from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
-from monstertruck_drivers.usb.tree import place
-from monstertruck_drivers.webcam.config import WebcamConfig
+from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.fusion.config import AnyOdometry
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.settings import SlamConfig
@@ -25,119 +17,13 @@ from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
-from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import BodyConfig, TruckBody
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.recorder.config import BlackBoxConfig, RecorderConfig
-
-SHAFTS: Final = ("drive", "drive_2", "drive_3", "drive_4")
-"""Roles of the driven shafts' controllers, in the order of the body's shafts."""
-
-C = TypeVar("C", bound=Schema)
+from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 Metres = Annotated[float, Field(gt=0, le=10)]
-
-
-class PortConfig(Schema):
-    """Where a device hangs."""
-
-    path: Path
-    """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
-    baud: Annotated[int, Field(ge=4800, le=1_000_000)] = 115200
-    """Bits per second; USB-CDC devices ignore it"""
-
-
-def _way(port: Any) -> str:
-    """Which of the two ways to name a port ``port`` is; not a key of either, so that complaints find their line."""
-    by_hub = isinstance(port, UsbPortConfig) or (isinstance(port, dict) and "hub" in port)
-    return "port by hub" if by_hub else "port by path"
-
-
-AnyPort = Annotated[
-    Annotated[PortConfig, Tag("port by path")] | Annotated[UsbPortConfig, Tag("port by hub")], Discriminator(_way)
-]
-
-
-class Mount(Schema):
-    """Pose of a sensor in the base frame."""
-
-    x: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres forward of the base point"""
-    y: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres left of the base point"""
-    z: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Metres above the base point"""
-    roll: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about x"""
-    pitch: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about y"""
-    yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """Radians about z"""
-
-    @property
-    def planar(self) -> tuple[float, float, float]:
-        """x, y (m) and yaw (rad)."""
-        return self.x, self.y, self.yaw
-
-
-class Device(Schema, Generic[C]):
-    """One device: its port, its mount, its driver."""
-
-    port: AnyPort
-    mount: Mount = Mount()
-    restart: RestartPolicy = RestartPolicy(max_delay=0.5)
-    driver: C
-
-    @property
-    def kind(self) -> str:
-        """What the driver's settings say it is."""
-        return str(vars(self.driver)["kind"])
-
-
-class Devices(Schema):
-    """The robot's devices by role; a role that is left out is not there."""
-
-    lidar: Device[HokuyoConfig] | None = None
-    drive: Device[EposConfig] | None = None
-    drive_2: Device[EposConfig] | None = None
-    """Controller of the body's second driven shaft, if it has one"""
-    drive_3: Device[EposConfig] | None = None
-    drive_4: Device[EposConfig] | None = None
-    steering: Device[MaestroConfig] | None = None
-    compass: Device[Os4000Config] | None = None
-    stabiliser: Device[Ax12Config] | None = None
-    """Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"""
-    camera: Device[WebcamConfig] | None = None
-
-    def present(self) -> dict[str, Device[Schema]]:
-        """The devices that are configured, by role."""
-        return {role: device for role in type(self).model_fields if (device := getattr(self, role)) is not None}
-
-    def shafts(self) -> dict[str, Device[EposConfig]]:
-        """The controllers of the driven shafts, by role."""
-        return {role: device for role in SHAFTS if (device := getattr(self, role)) is not None}
-
-    @model_validator(mode="after")
-    def _one_port_each(self) -> Self:
-        taken: dict[str, str] = {}
-        for role, device in self.present().items():
-            port = device.port
-            where = place(port.device) if isinstance(port, UsbPortConfig) else str(port.path)
-            if other := taken.get(where):
-                raise ValueError(f"{other} and {role} share the port {where}; every device needs its own")
-            taken[where] = role
-        return self
-
-
-class Monitors(Schema):
-    """What is read from the computer itself, without a port; what is left out is not watched."""
-
-    battery: IioConfig | None = None
-    """Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input"""
-    link: LinkQualityConfig | None = None
-    host: HostHealthConfig | None = None
 
 
 class Geometry(Schema):
@@ -179,21 +65,6 @@ class PathSource(Schema):
     """CSV with the header x,y,yaw,direction: metres, metres, radians, +1 or -1"""
     closed: bool = False
     """The path is a lap: its end is its start"""
-
-
-class MapRender(Schema):
-    """The picture of path over scan map that the worker draws."""
-
-    latency: Annotated[float, Field(gt=0, le=5)] = 0.2
-    """Seconds after which its results count on the virtual clock"""
-    deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Seconds after which a silent worker is killed"""
-    period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
-    """Seconds between two scans it is given"""
-    max_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = math.radians(3)
-    """Scans whose plane was tilted more than this are left out, rad: over 5 m they are 0.26 m off"""
-    picture: Path | None = None
-    """PNG file drawn whenever a path has come to its end"""
 
 
 class PlacementConfig(Schema):
@@ -244,6 +115,8 @@ class TruckConfig(Schema):
     """Where the e-stop latch is kept"""
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
+    sim: Any = None
+    """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
 
     def chassis(self) -> Chassis:
         """The body's kinematics.

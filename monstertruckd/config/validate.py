@@ -27,7 +27,11 @@ def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
     Raises:
         ConfigError: one line per mistake, each naming file, line, key and expectation.
     """
-    tree = load_tree(path)
+    return validated(load_tree(path), path, model)
+
+
+def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
+    """Validate what was read and merged from ``path``; see ``load_config``."""
     version = tree.data.get("version")
     if version != VERSION:
         origin = tree.origin(("version",)) or f"{path}:1"

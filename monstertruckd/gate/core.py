@@ -19,6 +19,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
+from monstertruck_runtime.requests import OPERATORS
 from monstertruck_runtime.stops import sentence
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
@@ -35,7 +36,7 @@ from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.outages import Outages
 from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.pursuit import Pursuit
-from monstertruckd.gate.sources import OPERATORS, Source, Sources
+from monstertruckd.gate.sources import Source, Sources
 from monstertruckd.gate.states import States
 from monstertruckd.gate.steering_check import SteeringCheck
 from monstertruckd.gate.stops import StopBook

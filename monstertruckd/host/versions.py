@@ -13,7 +13,7 @@ from typing import Final
 from monstertruckd import __version__
 
 PACKAGES: Final = ("eclipse-zenoh", "mcap", "numpy", "pydantic", "uvloop")
-ROOT: Final = Path(__file__).resolve().parents[1]
+ROOT: Final = Path(__file__).resolve().parents[2]
 PATIENCE: Final = 2.0
 """Seconds git may take."""
 

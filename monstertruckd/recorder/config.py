@@ -1,6 +1,8 @@
 """Recorder settings."""
 
+import math
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
@@ -65,3 +67,18 @@ class BlackBoxConfig(Schema):
     """Least seconds between two boxes of one reason; a trip meanwhile waits for it, at most ``before``."""
     unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
     """Reasons without a box: by default what somebody ordered."""
+
+
+class MapRender(Schema):
+    """The picture of path over scan map that the worker draws."""
+
+    latency: Annotated[float, Field(gt=0, le=5)] = 0.2
+    """Seconds after which its results count on the virtual clock"""
+    deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """Seconds after which a silent worker is killed"""
+    period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
+    """Seconds between two scans it is given"""
+    max_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = math.radians(3)
+    """Scans whose plane was tilted more than this are left out, rad: over 5 m they are 0.26 m off"""
+    picture: Path | None = None
+    """PNG file drawn whenever a path has come to its end"""

@@ -10,12 +10,13 @@ from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Ready, Subscription
+from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.config.truck import MapRender, Mount
+from monstertruckd.recorder.config import MapRender
 
 TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
 SPACING = 0.02

@@ -1,7 +1,7 @@
 """The narrow interfaces services see of the rest: publish, subscribe, report."""
 
-from collections.abc import Callable
-from typing import Protocol, TypeVar
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol, TypeVar
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
@@ -64,3 +64,14 @@ class EventSink(Protocol):
 
 Ready = Callable[[], None]
 """Called by a service once its session works; resets the restart budget."""
+
+Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Serves a remote call: gets the caller's JSON object, returns the answer; refuses by raising ``TruckError``."""
+
+
+class RpcRegistry(Protocol):
+    """Where handlers of remote calls are registered."""
+
+    def register(self, name: str, handler: Handler) -> None:
+        """Serve ``name`` by ``handler``."""
+        ...

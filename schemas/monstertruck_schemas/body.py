@@ -5,6 +5,7 @@ speed of the base and two axle angles; a body without axles is driven as the bic
 alike. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in the order given here.
 """
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -13,6 +14,28 @@ from monstertruck_schemas.base import Schema
 
 Metres = Annotated[float, Field(gt=0, le=10)]
 Gain = Annotated[float, Field(gt=0, le=10)]
+
+
+class Mount(Schema):
+    """Pose of a sensor in the base frame."""
+
+    x: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres forward of the base point"""
+    y: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres left of the base point"""
+    z: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Metres above the base point"""
+    roll: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about x"""
+    pitch: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about y"""
+    yaw: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    """Radians about z"""
+
+    @property
+    def planar(self) -> tuple[float, float, float]:
+        """x, y (m) and yaw (rad)."""
+        return self.x, self.y, self.yaw
 
 
 class TruckBody(Schema):

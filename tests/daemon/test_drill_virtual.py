@@ -17,11 +17,11 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.faults import Kind, Menu
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.validate import load_config
 from monstertruckd.tools.drill.drill import Drill, Outcome, Report
-from monstertruckd.tools.drill.faults import Kind, Menu
 from monstertruckd.tools.drill.observer import Observer, Violation
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -42,6 +42,10 @@ def demo() -> SimulatedTruckConfig:
     return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
 
 
+def menu_of(config: SimulatedTruckConfig) -> Menu:
+    return Menu(config.devices, records=config.recorder is not None)
+
+
 def test_random_faults_end_safely_and_leave_nothing_behind():
     report = Drill(4, 32, full(), leg=16).run()
     assert len(report.outcomes) == 32
@@ -58,13 +62,13 @@ def test_one_seed_is_one_report():
 
 
 def test_every_kind_is_on_the_menu_of_the_whole_truck_and_what_needs_hubs_is_not_without():
-    assert set(Menu(full()).kinds) == set(Kind)
-    missing = set(Kind) - set(Menu(demo()).kinds)
+    assert set(menu_of(full()).kinds) == set(Kind)
+    missing = set(Kind) - set(menu_of(demo()).kinds)
     assert missing == {Kind.HUB_LOSS, Kind.RAIL_ELECTRONICS, Kind.RAIL_12V, Kind.ECHO}
 
 
 def test_draws_are_the_seeds():
-    menu = Menu(full())
+    menu = menu_of(full())
     names = [[menu.draw(rng).name for _ in range(50)] for rng in map(np.random.default_rng, (1, 1, 2))]
     assert names[0] == names[1] != names[2]
     assert len(set(names[0])) > 20

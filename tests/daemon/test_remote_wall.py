@@ -8,27 +8,20 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.goals.exchange import DeformAnswer, PlanAnswer
-from monstertruck_planners.track.placed import TARGET as TRACKER
-from monstertruck_runtime.actors.codec import to_json
+from monstertruck_planners.steps import CODEC, DEFORMING, PLANNING, STEPS, TRACKING
 from monstertruck_runtime.actors.placement import Placement, Places
 from monstertruck_runtime.actors.remote import RPC, RemoteDesk
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruckd.assembly.goals import DEFORMER
-from monstertruckd.assembly.goals import TARGET as PLANNER
 from tests.bus_kit import running_robot
-from tests.unit.workers.step_kit import deform_tasks, numbers, plan_task, track_inputs
+from tests.unit.runtime.actors.step_kit import deform_tasks, numbers, plan_task, track_inputs
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
-STEPS = {
-    "planning": (PLANNER, [plan_task()]),
-    "deforming": (DEFORMER, deform_tasks()),
-    "tracking": (TRACKER, track_inputs()),
-}
+INPUTS = {PLANNING: [plan_task()], DEFORMING: deform_tasks(), TRACKING: track_inputs()}
 
 
 async def outputs(places: Places, placement: Placement, name: str) -> list[Any]:
-    target, inputs = STEPS[name]
+    target, inputs = STEPS[name], INPUTS[name]
     async with places.actor(placement, name, target, latency=0.0, deadline=60.0, patience=120.0) as actor:
         await actor.start()
         return [await actor.step(one) for one in inputs]
@@ -36,7 +29,7 @@ async def outputs(places: Places, placement: Placement, name: str) -> list[Any]:
 
 def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
     async def main(clock: Clock) -> tuple[int, dict[str, list[list[Any]]]]:
-        desk = RemoteDesk()
+        desk = RemoteDesk(CODEC)
         places = Places(clock, desk)
         remote = {}
         async with running_robot(deadline=5.0) as robot:
@@ -57,7 +50,7 @@ def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_
     assert ended == 0
     for name, (remote, worker, loop) in found.items():
         for elsewhere in (remote, worker):
-            a, b = (numbers(to_json(outputs)) for outputs in (elsewhere, loop))
+            a, b = (numbers(CODEC.to_json(outputs)) for outputs in (elsewhere, loop))
             assert len(a) == len(b) > 3, name
             assert np.abs(np.subtract(a, b)).max() < 1e-9, name
     plan, last = found["planning"][0][0], found["deforming"][0][0]

@@ -14,9 +14,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.body import BodyConfig
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
-from monstertruckd.config.load import load_truck
 from monstertruckd.config.validate import load_config
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, load_robot
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
 from monstertruckd.tools.simulation.rig import VirtualRig
 
@@ -46,7 +45,7 @@ def drive(name: str) -> tuple[Lap, np.ndarray, Odometry, VirtualRig]:
 
 
 def test_there_is_a_robot_of_every_kind():
-    kinds = {load_truck(FOLDER / f"{name}.yaml")[0].body.kind for name in ROBOTS}
+    kinds = {load_robot(FOLDER / f"{name}.yaml")[0].body.kind for name in ROBOTS}
     union = BodyConfig.__origin__  # type: ignore[attr-defined]
     assert kinds == {model.model_fields["kind"].annotation.__args__[0] for model in union.__args__}
 
@@ -113,7 +112,7 @@ def test_what_does_not_fit_the_body_is_refused(text: str, said: str, tmp_path: P
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.format(FOLDER))
     with pytest.raises(ConfigError) as caught:
-        load_truck(bad)
+        load_robot(bad)
     assert said in str(caught.value)
 
 

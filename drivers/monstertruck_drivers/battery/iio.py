@@ -19,7 +19,9 @@ from monstertruck_runtime.errors import (
     ProtocolError,
 )
 
-ROOT: Final = Path("/sys/bus/iio/devices")
+CONVERTERS: Final = "sys/bus/iio/devices"
+"""Folder of the kernel's converters, below a computer's root."""
+ROOT: Final = Path("/", CONVERTERS)
 _GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENXIO})
 _SCAN_TYPE: Final = re.compile(r"[bl]e:([su])(\d+)/")
 

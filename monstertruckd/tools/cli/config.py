@@ -32,10 +32,10 @@ def show(
     Exit code 2 if it is refused, with one line for each mistake.
     """
     from monstertruck_runtime.errors import NotFoundError
-    from monstertruckd.config.load import load_truck
     from monstertruckd.config.validate import resolved
+    from monstertruckd.tools.simulation.config import load_robot
 
-    loaded, tree = load_truck(config)
+    loaded, tree = load_robot(config)
     values = resolved(loaded)
     leaves = [(key, value) for key, value in _leaves(values, ()) if _wanted(key, keys)]
     if not leaves:

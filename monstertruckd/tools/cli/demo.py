@@ -22,7 +22,7 @@ from monstertruckd.tools.cli.output import (
 if TYPE_CHECKING:
     from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-DEMO_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
+DEMO_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
 
 
 def demo(

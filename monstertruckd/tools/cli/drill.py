@@ -14,7 +14,7 @@ from monstertruckd.tools.cli.output import JsonOption, console, print_json, prin
 if TYPE_CHECKING:
     from monstertruckd.tools.drill.drill import Drill, Outcome, Report
 
-FULL_CONFIG = Path(__file__).resolve().parents[2] / "configs" / "full.yaml"
+FULL_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "full.yaml"
 
 
 def drill(

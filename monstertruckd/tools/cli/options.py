@@ -29,7 +29,7 @@ def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
 
 def complete_role(incomplete: str) -> list[str]:
     """Places for devices in a configuration."""
-    from monstertruckd.config.truck import Devices
+    from monstertruck_drivers.config import Devices
 
     return [role for role in Devices.model_fields if role.startswith(incomplete)]
 

@@ -10,9 +10,10 @@ def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOIN
 
     It dials the robot, and again whenever the robot restarts; what it knows comes from there.
     """
+    from monstertruck_planners.steps import CODEC, STEPS
     from monstertruck_runtime.actors.server import serve
 
     async def main(clock: Clock) -> None:
-        await serve(clock, robot, endpoint)
+        await serve(clock, robot, endpoint, STEPS, CODEC)
 
     until_stopped(main)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_drivers.catalog import BY_NAME, Kind
+from monstertruck_drivers.config import Device
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.port import HubPort
 from monstertruck_runtime.errors import DeviceError, PortBusyError, WrongDeviceError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.truck import Device
 from monstertruckd.tools.doctor.finding import Finding, fail, fine, warn
 from monstertruckd.tools.doctor.patient import Patient
 

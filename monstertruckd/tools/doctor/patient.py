@@ -8,14 +8,15 @@ from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 
+from monstertruck_drivers.computer import ROOT, Computer
+from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import read_device
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.small_files import text_of
-from monstertruckd.assembly.cabling import ROOT, Computer
 from monstertruckd.config.load import load_truck
-from monstertruckd.config.truck import AnyPort, TruckConfig
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.doctor.accounts import Account, account_of
 from monstertruckd.tools.install.plan import UNIT, below, installed_config
 from monstertruckd.tools.install.unit import Program

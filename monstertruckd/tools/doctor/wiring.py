@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
+from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import DEVICES, Device, Node, Snapshot, ancestors, place, read_tree
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.truck import AnyPort
 from monstertruckd.tools.doctor.finding import Finding, fail, fine, warn
 from monstertruckd.tools.doctor.patient import Patient
 

@@ -23,7 +23,7 @@ from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.tools.drill.faults import Fault, Kind, Menu, Site, happen
+from monstertruck_sim.faults import Fault, Kind, Menu, Site, happen
 from monstertruckd.tools.drill.observer import STOPS_WITHIN, Observer, Violation
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -218,7 +218,7 @@ class _Driver:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number])
         base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
-        self._faults = _draw(Menu(base), leg.count, self._rng)
+        self._faults = _draw(Menu(base.devices, records=base.recorder is not None), leg.count, self._rng)
         records = any(fault.kind is Kind.DISK_FULL for fault in self._faults)
         recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None
         seed = int(self._rng.integers(2**31))
@@ -265,7 +265,7 @@ class _Truck:
     def __init__(self, rig: VirtualRig) -> None:
         self.rig = rig
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
-        self.site = Site(rig.config, rig.robot, rig.computer, rig.clock, rig.daemon.recorder)
+        self.site = Site(rig.config.sim, rig.config.devices, rig.robot, rig.computer, rig.clock, rig.daemon.recorder)
         bus = rig.bus
         self.operator = LocalOperator(bus, rig.clock)
         self._told = [bus.subscribe(topic, fifo(1 << 16)) for topic in (topics.EVENT, topics.GATE, topics.HEALTH)]

@@ -6,7 +6,7 @@ from typing import Final
 
 from monstertruck_runtime.errors import NotFoundError
 
-_PACKAGE: Final = Path(__file__).resolve().parents[1]
+_PACKAGE: Final = Path(__file__).resolve().parents[2]
 PLACES: Final = (_PACKAGE / "systemd", _PACKAGE.parent / "systemd")
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
+from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.truck import AnyPort, TruckConfig
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.install.shipped import filled, shipped
 
 HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))

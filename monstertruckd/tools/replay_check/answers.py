@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
+from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.placement import Actor, LoopActor, Placement, Places
 from monstertruck_runtime.actors.remote import RemoteDesk
 from monstertruck_runtime.clock import SECOND, WallClock
@@ -115,7 +116,7 @@ class ReplayedPlaces(Places):
     """Actors of the goal service."""
 
     def __init__(self, clock: PacedClock, record: GoalRecord, book: Book) -> None:
-        super().__init__(clock, RemoteDesk())
+        super().__init__(clock, RemoteDesk(CODEC))
         self._paced, self._record, self._book = clock, record, book
 
     def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:

@@ -1,38 +1,15 @@
 """Configuration of a run in the simulated world: the daemon's own, and the world behind the emulators."""
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from monstertruck_schemas.base import Schema
-from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.config import SimConfig
+from monstertruckd.config.calibration.apply import calibrated
 from monstertruckd.config.truck import TruckConfig
-
-
-class DrillConfig(Schema):
-    """Faults drawn at random while a simulated truck runs."""
-
-    seed: Annotated[int, Field(ge=0)] = 1
-    """Which faults, and when"""
-    period: Annotated[float, Field(gt=0)] = 10.0
-    """Seconds from one fault to the next, on average"""
-
-
-class SimConfig(Schema):
-    """The simulated side."""
-
-    seed: Annotated[int, Field(ge=0)] = 1
-    """Seed of everything random"""
-    deadman_wired: bool = False
-    """The servo controller's deadman output is wired to the drive controller's quick-stop input"""
-    servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
-    world: WorldConfig = WorldConfig()
-    drill: DrillConfig | None = None
-    """Faults that happen by themselves; null = none"""
-    recording: Path | None = None
-    """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""
+from monstertruckd.config.validate import validated
+from monstertruckd.config.yaml_tree import Tree, load_tree
 
 
 class SimulatedTruckConfig(TruckConfig):
@@ -47,3 +24,14 @@ class SimulatedTruckConfig(TruckConfig):
         if self.sim.world.truck.body.kind != self.body.kind:
             raise ValueError(f"sim.world.truck.body is {self.sim.world.truck.body.kind}, body is {self.body.kind}")
         return self
+
+
+def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
+    """The calibrated configuration of a real or a simulated robot; of the latter the section ``sim`` is checked, too.
+
+    Raises:
+        ConfigError: one line per mistake, in the file or in its calibration.
+    """
+    tree = load_tree(path)
+    model = TruckConfig if tree.data.get("sim") is None else SimulatedTruckConfig
+    return calibrated(*validated(tree, path, model))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import EmulatedPort
+from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import SECOND, Clock
@@ -20,11 +21,10 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
+from monstertruck_sim.faults import Mishaps, Site
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.world import World
-from monstertruckd.config.truck import Monitors, PortConfig
 from monstertruckd.config.validate import load_config
-from monstertruckd.tools.drill.faults import Mishaps, Site
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD = SECOND // 20
@@ -94,7 +94,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         path.parent.mkdir(parents=True, exist_ok=True)
         cables[role] = PtyPort(path)
     computer = EmulatedComputer(folder, config.devices, cables, clock)
-    robot = SimulatedRobot(config.sim, config, clock, computer.ports, folder)
+    robot = SimulatedRobot(config.sim, config.devices, config.monitors, clock, computer.ports, folder)
     log = TruthLog(robot.world, clock)
     emulated: dict[str, Commanded] = {role: Emulated(robot.emulators[role], robot.ports[role]) for role in devices}
     emulated |= {name: EmulatedFiles(files) for name, files in robot.monitored.items()}
@@ -108,7 +108,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
     if config.sim.drill is not None:
-        mishaps = Mishaps(Site(config, robot, computer, clock), config.sim.drill, _say)
+        mishaps = Mishaps(Site(config.sim, config.devices, robot, computer, clock), config.sim.drill, _say)
         tasks.append(asyncio.create_task(mishaps.run(), name="faults"))
     if robot.recorded is not None:
         tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))

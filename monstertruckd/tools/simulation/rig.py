@@ -12,10 +12,10 @@ from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.console import Emulated
+from monstertruck_sim.faults import Mishaps, Site
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.daemon import Daemon
-from monstertruckd.tools.drill.faults import Mishaps, Site
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.host import TruthLog
 
@@ -38,7 +38,13 @@ class VirtualRig:
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
         self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
         self.robot = SimulatedRobot(
-            config.sim, config, clock, self.computer.ports, self.computer.folder, offload=inline
+            config.sim,
+            config.devices,
+            config.monitors,
+            clock,
+            self.computer.ports,
+            self.computer.folder,
+            offload=inline,
         )
         self.world = self.robot.world
         self.truth = TruthLog(self.world, clock)
@@ -70,7 +76,9 @@ class VirtualRig:
             asyncio.create_task(self.truth.run(), name="truth"),
         ]
         if (drill := self.config.sim.drill) is not None:
-            site = Site(self.config, self.robot, self.computer, self.clock, self.daemon.recorder)
+            site = Site(
+                self.config.sim, self.config.devices, self.robot, self.computer, self.clock, self.daemon.recorder
+            )
             around.append(asyncio.create_task(Mishaps(site, drill).run(), name="faults"))
         self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
         try:

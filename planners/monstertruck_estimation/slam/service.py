@@ -22,12 +22,12 @@ from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import SlamHealth, Standing
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
-from monstertruckd.config.truck import Mount
 
 TARGET: Final = "monstertruck_estimation.slam.step:EstimationWorker"
 PATIENCE: Final = 180.0

@@ -8,9 +8,9 @@ from pydantic import ValidationError
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.ports import RpcRegistry
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalControl, GoalRequest, Request
-from monstertruckd.bus.rpc import Rpc
 
 GOAL: Final = "goal"
 CONTROL: Final = "goal_control"
@@ -20,7 +20,7 @@ PATIENCE: Final = 4.0
 R = TypeVar("R", bound=Request)
 
 
-def register(rpc: Rpc, service: GoalService, clock: Clock) -> None:
+def register(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
     """Serve ``goal`` and ``goal_control``; their payloads are a ``GoalRequest`` and a ``GoalControl``.
 
     Args:

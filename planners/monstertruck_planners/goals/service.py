@@ -20,6 +20,7 @@ from monstertruck_runtime.actors.placement import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.ports import Ready
+from monstertruck_runtime.requests import Sequences, refusal
 from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState
@@ -28,7 +29,6 @@ from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Reques
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
-from monstertruckd.gate.sources import Sequences, refusal
 
 Array = NDArray[np.float64]
 

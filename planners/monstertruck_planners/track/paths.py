@@ -10,12 +10,12 @@ from monstertruck_planners.track.line import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.requests import Sequences, refusal
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.gate.sources import Sequences, refusal
 
 HEADER = ["x", "y", "yaw", "direction"]
 

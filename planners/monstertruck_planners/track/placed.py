@@ -1,6 +1,6 @@
 """The tracker somewhere else: its inputs go to an actor, its outputs come back."""
 
-from typing import Any, Final
+from typing import Any
 
 from monstertruck_planners.track.step import TrackInput, TrackOutput, TrackSetup
 from monstertruck_runtime.actors.placement import Actor
@@ -9,8 +9,6 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.req import DriveRequest
-
-TARGET: Final = "monstertruck_planners.track.step:TrackingWorker"
 
 
 class PlacedTracker:

@@ -1,107 +1,96 @@
-"""Inputs and outputs of steps as JSON, exactly, for another machine: only the classes listed here are ever built."""
+"""Inputs and outputs of steps as JSON, exactly, for another machine: only registered classes are ever built."""
 
 import base64
 import dataclasses
+from collections.abc import Iterable
 from enum import Enum
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint
-from monstertruck_planners.goals.config import EscapeConfig, LocalConfig, PlannerConfig
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask, Setup, Way
-from monstertruck_planners.local.config import BandConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.route.config import HybridConfig, LatticeConfig
-from monstertruck_planners.track.config import (
-    FuzzyConfig,
-    LqrConfig,
-    MpcConfig,
-    PurePursuitConfig,
-    StanleyConfig,
-)
-from monstertruck_planners.track.step import Told, TrackInput, TrackOutput, TrackSetup
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.base import Pose2D, Schema, Twist2D
-from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import Path, TrackerState
-from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.sensor import Attitude, LaserScan, Vector3
-from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
+from monstertruck_schemas.base import Schema
 
-_CLASSES: Final[dict[str, type[Any]]] = {
-    cls.__name__: cls
-    for cls in (
-        *(PlanTask, PlanAnswer, Setup, PlannerConfig, EscapeConfig, HybridConfig, LatticeConfig, Grid, Pose2D),
-        *(DeformTask, DeformAnswer, Way, LocalConfig, RsbandConfig, PublishedConfig, TebConfig, BandConfig),
-        *(TrackInput, TrackOutput, TrackSetup, Told, Odometry, Twist2D, Path, GateState, LaserScan, Attitude, Vector3),
-        *(DriveRequest, TrackerState, FuzzyConfig, LqrConfig, MpcConfig, PurePursuitConfig, StanleyConfig),
-        *(FourWheelSteering, Footprint),
-    )
-}
-_ENUMS: Final[dict[str, type[Enum]]] = {cls.__name__: cls for cls in (Reason, Severity, Role, GateMode)}
 _DTYPES: Final = ("float64", "int8", "uint8", "int64")
 
 
-def to_json(value: Any) -> Any:
-    """A tree of known classes, arrays, tuples, lists, dicts by text, and scalars as what JSON can say.
+class StepCodec:
+    """Converts trees of registered classes, arrays, tuples, lists, dicts with text keys, paths and scalars.
 
-    Raises:
-        InputError: something else.
+    Args:
+        classes: dataclasses and ``Schema`` models that may travel; enums too.
     """
-    match value:
-        case Enum() if type(value).__name__ in _ENUMS:
-            return {"enum": type(value).__name__, "value": value.value}
-        case None | bool() | int() | float() | str():
-            return value
-        case np.ndarray() if str(value.dtype) in _DTYPES:
-            data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
-            return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
-        case FilePath():
-            return {"path": str(value)}
-        case tuple():
-            return {"tuple": [to_json(inner) for inner in value]}
-        case list():
-            return [to_json(inner) for inner in value]
-        case dict():
-            return {"dict": [[key, to_json(inner)] for key, inner in value.items()]}
-    name = type(value).__name__
-    if _CLASSES.get(name) is not type(value):
-        raise InputError(f"step: no {name} travels to another machine")
-    names = type(value).model_fields if isinstance(value, Schema) else [f.name for f in dataclasses.fields(value)]
-    return {"class": name, "fields": {field: to_json(getattr(value, field)) for field in names}}
 
+    def __init__(self, classes: Iterable[type[Any]]) -> None:
+        self._classes = {cls.__name__: cls for cls in classes}
 
-def from_json(value: Any) -> Any:
-    """Back.
+    def to_json(self, value: Any) -> Any:
+        """The value as what JSON can say.
 
-    Raises:
-        InputError: nothing that ``to_json`` makes.
-    """
-    try:
-        return _back(value)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"step: not readable: {type(error).__name__}: {error}") from error
+        Raises:
+            InputError: a class that is not registered.
+        """
+        match value:
+            case Enum() if self._knows(value):
+                return {"enum": type(value).__name__, "value": value.value}
+            case None | bool() | int() | float() | str():
+                return value
+            case np.ndarray() if str(value.dtype) in _DTYPES:
+                data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
+                return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
+            case Path():
+                return {"path": str(value)}
+            case tuple():
+                return {"tuple": [self.to_json(inner) for inner in value]}
+            case list():
+                return [self.to_json(inner) for inner in value]
+            case dict():
+                return {"dict": [[key, self.to_json(inner)] for key, inner in value.items()]}
+        if not self._knows(value):
+            raise InputError(f"step: no {type(value).__name__} travels to another machine")
+        names = type(value).model_fields if isinstance(value, Schema) else [f.name for f in dataclasses.fields(value)]
+        return {
+            "class": type(value).__name__,
+            "fields": {field: self.to_json(getattr(value, field)) for field in names},
+        }
 
+    def from_json(self, value: Any) -> Any:
+        """Back.
 
-def _back(value: Any) -> Any:
-    match value:
-        case {"enum": name, "value": inner}:
-            return _ENUMS[name](inner)
-        case {"array": dtype, "shape": shape, "data": data} if dtype in _DTYPES:
-            return np.frombuffer(base64.b64decode(data, validate=True), dtype).reshape(shape)
-        case {"path": text}:
-            return FilePath(text)
-        case {"tuple": inner}:
-            return tuple(map(_back, inner))
-        case {"dict": rows}:
-            return {key: _back(inner) for key, inner in rows}
-        case {"class": name, "fields": fields}:
-            return _CLASSES[name](**{field: _back(inner) for field, inner in fields.items()})
-        case list():
-            return [_back(inner) for inner in value]
-        case None | bool() | int() | float() | str():
-            return value
-    raise ValueError(f"unknown object {str(value)[:64]}")
+        Raises:
+            InputError: nothing that ``to_json`` makes.
+        """
+        try:
+            return self._back(value)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"step: not readable: {type(error).__name__}: {error}") from error
+
+    def _knows(self, value: Any) -> bool:
+        return self._classes.get(type(value).__name__) is type(value)
+
+    def _back(self, value: Any) -> Any:
+        match value:
+            case {"enum": name, "value": inner}:
+                return self._named(name, Enum)(inner)
+            case {"array": dtype, "shape": shape, "data": data} if dtype in _DTYPES:
+                return np.frombuffer(base64.b64decode(data, validate=True), dtype).reshape(shape)
+            case {"path": text}:
+                return Path(text)
+            case {"tuple": inner}:
+                return tuple(map(self._back, inner))
+            case {"dict": rows}:
+                return {key: self._back(inner) for key, inner in rows}
+            case {"class": name, "fields": fields}:
+                return self._named(name, object)(**{field: self._back(inner) for field, inner in fields.items()})
+            case list():
+                return [self._back(inner) for inner in value]
+            case None | bool() | int() | float() | str():
+                return value
+        raise ValueError(f"unknown object {str(value)[:64]}")
+
+    def _named(self, name: str, base: type[Any]) -> type[Any]:
+        found = self._classes[name]
+        if not issubclass(found, base):
+            raise TypeError(f"{name} is no {base.__name__}")
+        return found

@@ -9,7 +9,7 @@ import json
 from types import TracebackType
 from typing import Any, Final, Self
 
-from monstertruck_runtime.actors.codec import from_json, to_json
+from monstertruck_runtime.actors.codec import StepCodec
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
 
@@ -27,13 +27,15 @@ class RemoteActor:
 
     Args:
         name: of the steps, for the caller.
+        codec: of their inputs and outputs.
         clock: time.
         deadline: seconds for a step.
         patience: seconds to wait for a caller.
     """
 
-    def __init__(self, name: str, clock: Clock, *, deadline: float, patience: float) -> None:
-        self._name, self._clock, self._deadline, self._patience = name, clock, deadline, patience
+    def __init__(self, name: str, codec: StepCodec, clock: Clock, *, deadline: float, patience: float) -> None:
+        self._name, self._codec, self._clock = name, codec, clock
+        self._deadline, self._patience = deadline, patience
         self._server: str | None = None
         self._changed = False
         self._number = 0
@@ -69,7 +71,7 @@ class RemoteActor:
                 self._changed = False
                 raise WorkerError(f"{self._name}: another plan-server took over")
             self._number += 1
-            self._task = to_json(inputs)
+            self._task = self._codec.to_json(inputs)
             result = self._result = asyncio.get_running_loop().create_future()
             self._tell()
             try:
@@ -128,7 +130,7 @@ class RemoteActor:
             result.set_exception(WorkerError(f"{self._name}: {text}"))
             return True
         try:
-            result.set_result(from_json(json.loads(text)))
+            result.set_result(self._codec.from_json(json.loads(text)))
         except (ValueError, InputError) as error:
             result.set_exception(WorkerError(f"{self._name}: {error}"))
         return True
@@ -150,14 +152,19 @@ class RemoteActor:
 
 
 class RemoteDesk:
-    """The remote actors of a daemon by name."""
+    """The remote actors of a daemon by name.
 
-    def __init__(self) -> None:
+    Args:
+        codec: of all steps' inputs and outputs.
+    """
+
+    def __init__(self, codec: StepCodec) -> None:
+        self._codec = codec
         self._actors: dict[str, RemoteActor] = {}
 
     def actor(self, name: str, clock: Clock, *, deadline: float, patience: float) -> RemoteActor:
         """A new one."""
-        self._actors[name] = RemoteActor(name, clock, deadline=deadline, patience=patience)
+        self._actors[name] = RemoteActor(name, self._codec, clock, deadline=deadline, patience=patience)
         return self._actors[name]
 
     async def serve(self, payload: dict[str, Any]) -> dict[str, Any]:

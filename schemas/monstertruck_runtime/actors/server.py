@@ -4,10 +4,11 @@ import asyncio
 import importlib
 import json
 import logging
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Final, Protocol
 
-from monstertruck_runtime.actors.codec import from_json, to_json
+from monstertruck_runtime.actors.codec import StepCodec
 from monstertruck_runtime.actors.remote import PART, POLL, RPC
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
@@ -16,12 +17,6 @@ from monstertruck_runtime.threads import in_thread
 
 log = logging.getLogger(__name__)
 
-STEPS: Final = {
-    "planning": "monstertruck_planners.goals.planning_worker:PlanningWorker",
-    "deforming": "monstertruck_planners.goals.deforming_worker:DeformingWorker",
-    "tracking": "monstertruck_planners.track.step:TrackingWorker",
-}
-"""What it can compute."""
 RETRY: Final = 1.0
 """Seconds between two tries to reach a robot."""
 
@@ -34,29 +29,37 @@ class Caller(Protocol):
         ...
 
 
-async def serve(clock: Clock, robot: str, endpoint: str) -> None:
-    """Serve a robot until cancelled, over all its restarts."""
+async def serve(clock: Clock, robot: str, endpoint: str, steps: Mapping[str, str], codec: StepCodec) -> None:
+    """Serve a robot until cancelled, over all its restarts.
+
+    Args:
+        clock: time.
+        robot: its name.
+        endpoint: where it listens.
+        steps: what can be computed here: ``module:factory`` by name.
+        codec: of inputs and outputs.
+    """
     while True:
         try:
             async with (
                 TruckClient(robot, endpoint, clock=clock, timeout=2 * POLL) as client,
                 asyncio.TaskGroup() as tasks,
             ):
-                for name in STEPS:
-                    tasks.create_task(work(client, clock, name, f"{client.source[:40]}.{clock.now():x}"))
+                for name, target in steps.items():
+                    tasks.create_task(work(client, clock, name, target, codec, f"{client.source[:40]}.{clock.now():x}"))
         except* TruckError as group:
             log.warning("%s; tries again", group.exceptions[0])
         await clock.sleep(RETRY)
 
 
-async def work(caller: Caller, clock: Clock, name: str, server: str) -> None:
+async def work(caller: Caller, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
     """Call for one kind of steps, take them, bring the outputs; until cancelled.
 
     Raises:
         TruckError: the robot is gone.
     """
     who = {"actor": name, "server": server}
-    step = await in_thread(partial(_build, name))
+    step = await in_thread(partial(_build, target))
     reply: dict[str, Any] = {}
     done = 0
     while True:
@@ -72,20 +75,20 @@ async def work(caller: Caller, clock: Clock, name: str, server: str) -> None:
         done = int(reply["number"])
         failed = False
         try:
-            text = await in_thread(partial(_answer, step, reply["inputs"]))
+            text = await in_thread(partial(_answer, step, codec, reply["inputs"]))
         except Exception as error:  # noqa: BLE001 - told to the robot, which decides
             failed, text = True, f"{type(error).__name__}: {error}"
-            step = await in_thread(partial(_build, name))
+            step = await in_thread(partial(_build, target))
         parts = [text[i : i + PART] for i in range(0, len(text), PART)] or [""]
         for i, part in enumerate(parts, start=1):
             outputs = {"number": done, "part": part, "last": i == len(parts), "failed": failed}
             reply = await caller.call(RPC, {**who, "after": done, **outputs})
 
 
-def _build(name: str) -> Any:
-    module, _, factory = STEPS[name].partition(":")
+def _build(target: str) -> Any:
+    module, _, factory = target.partition(":")
     return getattr(importlib.import_module(module), factory)()
 
 
-def _answer(step: Any, inputs: Any) -> str:
-    return json.dumps(to_json(step.step(from_json(inputs))))
+def _answer(step: Any, codec: StepCodec, inputs: Any) -> str:
+    return json.dumps(codec.to_json(step.step(codec.from_json(inputs))))

@@ -3,10 +3,10 @@ import math
 import pytest
 
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.requests import MAX_SOURCES
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.sources import MAX_SOURCES
 from tests.unit.gate.rig import Rig
 
 TRACKER = {"source": "track", "role": Role.TRACKER}

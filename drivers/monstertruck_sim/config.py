@@ -1,0 +1,34 @@
+"""The simulated side of a configuration: the section ``sim``."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+from monstertruck_sim.world.config import WorldConfig
+
+
+class DrillConfig(Schema):
+    """Faults drawn at random while a simulated truck runs."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Which faults, and when"""
+    period: Annotated[float, Field(gt=0)] = 10.0
+    """Seconds from one fault to the next, on average"""
+
+
+class SimConfig(Schema):
+    """The simulated side."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of everything random"""
+    deadman_wired: bool = False
+    """The servo controller's deadman output is wired to the drive controller's quick-stop input"""
+    servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
+    world: WorldConfig = WorldConfig()
+    drill: DrillConfig | None = None
+    """Faults that happen by themselves; null = none"""
+    recording: Path | None = None
+    """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""

@@ -1,0 +1,84 @@
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
+from monstertruck_planners.route.catalog import CONFIGS, make_planner
+from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
+from monstertruck_planners.route.grid_astar import GridAstarPlanner
+from monstertruck_planners.route.lattice import LatticePlanner
+from monstertruck_planners.route.lattice_moves import ANGLES, make_moves
+from monstertruck_planners.route.motion import MotionPath
+from monstertruck_schemas.reasons import Reason
+from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
+
+WALL = (2.9, 0.0, 3.1, 2.8)
+START, GOAL = np.array([1.0, 1.0, 0.0]), np.array([5.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("cell", [0.02, 0.03, 0.04, 0.05, 0.1])
+@pytest.mark.parametrize(("radius", "crab"), [(0.757, 0.0), (0.378, 0.4)])
+def test_moves_end_on_cells_and_keep_the_radius(cell, radius, crab):
+    moves = make_moves(radius, crab, cell)
+    for h in range(16):
+        assert moves.number[h] == (7 if crab == 0.0 else 11)
+        for k in range(moves.number[h]):
+            path = MotionPath(np.array([0.0, 0.0, ANGLES[h]]), moves.rows[h, k])
+            dx, dy, turn = moves.shift[h, k].tolist()
+            assert path.end[:2] == pytest.approx((dx * cell, dy * cell), abs=1e-9)
+            assert math.remainder(path.end[2] - ANGLES[(h + turn) % 16], math.tau) == pytest.approx(0.0, abs=1e-9)
+            assert path.greatest_curvature <= 1 / radius + 1e-9
+            assert np.abs(path.rows[:, 2]).max() <= crab + 1e-9
+            assert path.cusps == 0
+            assert moves.cost[h, k] >= path.length - 1e-12
+
+
+def test_costs_are_the_authors():
+    moves = make_moves(0.378, 0.4, 0.05)
+    factors = sorted(
+        {round(moves.cost[0, k] / np.abs(moves.rows[0, k, :, 0]).sum(), 6) for k in range(moves.number[0])}
+    )
+    assert factors == [1.0, 2.0, 3.0, 5.0]
+
+
+@pytest.mark.parametrize("vehicle", [CAR, TRUCK])
+def test_lattice_routes_are_drivable(vehicle):
+    where = ground(WALL)
+    planner = LatticePlanner(vehicle, LatticeConfig(effort=20_000))
+    for goal in (GOAL, (1.5, 3.0, math.pi)):
+        result = planner.plan(where, START, goal)
+        assert result.ok
+        assert_drivable(result.path, where, vehicle, START, goal)
+        assert result.path.length <= result.statistics["first_length"] + 1e-9
+
+
+def test_lattice_and_grid_refuse_by_name():
+    shut = ground((2.9, 0.0, 3.1, 4.0))
+    for planner in (LatticePlanner(CAR), GridAstarPlanner(CAR)):
+        assert planner.plan(shut, START, GOAL).reason is Reason.GOAL_UNREACHABLE
+        assert planner.plan(shut, START, (3.0, 1.0, 0.0)).reason is Reason.GOAL_BLOCKED
+        assert planner.plan(shut, START, (3.0, math.inf, 0.0)).reason is Reason.NOT_FINITE
+
+
+def test_the_authors_grid_costs():
+    where = ground(WALL)
+    planner = GridAstarPlanner(Vehicle.truck("counter"), GridAstarConfig())
+    toll = planner._tolls(np.array([0.1, 0.181, 0.3, 0.47, 0.5], np.float32))
+    assert toll.tolist() == [0, 0, 199, 91, 50]  # 252 exp(-0.01) is lethal, 252 exp(-1.2) and exp(-2.9) are not
+    result = planner.plan(where, START, GOAL)
+    assert result.ok
+    assert result.poses[0] == pytest.approx(START)
+    assert result.poses[-1] == pytest.approx(GOAL)
+    assert where.field.lookup(result.poses[1:-1, :2]).min() > planner.vehicle.footprint.inscribed_radius
+    step = np.diff(result.poses[:, :2], axis=0)
+    assert np.hypot(*step.T).max() < 0.12
+    assert result.poses[5:-5, 2] == pytest.approx(np.arctan2(step[5:-4, 1], step[5:-4, 0]))
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_every_kind_plans(kind):
+    planner = make_planner(CAR, CONFIGS[kind](effort=2000))
+    warm_up(planner)
+    result = planner.plan(RouteMap.from_cells(np.zeros((60, 60), np.int8), 0.1), (1, 1, 0), (4, 4, 0))
+    assert result.ok

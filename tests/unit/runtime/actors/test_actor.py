@@ -1,0 +1,278 @@
+"""Worker processes: state, deadline, death, order on the virtual clock, and no zombies."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
+from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
+
+ROOT = Path(__file__).parents[4]
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+def counter(clock, target: str = "Counter", *, latency=0.01, deadline=5.0, **settings) -> WorkerActor:
+    return WorkerActor("counter", f"tests.worker_kit:{target}", clock, latency=latency, deadline=deadline, **settings)
+
+
+def gone(pid: int) -> bool:
+    """No such process, not even as a zombie."""
+    return not Path(f"/proc/{pid}").exists()
+
+
+async def test_a_worker_keeps_its_state_and_gets_arrays():
+    async with counter(WallClock()) as worker:
+        assert worker.pid is None
+        assert [await worker.step(None) for _ in range(3)] == [1, 2, 3]
+        array = np.arange(300_000.0)
+        np.testing.assert_array_equal(await worker.step({"double": array}), array * 2)
+        pid = worker.pid
+        assert pid is not None
+    assert worker.pid is None
+    assert gone(pid)
+
+
+async def test_a_worker_is_niced_single_threaded_and_light():
+    async with counter(WallClock()) as worker:
+        facts = await worker.step("facts")
+    assert facts["pid"] != os.getpid()
+    assert facts["nice"] >= os.nice(0) + 5
+    assert facts["threads"] == "1"
+    assert not {"zenoh", "asyncio", "pydantic", "multiprocessing"} & set(facts["modules"])
+
+
+async def test_concurrent_steps_are_taken_in_order():
+    async with counter(WallClock()) as worker:
+        assert await asyncio.gather(*(worker.step(None) for _ in range(5))) == [1, 2, 3, 4, 5]
+
+
+async def test_a_hung_worker_is_killed_at_its_deadline_and_never_hurts_the_loop():
+    clock = WallClock()
+    late = []
+
+    async def tick() -> None:
+        while True:
+            due = clock.now() + 5_000_000
+            await clock.sleep_until(due)
+            late.append(clock.now() - due)
+
+    async with counter(clock, deadline=0.3) as worker:
+        await worker.start()
+        pid = worker.pid
+        assert pid is not None
+        ticking = asyncio.create_task(tick())
+        start = clock.now()
+        with pytest.raises(WorkerTimeoutError, match=r"counter missed its deadline of 0.3 s"):
+            await worker.step({"sleep": 60})
+        took = (clock.now() - start) / SECOND
+        ticking.cancel()
+        assert 0.3 <= took < 0.6
+        assert gone(pid)
+        assert sorted(late)[len(late) // 2] < 5_000_000
+        assert len(late) > 20
+        assert await worker.step(None) == 1  # a fresh one
+
+
+async def test_a_stopped_worker_is_killed_too():
+    async with counter(WallClock(), deadline=0.2) as worker:
+        await worker.start()
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGSTOP)
+        with pytest.raises(WorkerTimeoutError):
+            await worker.step({"double": np.zeros(1_000_000)})
+
+
+async def test_a_worker_that_dies_or_raises_is_replaced():
+    async with counter(WallClock()) as worker:
+        assert await worker.step(None) == 1
+        with pytest.raises(WorkerError, match="is gone"):
+            await worker.step({"die": 3})
+        assert await worker.step(None) == 1
+        with pytest.raises(WorkerError, match="ValueError: no path"):
+            await worker.step({"raise": "no path"})
+        assert await worker.step(None) == 1
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGKILL)
+        with pytest.raises(WorkerError, match="is gone"):
+            await worker.step(None)
+        assert await worker.step(None) == 1
+
+
+async def test_a_factory_that_fails_is_an_error_with_its_text():
+    async with counter(WallClock(), "broken") as worker:
+        for _ in range(2):
+            with pytest.raises(WorkerError, match="no model file"):
+                await worker.start()
+            assert worker.pid is None
+
+
+async def test_a_start_takes_no_longer_than_the_patience():
+    async with counter(WallClock(), "slow_to_build", patience=0.3) as worker:
+        with pytest.raises(WorkerTimeoutError, match=r"did not start within 0.3 s"):
+            await worker.step(None)
+    async with counter(WallClock(), "nothing_here") as worker:
+        with pytest.raises(WorkerError, match="nothing_here"):
+            await worker.step(None)
+
+
+@pytest.mark.parametrize("after", [0.0, 0.001, 0.3])
+async def test_a_cancelled_step_leaves_no_process(after: float):
+    worker = counter(WallClock())
+    step = asyncio.create_task(worker.step({"sleep": 60}))
+    await asyncio.sleep(after)
+    pid = worker.pid
+    step.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await step
+    assert worker.pid is None
+    assert pid is None or gone(pid)
+
+
+async def test_closing_under_a_step_fails_it():
+    worker = counter(WallClock())
+    await worker.start()
+    step = asyncio.create_task(worker.step({"sleep": 60}))
+    await asyncio.sleep(0.05)
+    await worker.close()
+    await worker.close()
+    with pytest.raises(WorkerError):
+        await step
+
+
+async def test_a_worker_ends_with_its_killed_parent(tmp_path: Path):
+    parent = tmp_path / "parent.py"
+    parent.write_text(
+        textwrap.dedent("""
+        import asyncio
+        from monstertruck_runtime.clock import WallClock
+        from monstertruck_runtime.actors.actor import WorkerActor
+
+        async def main():
+            worker = WorkerActor("w", "tests.worker_kit:Counter", WallClock(), latency=1, deadline=99)
+            await worker.start()
+            print(worker.pid, flush=True)
+            await worker.step({"sleep": 60})
+
+        asyncio.run(main())
+        """)
+    )
+    process = subprocess.Popen([sys.executable, str(parent)], stdout=subprocess.PIPE, text=True)
+    with process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        await asyncio.sleep(0.05)
+        process.kill()
+    async with asyncio.timeout(3):
+        # the container's init may not reap: a zombie has ended, too
+        while not gone(pid) and "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text():
+            await asyncio.sleep(0.01)
+
+
+def test_on_the_virtual_clock_a_result_comes_exactly_at_its_declared_latency():
+    async def main(clock: VirtualClock) -> list[tuple[int, int]]:
+        got = []
+        async with counter(clock, latency=0.2, cpu_factor=2.5) as worker:
+            for seconds in (0.05, 0.0):
+                start = clock.now()
+                got.append((await worker.step({"sleep": seconds}), clock.now() - start))
+        return got
+
+    (first, one), (second, two) = run_virtual(main)
+    assert (first, second) == (1, 2)
+    assert one == pytest.approx(0.5 * SECOND, abs=5)
+    assert two == pytest.approx(0.5 * SECOND, abs=5)
+
+
+def test_results_due_together_come_in_the_order_of_submission_whatever_the_processes_do():
+    async def main(clock: VirtualClock) -> list[tuple[str, int]]:
+        order: list[tuple[str, int]] = []
+
+        async def ask(worker: WorkerActor, name: str, begin: float, seconds: float) -> None:
+            await clock.sleep(begin)
+            await worker.step({"sleep": seconds})
+            order.append((name, clock.now()))
+
+        workers = [counter(clock, latency=latency) for latency in (0.3, 0.2, 0.1, 0.2)]
+        try:
+            await asyncio.gather(
+                ask(workers[3], "d", 0.1, 0.0),
+                ask(workers[0], "a", 0.0, 0.2),
+                ask(workers[2], "c", 0.2, 0.1),
+                ask(workers[1], "b", 0.1, 0.0),
+            )
+        finally:
+            for worker in workers:
+                await worker.close()
+        return order
+
+    one, two = run_virtual(main), run_virtual(main)
+    assert one == two
+    assert [name for name, _ in one] == ["a", "d", "b", "c"]
+
+
+def test_too_slow_a_computer_misses_the_deadline_on_the_virtual_clock():
+    async def main(clock: VirtualClock) -> float:
+        async with counter(clock, latency=0.2, deadline=0.5, cpu_factor=3) as worker:
+            start = clock.now()
+            with pytest.raises(WorkerTimeoutError):
+                await worker.step(None)
+            return (clock.now() - start) / SECOND
+
+    assert run_virtual(main) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_hang_on_the_virtual_clock_ends_at_the_deadline_too():
+    async def main(clock: VirtualClock) -> tuple[float, int]:
+        async with counter(clock, latency=0.2, deadline=0.5, patience=1.0) as worker:
+            start = clock.now()
+            with pytest.raises(WorkerTimeoutError):
+                await worker.step({"sleep": 60})
+            took = (clock.now() - start) / SECOND
+            with pytest.raises(WorkerError, match="is gone"):
+                await worker.step({"die": 1})
+            return took, await worker.step(None)
+
+    assert run_virtual(main) == (pytest.approx(0.5, abs=1e-6), 1)
+
+
+def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
+    async def main(clock: VirtualClock) -> None:
+        async with counter(clock, "slow_to_build", patience=0.3) as worker:
+            with pytest.raises(WorkerTimeoutError, match="did not start"):
+                await worker.step(None)
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize(
+    ("target", "error"), [("slow_to_build", WorkerTimeoutError), ("broken", WorkerError), ("Counter", None)]
+)
+def test_on_the_virtual_clock_a_worker_starts_beside_the_run(target: str, error: type[Exception] | None):
+    async def main(clock: VirtualClock) -> None:
+        async with counter(clock, target, patience=0.3 if target == "slow_to_build" else 30.0) as worker:
+            await worker.start()
+            pid = worker.pid
+            await worker.start()
+            assert worker.pid == pid is not None
+            if error is None:
+                assert await worker.step(None) == 1
+                assert worker.pid == pid
+                return
+            with pytest.raises(error):
+                await worker.step(None)
+            assert worker.pid is None
+            assert gone(pid)
+
+    run_virtual(main)

@@ -1,0 +1,142 @@
+"""The frame: typed steps with bounds, given up anywhere, nothing saved before the end."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Battery, BatteryLevel
+from monstertruckd.config.calibration.record import Estimate, Result
+from monstertruckd.config.load import load_uncalibrated
+from monstertruckd.tools.calibrate.guide import Guide, Wizard, calibrate
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
+
+CONFIG = load_uncalibrated(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml")[0]
+RESULT = Result(
+    wizard="battery", measured="test", estimates=(Estimate(name="gain", value=1.1, samples=1, meaning="test"),)
+)
+DATE = "2026-11-22T12:00:00Z"
+
+
+class Truck:
+    source = "test"
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, Any]] = []
+        self.boxes: list[Mailbox[Any]] = []
+
+    def subscribe(self, topic, delivery):
+        self.boxes.append(Mailbox(delivery))
+        return self.boxes[-1]
+
+    async def drive(self, speed, front, rear=0.0, lease=0.3):
+        raise AssertionError("nothing moves here")
+
+    async def order(self, order, lease=1.0):
+        raise AssertionError("nothing moves here")
+
+    async def call(self, rpc, payload=None):
+        self.calls.append((rpc, payload))
+        return {"file": "0001.json", "result": payload["result"] | {"date": DATE}}
+
+
+class Panel:
+    def __init__(self, *, number: float = 1.0, yes: bool = True) -> None:
+        self.said: list[str] = []
+        self._number = number
+        self._yes = yes
+
+    def say(self, text):
+        self.said.append(text)
+
+    def progress(self, name, done, total):
+        self.said.append(f"{name} {done:g}/{total:g}")
+
+    async def number(self, step):
+        return self._number
+
+    async def confirm(self, step):
+        return self._yes
+
+
+def run(steps, panel: Panel | None = None, truck: Truck | None = None):
+    """Run a wizard of the given coroutine function; returns what ``calibrate`` does."""
+    wizard = Wizard("battery", "test", "a table", steps)
+
+    async def main(clock: VirtualClock):
+        return await calibrate(wizard, truck or Truck(), panel or Panel(), clock, CONFIG, {})
+
+    return run_virtual(main)
+
+
+def test_the_result_is_saved_by_the_daemon_at_the_end():
+    truck, panel = Truck(), Panel()
+
+    async def steps(guide: Guide) -> Result:
+        assert not truck.calls
+        return guide.fit("scale", lambda: RESULT)
+
+    assert run(steps, panel, truck) == (RESULT.model_copy(update={"date": DATE}), "0001.json")
+    assert truck.calls == [("calibration_save", {"result": RESULT.model_dump(mode="json"), "by": "test"})]
+    assert panel.said == ["battery: test", "room: a table", "computing: scale"]
+
+
+@pytest.mark.parametrize("panel", [Panel(number=3.0), Panel(number=-1.0)])
+def test_a_number_has_bounds(panel: Panel):
+    truck = Truck()
+
+    async def steps(guide: Guide) -> Result:
+        await guide.ask(Number("volts", "volts?", 0.0, 2.0))
+        return RESULT
+
+    with pytest.raises(InputError, match=r"volts: .* is not within 0 to 2"):
+        run(steps, panel, truck)
+    assert not truck.calls
+
+
+def test_no_to_what_has_to_be_ends_the_wizard():
+    async def steps(guide: Guide) -> Result:
+        assert not await guide.confirm(Confirm("seen", "did it?", fact=True)), "a fact may be either"
+        await guide.confirm(Confirm("ready", "ready?"))
+        return RESULT
+
+    truck = Truck()
+    with pytest.raises(RequestRefusedError, match=r"given up at: ready\?") as caught:
+        run(steps, Panel(yes=False), truck)
+    assert caught.value.refusal is Reason.CANCELLED
+    assert not truck.calls
+
+
+def test_messages_are_collected_within_their_time():
+    truck, panel = Truck(), Panel()
+
+    async def steps(guide: Guide) -> Result:
+        collecting = asyncio.ensure_future(guide.collect(Collect("voltage", topics.BATTERY, 3, 5.0)))
+        await asyncio.sleep(0)
+        message = Battery(stamp=1, received=1, seq=0, raw_voltage=24.0, cells=6, level=BatteryLevel.NORMAL)
+        for _ in range(3):
+            truck.boxes[0].put(message)
+            await asyncio.sleep(0.1)
+        assert await collecting == [message] * 3
+        await guide.collect(Collect("voltage", topics.BATTERY, 3, 5.0))
+        return RESULT
+
+    with pytest.raises(NoAnswerError, match="sensor/battery: 0 of 3 messages came within 5 s"):
+        run(steps, panel, truck)
+    assert "voltage 3/3" in panel.said
+
+
+def test_values_of_the_running_configuration():
+    async def steps(guide: Guide) -> Result:
+        assert guide.value("geometry.drive_ratio") == 644.0
+        guide.value("devices.camera.driver.rate")
+        return RESULT
+
+    with pytest.raises(InputError, match=r"devices\.camera\.driver\.rate: not in this truck's configuration"):
+        run(steps)

@@ -1,0 +1,58 @@
+"""`drill` as a user sees it."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monstertruck_sim.faults import Kind
+from monstertruckd.tools.cli import drill as command
+from monstertruckd.tools.cli.main import main
+from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.observer import Violation
+
+DEMO = Path(__file__).resolve().parents[4] / "configs" / "demo.yaml"
+SAFE = Outcome("stall: lidar", Kind.STALL, True, stop_bytes_s=0.27, standstill_s=0.56, metres=0.07, recovered_s=0.9)
+UNSAFE = Outcome("stall: drive", Kind.STALL, True, violations=(Violation(0.7, "stop", "0.2 m/s: must stand"),))
+STUCK = Outcome("reset: compass", Kind.RESET, False, stuck=("compass",))
+
+
+def run(monkeypatch: pytest.MonkeyPatch, outcomes: tuple[Outcome, ...], *arguments: str) -> int:
+    def drill(self: Drill, **_: Any) -> Report:
+        return Report(self.seed, outcomes[: self.count])
+
+    monkeypatch.setattr(Drill, "run", drill)
+    monkeypatch.setattr(sys, "argv", ["monstertruckd", "drill", "--config", str(DEMO), *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_report_names_fault_reaction_time_way_and_score(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run(monkeypatch, (SAFE,), "--count", "1") == 0
+    out = capsys.readouterr().out
+    for word in ("stall: lidar", "stopped", "0.27", "0.56", "0.070", "0.90", "1 faults: 0 with unsafe motion"):
+        assert word in out
+
+
+@pytest.mark.parametrize(("outcome", "text"), [(UNSAFE, "must stand"), (STUCK, "not back: compass")])
+def test_what_is_unsafe_or_stuck_is_the_exit_code_and_a_line(
+    outcome: Outcome, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run(monkeypatch, (SAFE, outcome), "--count", "2") == 1
+    assert text in capsys.readouterr().out
+
+
+def test_json_holds_the_figures(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, (SAFE, UNSAFE), "--json", "--seed", "5") == 1
+    report = json.loads(capsys.readouterr().out)
+    assert (report["seed"], report["faults"], report["unsafe"]) == (5, 2, 1)
+    assert report["outcomes"][0]["fault"] == "stall: lidar"
+
+
+def test_the_default_truck_is_shipped():
+    assert command.FULL_CONFIG.exists()

@@ -1,0 +1,212 @@
+"""The habit all commands share: values, tables, progress and ends."""
+
+import fcntl
+import json
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.output import (
+    HELP_STYLE,
+    CommandGroup,
+    finish,
+    print_json,
+    print_table,
+    progress,
+    until_stopped,
+)
+from monstertruckd.tools.logs.listing import LogState, list_logs
+
+ROOT = Path(__file__).resolve().parents[4]
+
+
+def ending(command: Callable[[], None]) -> int:
+    """Exit code of a command line with this one command."""
+    line = typer.Typer(cls=CommandGroup)
+    line.callback()(lambda: None)
+    line.command("do")(command)
+    with pytest.raises(SystemExit) as ended:
+        line(["do"])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ConfigError("a.yaml:3: wrong"), 2),
+        (NotFoundError("no such robot"), 4),
+        (RequestRefusedError(Reason.OBSTACLE_STOP, "a wall"), 56),
+    ],
+)
+def test_an_error_is_one_sentence_and_its_reasons_code(
+    error: TruckError, code: int, capsys: pytest.CaptureFixture[str]
+):
+    def command() -> None:
+        raise error
+
+    assert ending(command) == code
+    streams = capsys.readouterr()
+    assert (streams.out, streams.err) == ("", f"{error}\n")
+
+
+def test_a_missing_package_is_one_sentence(capsys: pytest.CaptureFixture[str]):
+    def command() -> None:
+        import no_such_package  # noqa: F401
+
+    assert ending(command) == Reason.NOT_INSTALLED.exit_code
+    assert "no_such_package is not installed: an extra brings it" in capsys.readouterr().err
+
+
+def test_an_interrupt_gives_up_but_is_the_ordinary_end_of_what_runs_until_stopped():
+    def finite() -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    def endless() -> None:
+        async def main(clock: object) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            await clock.sleep(10.0)  # type: ignore[attr-defined]
+
+        until_stopped(main)
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert ending(finite) == Reason.CANCELLED.exit_code
+    assert ending(endless) == 0
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_sigterm_counts_where_ctrl_c_is_ignored():
+    """As for a job that a script starts in the background."""
+
+    def command() -> None:
+        async def main(clock: object) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            await clock.sleep(10.0)  # type: ignore[attr-defined]
+
+        until_stopped(main)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert ending(command) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_reader_that_leaves_is_no_failure():
+    read, write = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "monstertruckd", "topics"], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True
+    )
+    os.close(read)
+    os.close(write)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (0, "")
+
+
+def called(*arguments: str, **streams: Any) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "monstertruckd", *arguments]
+    return subprocess.run(command, cwd=ROOT, text=True, timeout=30, check=False, **streams)
+
+
+def test_help_and_usage_errors_are_bare_lines_in_pipes():
+    told = called("log", "--help", capture_output=True).stdout
+    assert told.isascii()
+    report = "Write one HTML page about a log: way, states, events, signals, health, losses."
+    assert f"  report   {report}\n" in told
+    refused = called("probe", capture_output=True)
+    assert refused.returncode == 2
+    assert refused.stderr.endswith("\nError: Missing argument 'device'.\n")
+
+
+def test_help_is_framed_on_a_terminal():
+    reader, terminal = pty.openpty()
+    try:
+        assert called("log", "--help", stdin=terminal, stdout=terminal, stderr=terminal).returncode == 0
+        assert "╭" in os.read(reader, 1 << 16).decode()
+    finally:
+        os.close(reader)
+        os.close(terminal)
+
+
+@pytest.mark.parametrize("columns", [70, 160])
+def test_help_has_the_width_of_the_terminal_it_stands_on(columns: int):
+    reader, terminal = pty.openpty()
+    try:
+        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        bare = {name: value for name, value in os.environ.items() if name not in {"COLUMNS", "LINES"}}
+        called("log", "--help", env=bare, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
+        lines = os.read(reader, 1 << 16).decode().splitlines()
+        assert max(map(len, lines)) <= columns
+        assert any(line.endswith("the first error is kept.") for line in lines) is (columns > 100)
+        assert lines[0].isascii()
+    finally:
+        os.close(reader)
+        os.close(terminal)
+
+
+def test_nothing_is_lost_without_a_standard_output(tmp_path: Path):
+    (tmp_path / "cut.mcap").write_bytes((ROOT / "tests/data/replay/level.mcap").read_bytes()[:-9])
+    command = f"exec {sys.executable} -m monstertruckd log recover {tmp_path}/cut.mcap >&-"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    (log,) = list_logs(tmp_path)
+    assert log.state is LogState.FINISHED
+
+
+def test_remarks_never_stand_among_results():
+    command = f"exec {sys.executable} -m monstertruckd log info --json nowhere.mcap 2>&-"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (Reason.NOT_FOUND.exit_code, "")
+
+
+def test_every_group_has_the_same_help():
+    def styles(command: Any) -> Iterator[str | None]:
+        yield command.rich_markup_mode
+        for inner in getattr(command, "commands", {}).values():
+            yield from styles(inner)
+
+    assert set(styles(typer.main.get_command(app))) == {HELP_STYLE}
+
+
+def test_finish_is_silent_about_success_only(capsys: pytest.CaptureFixture[str]):
+    finish(Reason.GOAL_REACHED)
+    with pytest.raises(typer.Exit) as ended:
+        finish(Reason.PATH_LOST)
+    assert ended.value.exit_code == Reason.PATH_LOST.exit_code
+    assert capsys.readouterr().err == f"{Reason.PATH_LOST.text}\n"
+
+
+def test_json_is_strict_whatever_it_is_made_of(capsys: pytest.CaptureFixture[str]):
+    print_json({"pose": Pose2D(x=1.0, y=2.0, yaw=0.5), "far": (float("inf"), 1.5), "why": Reason.OK, "at": Path("a/b")})
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == {"pose": {"x": 1.0, "y": 2.0, "yaw": 0.5}, "far": [None, 1.5], "why": "ok", "at": "a/b"}
+    print_json([1, 2], indent=None)
+    assert capsys.readouterr().out == "[1, 2]\n"
+
+
+def test_a_piped_table_is_a_line_for_each_row_whatever_its_width(capsys: pytest.CaptureFixture[str]):
+    print_table(("name", "Hz", "what"), [("a", "5", "word " * 60), ("long", "12.5", "")], right=("Hz",), title="seen")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "name    Hz  what"
+    assert lines[1].startswith("a        5  word word")
+    assert lines[2] == "long  12.5"
+    assert not any(line.endswith(" ") for line in lines)
+
+
+def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture[str]):
+    with progress("reading", total=10) as done:
+        done(5)
+    assert capsys.readouterr() == ("", "")

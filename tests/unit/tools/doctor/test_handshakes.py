@@ -1,0 +1,134 @@
+"""Handshakes with emulated devices, and none while a daemon has them."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from monstertruck_drivers.cable import MemoryPort
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import PortBusyError
+from monstertruck_runtime.threads import inline
+from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.computer import EmulatedComputer
+from monstertruck_sim.robot import SimulatedRobot
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.doctor import handshakes as module
+from monstertruckd.tools.doctor.finding import Finding, Level
+from monstertruckd.tools.doctor.handshakes import handshakes
+from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.unit.tools.doctor.kit import Ward, see
+from tests.unit.tools.install.kit import PROGRAM, ROOT
+
+FULL = ROOT / "configs" / "full.yaml"
+
+
+class Truck:
+    """All emulated devices of the full truck, each behind its port of the emulated computer."""
+
+    def __init__(self, folder: Path, clock: VirtualClock) -> None:
+        self.config = load_config(FULL, SimulatedTruckConfig)[0]
+        self.ports = {role: MemoryPort(role) for role in self.config.devices.present()}
+        self.computer = EmulatedComputer(folder, self.config.devices, self.ports, clock)
+        self.robot = SimulatedRobot(
+            self.config.sim,
+            self.config.devices,
+            self.config.monitors,
+            clock,
+            self.computer.ports,
+            self.computer.folder,
+            offload=inline,
+        )
+
+
+def shake(folder: Path, spoil: Callable[[Truck], None] = lambda _: None) -> dict[str, Finding]:
+    """Ask all devices but the camera, whose node only a kernel could open."""
+
+    async def main(clock: VirtualClock) -> dict[str, Finding]:
+        truck = Truck(folder, clock)
+        around = asyncio.create_task(truck.robot.run())
+        await clock.sleep(1.0)
+        spoil(truck)
+        blind = truck.config.model_copy(update={"devices": truck.config.devices.model_copy(update={"camera": None})})
+        patient = Patient(folder, truck.computer.computer(), PROGRAM, FULL, blind, None, None)
+        found = {finding.check: finding async for finding in handshakes(patient)}
+        around.cancel()
+        await asyncio.wait([around])
+        return found
+
+    return run_virtual(main)
+
+
+def test_every_device_answers(tmp_path: Path):
+    found = shake(tmp_path)
+    assert {finding.level for finding in found.values()} == {Level.OK}
+    assert sorted(name.split()[0] for name in found) == ["compass", "drive", "lidar", "stabiliser", "steering"]
+    assert found["lidar handshake"].seen == "Hokuyo URG-04LX laser scanner (SCIP 1.1 and 2.0) answers"
+
+
+def test_silence_and_absence(tmp_path: Path):
+    def spoil(truck: Truck) -> None:
+        truck.ports["drive"].device.faults.deaf = True
+        truck.computer.usb.unplug("1-2.1")
+
+    found = shake(tmp_path, spoil)
+    assert found["drive handshake"].reason is Reason.DEVICE_TIMEOUT
+    assert found["drive handshake"].mend is not None
+    assert " -m monstertruckd probe drive --port " in found["drive handshake"].mend
+    assert "lidar handshake" not in found, "the wiring tells of it"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("/opt/truck/.venv/bin/python", "-P", "-m", "monstertruckd", "run", "--config", "x"),
+        ("/usr/bin/python3", "/usr/local/bin/monstertruckd", "run", "-c", "x"),
+    ],
+)
+def test_nothing_is_asked_while_a_daemon_runs(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    async def never(*_: object) -> Finding:
+        raise AssertionError("a port of the daemon was touched")
+
+    monkeypatch.setattr(module, "_shake", never)
+    (found,) = see(tmp_path, handshakes, lambda ward: ward.process(4711, *words)).values()
+    assert found.level is Level.OK
+    assert found.seen == "not tried: the running daemon (process 4711) has the ports"
+    assert found.mend == "/opt/monstertruckd/.venv/bin/python -m monstertruckd status --once"
+
+
+def test_other_processes_are_no_daemon(tmp_path: Path):
+    def others(ward: Ward) -> None:
+        ward.process(1, "/sbin/init")
+        ward.process(2, "python", "-m", "monstertruckd", "doctor")
+        ward.put("proc/3/cmdline")
+
+    def check(patient: Patient) -> list[Finding]:
+        assert patient.daemon() is None
+        return []
+
+    see(tmp_path, check, others)
+
+
+def test_a_port_that_another_program_holds(tmp_path: Path):
+    class Held:
+        name = "held"
+
+        async def open(self) -> None:
+            raise PortBusyError("held: held by another process")
+
+    def held(ward: Ward) -> None:
+        machine = replace(ward.patient.computer.machine, serial=lambda *_: Held())
+        assert ward.patient.config is not None
+        devices = ward.patient.config.devices
+        only = devices.model_copy(update=dict.fromkeys(set(devices.present()) - {"steering"}))
+        config = ward.patient.config.model_copy(update={"devices": only})
+        computer = replace(ward.patient.computer, machine=machine)
+        ward.patient = replace(ward.patient, config=config, computer=computer)
+
+    (found,) = see(tmp_path, handshakes, held).values()
+    assert found.reason is Reason.DEVICE_BUSY
+    assert found.mend is not None
+    assert found.mend.startswith("sudo fuser -v ")

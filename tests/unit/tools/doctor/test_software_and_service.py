@@ -1,0 +1,166 @@
+"""Python, packages, configuration, the service's files and rights."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.doctor.accounts import Account, account_of
+from monstertruckd.tools.doctor.finding import Level
+from monstertruckd.tools.doctor.patient import Patient, admit
+from monstertruckd.tools.doctor.service import rights, rules, service
+from monstertruckd.tools.doctor.software import configuration, packages, python
+from monstertruckd.tools.install.plan import RULES, UNIT
+from tests.unit.tools.doctor.kit import Ward, bad, see
+from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
+
+REQUIRES = [
+    "numpy>=2",
+    'mcap>=1.3; extra == "robot"',
+    'rerun-sdk; extra == "view"',
+    'monstertruckd[logs]; extra == "view"',
+]
+INSTALL = f"sudo /opt/monstertruckd/.venv/bin/python -m monstertruckd install-service --config {TRUCK}"
+
+
+def without(*absent: str):
+    def spoil(ward: Ward) -> None:
+        ward.patient = replace(ward.patient, versions=lambda name: None if name in absent else "1.0")
+
+    return spoil
+
+
+def test_a_processor_without_wheels_is_told(tmp_path: Path):
+    assert bad(see(tmp_path / "a", lambda patient: python(patient, "x86_64"))) == {}
+    found = see(tmp_path / "b", lambda patient: python(patient, "armv7l"))["python"]
+    assert (found.level, found.reason) == (Level.WARN, Reason.NOT_SUPPORTED)
+
+
+def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
+    def check(patient: Patient):
+        return packages(patient, REQUIRES)
+
+    found = see(tmp_path / "a", check, without("rerun-sdk"))
+    assert bad(found) == {}
+    assert found["extras"].seen == "installed: none; incomplete: view (rerun-sdk)"
+    lacking = see(tmp_path / "b", check, without("mcap", "numpy"))["packages"]
+    assert lacking.reason is Reason.NOT_INSTALLED
+    assert lacking.seen == "missing: numpy, mcap"
+    assert lacking.mend == "/opt/monstertruckd/.venv/bin/python -m pip install 'monstertruckd[robot]'"
+
+    def in_a_checkout(ward: Ward) -> None:
+        without("mcap")(ward)
+        program = replace(ward.patient.program, neutral=ROOT / "systemd" / "neutral.py")
+        ward.patient = replace(ward.patient, program=program)
+
+    mend = see(tmp_path / "c", check, in_a_checkout)["packages"].mend
+    assert mend == f"cd {ROOT} && python3 -m monstertruckd.bootstrap sync"
+
+
+def test_the_configuration_is_the_named_one_else_the_services(tmp_path: Path):
+    def admitted(ward: Ward) -> None:
+        ward.patient = admit(ward.folder, PROGRAM, None, 0, ward.clock)
+
+    found = see(tmp_path / "a", configuration, admitted)["config"]
+    assert found.level is Level.OK
+    assert found.seen == str(tmp_path / "a/etc/monstertruckd/truck.yaml")
+
+    def refused(ward: Ward) -> None:
+        ward.put("etc/monstertruckd/truck.yaml", "version: 1\ndevices: {}\nspeed: 9\n")
+        admitted(ward)
+
+    found = see(tmp_path / "b", configuration, refused)["config"]
+    assert found.reason is Reason.BAD_CONFIG
+    assert "truck.yaml:3: speed: unknown key" in found.seen
+    assert found.mend is not None
+    assert " config show " in found.mend
+
+    def nothing(ward: Ward) -> None:
+        ward.patient = admit(ward.folder / "nowhere", PROGRAM, None, 0, ward.clock)
+
+    found = see(tmp_path / "c", configuration, nothing)["config"]
+    assert (found.level, found.reason) == (Level.WARN, Reason.NOT_FOUND)
+
+
+def test_the_service_as_installed_now(tmp_path: Path):
+    assert bad(see(tmp_path / "a", service)) == {}
+
+    def gone(ward: Ward) -> None:
+        (ward.folder / UNIT.relative_to("/")).unlink()
+
+    found = see(tmp_path / "b", service, gone)["service"]
+    assert (found.level, found.reason, found.mend) == (Level.WARN, Reason.NOT_INSTALLED, INSTALL)
+
+    def old(ward: Ward) -> None:
+        ward.put(str(UNIT.relative_to("/")), "[Service]\nUser=monstertruckd\n")
+
+    found = see(tmp_path / "c", service, old)["service"]
+    assert found.seen == "installed, but other than it would be now: monstertruckd.service"
+    assert found.mend == INSTALL
+
+
+def test_what_systemd_says_of_it(tmp_path: Path):
+    def saying(said: str):
+        return lambda ward: ward.runs(systemctl=(0, said))
+
+    assert see(tmp_path / "a", service, saying("ActiveState=active\nNRestarts=0"))["service runs"].seen == "active"
+    found = see(tmp_path / "b", service, saying("ActiveState=active\nNRestarts=7"))["service runs"]
+    assert (found.level, found.seen) == (Level.WARN, "active, 7 restarts")
+    found = see(tmp_path / "c", service, saying("ActiveState=failed\nNRestarts=2"))["service runs"]
+    assert (found.level, found.reason) == (Level.FAIL, Reason.SERVICE_FAILED)
+    assert found.mend == "journalctl -u monstertruckd.service -e"
+
+
+def test_rules_that_are_missing_or_old(tmp_path: Path):
+    place = str(RULES.relative_to("/"))
+    assert bad(see(tmp_path / "a", rules)) == {}
+    missing = see(tmp_path / "b", rules, lambda ward: (ward.folder / place).unlink())["udev rules"]
+    assert (missing.reason, missing.mend) == (Reason.NOT_INSTALLED, INSTALL)
+    old = see(tmp_path / "c", rules, lambda ward: (ward.put(place, "# of yesterday\n"), None)[1])["udev rules"]
+    assert old.seen.endswith("is older than the config")
+
+
+def test_modem_manager_is_harmless_once_told(tmp_path: Path):
+    def running(ward: Ward) -> None:
+        ward.process(77, "/usr/sbin/ModemManager")
+
+    def untold(ward: Ward) -> None:
+        running(ward)
+        (ward.folder / RULES.relative_to("/")).unlink()
+
+    assert see(tmp_path / "a", rules)["ModemManager"].seen == "does not run"
+    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and is told to keep off"
+    assert see(tmp_path / "c", rules, untold)["ModemManager"].level is Level.WARN
+
+
+def test_rights_of_the_services_user(tmp_path: Path):
+    assert bad(see(tmp_path / "a", rights)) == {}
+
+    def outsider(ward: Ward) -> None:
+        ward.patient = replace(ward.patient, account=Account("pi", 64_998, {"pi": 64_998}))
+
+    found = bad(see(tmp_path / "b", rights, outsider))
+    assert found["user"].mend == "sudo usermod -aG dialout,video pi"
+    assert found["lidar rights"].reason is Reason.NOT_PERMITTED
+    assert found["lidar rights"].mend == "sudo usermod -aG dialout,video pi"
+    assert found["logs"].reason is Reason.RECORDING_FAILED
+
+    def locked(ward: Ward) -> None:
+        (ward.folder / "dev" / "ttyUSB0").chmod(0o600)
+
+    (found,) = bad(see(tmp_path / "c", rights, locked)).values()
+    node = tmp_path / "c/dev/ttyUSB0"
+    assert found.mend == f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
+
+    def nobody(ward: Ward) -> None:
+        ward.patient = replace(ward.patient, account=None)
+
+    assert see(tmp_path / "d", rights, nobody)["user"].seen == "the service's user does not exist"
+
+
+def test_accounts_are_read_from_the_systems_own_files(tmp_path: Path):
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc/passwd").write_text("root:x:0:0::/root:/bin/sh\npi:x:1000:1000::/home/pi:/bin/sh\n")
+    (tmp_path / "etc/group").write_text("root:x:0:\npi:x:1000:\ndialout:x:20:anna,pi\nvideo:x:44:anna\nbroken\n")
+    pi = Account("pi", 1000, {"pi": 1000, "dialout": 20})
+    assert account_of(tmp_path, "pi") == account_of(tmp_path, 1000) == pi
+    assert account_of(tmp_path, "eva") is None

@@ -1,0 +1,213 @@
+"""Installing and taking out: twice is once, nothing of the operator's is lost, the system is told once."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.errors import CommandFailedError, ConfigError, NotFoundError, NotPermittedError
+from monstertruckd.tools.install import apply
+from monstertruckd.tools.install.apply import Change, Report, install, run_command, uninstall
+from monstertruckd.tools.install.configuration import files_of
+from monstertruckd.tools.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
+from tests.unit.tools.install.kit import ROOT, TRUCK, settings, truck_plan
+
+
+def tree(root: Path) -> dict[str, str]:
+    """Every file and link below ``root`` with what it says."""
+    return {
+        str(path.relative_to(root)): str(path.readlink()) if path.is_symlink() else path.read_text()
+        for path in sorted(root.rglob("*"))
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def test_everything_is_where_systemd_and_udev_look(tmp_path: Path):
+    report = install(truck_plan(tmp_path), tmp_path)
+    assert set(report.changes.values()) == {Change.NEW}
+    assert report.commands == [], "a system elsewhere is only written"
+    assert list(tree(tmp_path)) == [
+        "etc/modules-load.d/monstertruckd.conf",
+        "etc/monstertruckd/parts/chassis.yaml",
+        "etc/monstertruckd/truck.yaml",
+        "etc/systemd/system/monstertruckd.service",
+        "etc/systemd/system/multi-user.target.wants/monstertruckd.service",
+        "etc/sysusers.d/monstertruckd.conf",
+        "etc/tmpfiles.d/monstertruckd.conf",
+        "etc/udev/rules.d/70-monstertruckd.rules",
+    ]
+    assert tree(tmp_path)["etc/monstertruckd/truck.yaml"] == TRUCK.read_text()
+    assert (tmp_path / "etc/systemd/system/monstertruckd.service").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("config", [TRUCK, None], ids=["the same", "the installed"])
+def test_the_second_time_nothing_changes(config: Path | None, tmp_path: Path):
+    install(truck_plan(tmp_path), tmp_path)
+    before = tree(tmp_path)
+    report = install(truck_plan(tmp_path, config), tmp_path)
+    assert not report.changed
+    assert tree(tmp_path) == before
+
+
+def test_the_user_of_the_installed_unit_stays_until_another_is_named(tmp_path: Path):
+    unit = tmp_path / "etc/systemd/system/monstertruckd.service"
+    for user, found in ((None, "monstertruckd"), ("pi", "pi"), (None, "pi"), ("truck", "truck")):
+        install(truck_plan(tmp_path, user=user), tmp_path)
+        assert settings(unit.read_text())["User"] == [found]
+
+
+def test_the_second_time_the_configuration_may_have_any_name(tmp_path: Path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(f"version: 1\ninclude: {TRUCK}\n")
+    root = tmp_path / "root"
+    install(truck_plan(root, mine), root)
+    assert not install(truck_plan(root, None), root).changed
+    (root / "etc/monstertruckd/truck.yaml").write_text("not the one\n")
+    assert not install(truck_plan(root, None), root).changed
+
+    (root / "etc/monstertruckd/mine.yaml").unlink()
+    with pytest.raises(NotFoundError, match=r"etc/monstertruckd/mine.yaml: no configuration is installed"):
+        truck_plan(root, None)
+
+
+def test_an_edited_configuration_is_kept_beside_and_its_change_reaches_the_rules(tmp_path: Path):
+    install(truck_plan(tmp_path), tmp_path)
+    installed = tmp_path / "etc/monstertruckd/truck.yaml"
+    edited = installed.read_text().replace('hub: "1-2", port: 1', 'hub: "1-2", port: 4')
+    installed.write_text(edited)
+    report = install(truck_plan(tmp_path, None), tmp_path)
+    changed = [path.name for path, change in report.changes.items() if change is not Change.SAME]
+    assert changed == ["70-monstertruckd.rules"]
+    assert 'KERNELS=="1-2.4:*.0"' in (tmp_path / "etc/udev/rules.d/70-monstertruckd.rules").read_text()
+    assert installed.read_text() == edited
+
+    report = install(truck_plan(tmp_path, TRUCK), tmp_path)
+    assert report.previous == [Path("/etc/monstertruckd/truck.yaml~")]
+    assert (tmp_path / "etc/monstertruckd/truck.yaml~").read_text() == edited
+    assert installed.read_text() == TRUCK.read_text()
+
+
+def test_a_dry_run_tells_the_same_and_does_nothing(tmp_path: Path):
+    said = install(truck_plan(tmp_path), tmp_path, dry=True)
+    assert tree(tmp_path) == {}
+    assert install(truck_plan(tmp_path), tmp_path) == said
+    before = tree(tmp_path)
+    said = uninstall(tmp_path, dry=True)
+    assert tree(tmp_path) == before
+    assert uninstall(tmp_path) == said
+
+
+def test_taking_out_leaves_the_configuration_and_may_be_repeated(tmp_path: Path):
+    install(truck_plan(tmp_path), tmp_path)
+    report = uninstall(tmp_path)
+    assert set(report.changes.values()) == {Change.REMOVED}
+    assert list(tree(tmp_path)) == ["etc/monstertruckd/parts/chassis.yaml", "etc/monstertruckd/truck.yaml"]
+    assert not uninstall(tmp_path).changed
+
+
+class Here:
+    """Makes a folder stand for this system, and keeps the programs that were run; ``fails`` is the one that fails."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.ran: list[tuple[str, ...]] = []
+        self.fails: str | None = None
+        monkeypatch.setattr(apply, "below", lambda _, path: folder / path.relative_to("/"))
+        (folder / "run/systemd/system").mkdir(parents=True)
+
+    def __call__(self, arguments: Sequence[str]) -> None:
+        self.ran.append(tuple(arguments))
+        if self.fails is not None and self.fails in arguments:
+            raise CommandFailedError(f"{arguments[0]}: no")
+
+    def install(self) -> Report:
+        return install(truck_plan(Path("/")), Path("/"), run=self)
+
+
+def test_the_running_system_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    here = Here(tmp_path, monkeypatch)
+    assert here.install().commands == list(AFTER_INSTALL)
+    assert here.ran == list(AFTER_INSTALL)
+    assert not here.install().changed
+    assert here.ran == list(AFTER_INSTALL)
+    here.ran.clear()
+    assert uninstall(Path("/"), run=here).changed
+    assert here.ran == [*BEFORE_REMOVAL, *AFTER_REMOVAL]
+
+
+def test_a_system_that_does_not_run_is_only_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    here = Here(tmp_path, monkeypatch)
+    (tmp_path / "run/systemd/system").rmdir()
+    assert here.install().commands == []
+    assert uninstall(Path("/"), run=here).changed
+    assert here.ran == []
+
+
+def test_an_installation_that_broke_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    here = Here(tmp_path, monkeypatch)
+    here.fails = "systemd-tmpfiles"
+    with pytest.raises(CommandFailedError):
+        here.install()
+    here.fails = None
+    here.ran.clear()
+    assert here.install().changed
+    assert here.ran == list(AFTER_INSTALL), "the files are all there, but nobody was told of them"
+    assert not here.install().changed
+
+
+def test_nothing_is_told_by_a_shell_or_over_the_network():
+    programs = {command[0] for command in (*AFTER_INSTALL, *BEFORE_REMOVAL, *AFTER_REMOVAL)}
+    assert programs == {"systemctl", "systemd-sysusers", "systemd-tmpfiles", "udevadm"}
+
+
+def test_what_a_program_says_becomes_the_error():
+    with pytest.raises(CommandFailedError, match=r"ls /nowhere: .*No such file"):
+        run_command(["ls", "/nowhere"])
+    with pytest.raises(NotFoundError, match="no-such-program: no such program; a service needs systemd"):
+        run_command(["no-such-program"])
+
+
+def test_who_may_not_write_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(path: Path, _: str, **_options: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(apply, "replace_file", refuse)
+    with pytest.raises(NotPermittedError, match=r"/etc/monstertruckd/truck.yaml: Permission denied"):
+        install(truck_plan(tmp_path), tmp_path)
+
+
+def test_a_simulated_truck_is_no_service(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"demo.yaml: sim: is a simulated truck"):
+        truck_plan(tmp_path, ROOT / "configs" / "demo.yaml")
+
+
+def test_without_any_configuration_it_asks_for_one(tmp_path: Path):
+    with pytest.raises(NotFoundError, match="name the truck's with --config FILE"):
+        truck_plan(tmp_path, None)
+
+
+def test_files_of_a_configuration_keep_their_places(tmp_path: Path):
+    (tmp_path / "robots").mkdir()
+    main = tmp_path / "robots" / "mine.yaml"
+    main.write_text("include: [../parts/a.yaml, /elsewhere.yaml]\npath: {file: ../lap.csv}\n")
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "a.yaml").write_text("version: 1\npath: {file: /absolute.csv}\n")
+    (tmp_path / "lap.csv").touch()
+    assert [str(place) for place in files_of(main)] == ["robots/mine.yaml", "parts/a.yaml", "lap.csv"]
+
+
+@pytest.mark.skipif(shutil.which("systemd-sysusers") is None or os.geteuid() != 0, reason="needs systemd and root")
+def test_systemd_makes_the_user_and_the_folders(tmp_path: Path):
+    install(truck_plan(tmp_path), tmp_path)
+    for program in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
+        kind = "sysusers.d" if len(program) == 1 else "tmpfiles.d"
+        file = str(tmp_path / "etc" / kind / "monstertruckd.conf")
+        subprocess.run(
+            [program[0], f"--root={tmp_path}", *program[1:], file], check=True, capture_output=True, timeout=30
+        )
+    groups = dict(line.split(":", 1) for line in (tmp_path / "etc/group").read_text().splitlines())
+    assert groups["dialout"].endswith(":monstertruckd")
+    assert groups["video"].endswith(":monstertruckd")
+    assert (tmp_path / "var/lib/monstertruckd").stat().st_mode & 0o777 == 0o750
