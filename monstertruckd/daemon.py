@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from monstertruck_drivers.computer import Computer
-from monstertruck_drivers.config import SHAFTS
 from monstertruck_drivers.link import Port
 from monstertruck_planners.goals import rpc as goal_rpc
 from monstertruck_planners.goals.service import GoalService
@@ -33,6 +32,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
+from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.assembly.cabling import Cabling

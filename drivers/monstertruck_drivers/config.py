@@ -1,7 +1,7 @@
 """Which devices a robot has, where they hang, and how they are set: the sections ``devices`` and ``monitors``."""
 
 from pathlib import Path
-from typing import Annotated, Any, Final, Generic, Self, TypeVar
+from typing import Annotated, Any, Generic, Self, TypeVar
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -19,9 +19,7 @@ from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
-
-SHAFTS: Final = ("drive", "drive_2", "drive_3", "drive_4")
-"""Roles of the driven shafts' controllers, in the order of the body's shafts."""
+from monstertruck_schemas.roles import SHAFTS
 
 C = TypeVar("C", bound=Schema)
 

@@ -14,7 +14,7 @@ from monstertruck_drivers.base import Emulator
 from monstertruck_drivers.battery.emulator import IioEmulator
 from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.cable import EmulatedPort
-from monstertruck_drivers.config import SHAFTS, Devices, Monitors
+from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, RecordedRanges
@@ -25,11 +25,12 @@ from monstertruck_drivers.os4000.emulator import Os4000Emulator
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_schemas.roles import SHAFTS
 from monstertruck_sim.config import SimConfig
 from monstertruck_sim.console import FileEmulator
 from monstertruck_sim.world.world import World
 
-LINE_BAUD = {**dict.fromkeys(SHAFTS, 38400), "stabiliser": BAUD}
+LINE_BAUD: dict[str, int] = {**dict.fromkeys(SHAFTS, 38400), "stabiliser": BAUD}
 """Serial lines whose speed is felt; the others are USB from end to end, or have a byte now and then."""
 
 

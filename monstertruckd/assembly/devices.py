@@ -7,7 +7,6 @@ from monstertruck_drivers.battery.driver import IioBatteryDriver
 from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.catalog import BY_NAME
 from monstertruck_drivers.computer import Computer
-from monstertruck_drivers.config import SHAFTS
 from monstertruck_drivers.host_health.driver import HostHealthDriver
 from monstertruck_drivers.link_quality.driver import LinkQualityDriver
 from monstertruck_estimation.scan_tilt import TiltStamper
@@ -16,6 +15,7 @@ from monstertruck_runtime.mailbox import Delivery, latest
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
+from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Writer
 from monstertruckd.assembly.cabling import Cabling

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_drivers.config import SHAFTS, Devices, Monitors
+from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.fusion.config import AnyOdometry
@@ -19,6 +19,7 @@ from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import BodyConfig, TruckBody
+from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig

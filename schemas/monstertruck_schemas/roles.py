@@ -1,0 +1,28 @@
+"""Names of the devices that the rest of the robot knows by what they are for."""
+
+from enum import StrEnum
+from typing import Final
+
+
+class DeviceRole(StrEnum):
+    """What a device is for: its key in the configuration, the name of its service, the frame it measures in.
+
+    Roles of devices from other packages are names of their own; nothing in the daemon asks for them by name.
+    """
+
+    LIDAR = "lidar"
+    DRIVE = "drive"
+    DRIVE_2 = "drive_2"
+    DRIVE_3 = "drive_3"
+    DRIVE_4 = "drive_4"
+    STEERING = "steering"
+    COMPASS = "compass"
+    STABILISER = "stabiliser"
+    CAMERA = "camera"
+    BATTERY = "battery"
+    LINK = "link"
+    HOST = "host"
+
+
+SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
+"""Controllers of the driven shafts, in the order of the body's shafts."""
