@@ -37,7 +37,7 @@ from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
-from monstertruckd.tools.simulation.operator import MOVING, drive_lap
+from monstertruckd.tools.simulation.operator import drive_lap
 
 HERE = Path(__file__).resolve().parent
 FULL = HERE.parent / "configs" / "full.yaml"
@@ -108,7 +108,7 @@ async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bo
         drives.stops += [reason.value for reason in lap.interruptions]
     with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.STOP, latest()) as stop:
         while True:
-            if gate.latest is not None and gate.latest.mode not in MOVING:
+            if gate.latest is not None and not gate.latest.mode.active:
                 if drives.states:
                     drives.stops.append("unknown" if stop.latest is None else stop.latest.reason.value)
                 await client.order(Order.ARM)

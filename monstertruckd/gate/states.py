@@ -9,8 +9,6 @@ from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.events import EventLog
 from monstertruckd.gate.sources import Key, Source
 
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
-
 MEANS: Final = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
 """What a state itself means for driving."""
 
@@ -39,7 +37,7 @@ class States:
     @property
     def active(self) -> bool:
         """Whether the truck is armed, drives, or is being stopped."""
-        return self.mode in ACTIVE
+        return self.mode.active
 
     @property
     def reasons(self) -> tuple[Reason, ...]:

@@ -95,6 +95,16 @@ class GateMode(StrEnum):
     STOPPING = "stopping"
     ESTOPPED = "estopped"
 
+    @property
+    def active(self) -> bool:
+        """Whether the truck is armed, drives or is being stopped: it may move."""
+        return self in (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the truck drives or is being stopped."""
+        return self in (GateMode.DRIVING, GateMode.STOPPING)
+
 
 class GateState(Message):
     """The safety gate: who drives, what limits apply and why. Retained; also acknowledges requests."""

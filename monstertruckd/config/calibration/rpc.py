@@ -54,7 +54,7 @@ def register(
         return {"file": str(path)}
 
     def at_rest() -> None:
-        if mode() not in (GateMode.DISARMED, GateMode.ESTOPPED):
+        if mode().active:
             raise RequestRefusedError(
                 Reason.BUSY, f"the truck is {mode()}: calibrations are written while it is disarmed"
             )

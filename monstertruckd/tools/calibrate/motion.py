@@ -41,7 +41,6 @@ AT_REST: Final = 0.5
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
-CLOSED: Final = frozenset({GateMode.DISARMED, GateMode.ESTOPPED})
 
 
 class Truck(Protocol):
@@ -169,7 +168,7 @@ class _Run:
                 raise NoAnswerError(f"the gate does not tell its state within {ARMING:g} s")
             await self._clock.sleep(PERIOD)
             self._take()
-        if self.state.mode not in CLOSED:
+        if self.state.mode.active:
             holder = f", {self.state.holder} drives" if self.state.holder else ""
             raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
 
@@ -197,7 +196,7 @@ class _Run:
     async def disarmed(self) -> None:
         """Wait until the gate has done so: the state that says DRIVING shall not be taken for the next move's."""
         end = self._clock.now() + round(ARMING * SECOND)
-        while self.state is None or self.state.mode not in CLOSED:
+        while self.state is None or self.state.mode.active:
             if self._clock.now() > end:
                 raise NoAnswerError(f"the gate does not tell within {ARMING:g} s that it disarmed the truck")
             await self._clock.sleep(PERIOD)

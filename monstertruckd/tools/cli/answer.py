@@ -15,10 +15,9 @@ from monstertruck_schemas.topics import EVENT, GATE, Topic
 
 M = TypeVar("M", bound=Message)
 
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 FULFILLED: Final = {
-    Order.ARM: ACTIVE,
-    Order.DISARM: frozenset({GateMode.DISARMED, GateMode.ESTOPPED}),
+    Order.ARM: frozenset(mode for mode in GateMode if mode.active),
+    Order.DISARM: frozenset(mode for mode in GateMode if not mode.active),
     Order.ESTOP: frozenset({GateMode.ESTOPPED}),
     Order.RESET: frozenset(GateMode) - {GateMode.ESTOPPED},
 }

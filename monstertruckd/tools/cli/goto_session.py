@@ -15,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder, Order
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER, Topic
-from monstertruckd.tools.cli.answer import ACTIVE, give
+from monstertruckd.tools.cli.answer import give
 from monstertruckd.tools.cli.output import progress, remark
 
 M = TypeVar("M", bound=Message)
@@ -190,7 +190,7 @@ async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock) -> None:
     while True:
         await clock.sleep(2 * LOOK)
         state = gate.latest
-        if state is None or state.mode in ACTIVE:
+        if state is None or state.mode.active:
             said = ""
             continue
         why = ", ".join(reason.text for reason in state.reasons) or state.mode.value

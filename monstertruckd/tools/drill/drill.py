@@ -27,7 +27,7 @@ from monstertruck_sim.faults import Fault, Kind, Menu, Site, happen
 from monstertruckd.tools.drill.observer import STOPS_WITHIN, Observer, Violation
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.operator import MOVING, LocalOperator
+from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.rig import VirtualRig
 
 LEG: Final = 25
@@ -347,7 +347,7 @@ class _Truck:
         while self.rig.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
-            if order is not None and self._state.latest is not None and self._state.latest.mode not in MOVING:
+            if order is not None and self._state.latest is not None and not self._state.latest.mode.active:
                 await self._order(order)
             await self.rig.clock.sleep(0.02)
         return condition()

@@ -23,7 +23,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.drill.scenario import AT_REST, SENSORS, Expect, Reaction, Scenario, Stage, Station
 from monstertruckd.tools.drill.wire import WireTap, stop_bytes, written
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.operator import MOVING, LocalOperator
+from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.rig import VirtualRig
 
 PATIENCE: Final = 10.0
@@ -94,7 +94,7 @@ class _Drill:
     async def drive(self) -> None:
         """Arm and come to speed."""
         self.station.silent = True  # nobody may arm with a deflected stick
-        await self._until(lambda: self.gate[-1].mode in MOVING, "the truck to be armed", Order.ARM)
+        await self._until(lambda: self.gate[-1].mode.active, "the truck to be armed", Order.ARM)
         self.station.silent = not self.scenario.by_station
         await self._until(self.moving, "the truck to drive")
 
@@ -132,7 +132,7 @@ class _Drill:
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
-            if order is not None and self.gate and self.gate[-1].mode not in MOVING:
+            if order is not None and self.gate and not self.gate[-1].mode.active:
                 await self.operator.order(order)
             await self.clock.sleep(0.02)
         return condition()

@@ -13,13 +13,11 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Role
-from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
 from monstertruckd.bus.local import Bus
 
 M = TypeVar("M", bound=Message)
-
-MOVING = (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
 
 INTERRUPTIONS = 20
 """Times in a lap that the truck is armed again after a stop; more are a fault, not a busy computer."""
@@ -132,7 +130,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
                         told = (np.array(cross_track), tuple(interruptions))
                         return Lap(report.outcome, start, report.stamp, *told)
                     state = gate.latest
-                    if state is not None and state.mode not in MOVING and len(interruptions) < INTERRUPTIONS:
+                    if state is not None and not state.mode.active and len(interruptions) < INTERRUPTIONS:
                         interruptions.append(stop.latest.reason if stop.latest is not None else Reason.DISARMED)
                         await _arm(operator, clock, gate, patience)
         except TimeoutError:
@@ -145,7 +143,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
 async def _arm(operator: Operator, clock: Clock, gate: Mailbox[GateState], patience: float) -> None:
     try:
         async with clock.deadline(patience):
-            while gate.latest is None or gate.latest.mode not in MOVING:
+            while gate.latest is None or not gate.latest.mode.active:
                 await operator.order(Order.ARM)
                 await clock.sleep(0.25)
     except TimeoutError:

@@ -13,11 +13,9 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.state import GateMode
 
 Array = NDArray[np.float64]
 
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 SOURCE: Final = "goals"
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
@@ -108,7 +106,7 @@ class Lead:
     def stand_still(self) -> None:
         """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
         gate, now = self._in.gate.latest, self._clock.now()
-        if self.driving or gate is None or gate.mode not in ACTIVE:
+        if self.driving or gate is None or not gate.mode.active:
             return
         self._out.wish.put(
             DriveRequest(

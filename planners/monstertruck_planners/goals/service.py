@@ -12,7 +12,7 @@ from monstertruck_planners.goals import mission as machine
 from monstertruck_planners.goals.deform import Deformation, told_of
 from monstertruck_planners.goals.escape import placed
 from monstertruck_planners.goals.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup
-from monstertruck_planners.goals.lead import ACTIVE, AT_REST, Lead
+from monstertruck_planners.goals.lead import AT_REST, Lead
 from monstertruck_planners.goals.lookout import blocked, way_ahead
 from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
 from monstertruck_planners.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
@@ -196,7 +196,7 @@ class GoalService:
         along = 0.0 if report is None else report.along
         return Facts(
             now=now / SECOND,
-            armed=gate is not None and gate.mode in ACTIVE and odometry is not None,
+            armed=gate is not None and gate.mode.active and odometry is not None,
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
             pose=None if odometry is None else pose_of(odometry),
             answer=answer,

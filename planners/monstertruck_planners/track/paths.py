@@ -2,7 +2,6 @@
 
 import csv
 from pathlib import Path as FilePath
-from typing import Final
 
 import numpy as np
 
@@ -15,11 +14,10 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
-from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.state import GateState
 
 HEADER = ["x", "y", "yaw", "direction"]
 
-MOVING: Final = frozenset({GateMode.DRIVING, GateMode.STOPPING})
 """Modes in which the path stays as it is."""
 
 
@@ -127,7 +125,7 @@ class PathService:
         reason = refusal(request, gate, self._sequences, self._clock.now(), self._max_age)
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
-        if gate is not None and gate.mode in MOVING:
+        if gate is not None and gate.mode.moving:
             raise RequestRefusedError(Reason.BUSY, f"the truck is {gate.mode}, stop it first")
         check_path(request.path)
 

@@ -24,10 +24,9 @@ from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.sensor import Attitude, LaserScan
-from monstertruck_schemas.state import GateMode, GateState, Odometry
+from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
-ACTIVE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING})
 """Modes of the gate in which the tracker asks for motion."""
 
 LOOKS: Final = 8
@@ -128,7 +127,7 @@ class TrackerService:
         pose, path, gate = self._pose.latest, self._path.latest, self._gate.latest
         if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
             return  # silent: its lease runs out
-        if self._choose_line(path, pose, armed=gate.mode in ACTIVE) and len(path.poses) > LONG:
+        if self._choose_line(path, pose, armed=gate.mode.active) and len(path.poses) > LONG:
             yield
         if self._line is None:
             return
@@ -143,7 +142,7 @@ class TrackerService:
             text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, text)
             return
-        if gate.mode in ACTIVE:
+        if gate.mode.active:
             self._progress = command.progress
             if command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST:
                 self._ask(command, gate, now)
