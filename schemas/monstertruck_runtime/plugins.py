@@ -1,0 +1,194 @@
+"""Plug-ins: what a ``kind`` in the configuration stands for, from this repository or from another distribution.
+
+A catalog has one ``Plugin`` row per kind. The settings model is light: it is loaded to check a configuration. The
+implementation is loaded on use, so that listing kinds, ``--help`` and a check of a configuration stay cheap. Other
+distributions add rows through entry points, each of which names a ``Plugin``::
+
+    [project.entry-points."monstertruck.trackers"]
+    mine = "my_package.plugin:MINE"
+"""
+
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Generic, Literal, TypeVar, cast, get_args, get_origin
+
+from pydantic import BaseModel, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.entry_points import Broken, Extended, extended
+
+
+def load(place: str) -> Any:
+    """The object at ``module:name``.
+
+    Raises:
+        ImportError: there is no such module, or it needs one that is not installed.
+        AttributeError: the module has no such name.
+    """
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plugin:
+    """One kind of something that a configuration can choose; a catalog may use a subclass with more columns."""
+
+    name: str
+    """The ``kind`` in a configuration."""
+    settings: str
+    """Place ``module:Class`` of its settings, a ``Schema`` with ``kind: Literal[name]``."""
+    implementation: str
+    """Place ``module:Class`` of what does the work; the catalog's user says what it is called with."""
+    doc: str
+    """One line for lists."""
+    extra: str | None = None
+    """Extra of the distribution without which the implementation does not load."""
+
+    def settings_class(self) -> type[Schema]:
+        """Model of its section in the configuration; loads its module."""
+        return cast("type[Schema]", load(self.settings))
+
+    def implementation_class(self) -> Any:
+        """What does the work; loads its module.
+
+        Raises:
+            InputError: it does not load.
+        """
+        try:
+            return load(self.implementation)
+        except (ImportError, AttributeError) as error:
+            needs = "" if self.extra is None else f"needs the extra [{self.extra}]: "
+            raise InputError(f"kind {self.name}: {needs}{error}") from error
+
+
+P = TypeVar("P", bound=Plugin)
+
+
+class Catalog(Mapping[str, P], Generic[P]):
+    """All plug-ins of one group by kind: ours in the order given, then those of other distributions.
+
+    Entry points and settings models are read on first use, once.
+
+    Args:
+        group: of the entry points.
+        rows: ours; their class is what other distributions have to give.
+    """
+
+    def __init__(self, group: str, *rows: P) -> None:
+        self.group = group
+        self._ours = {row.name: row for row in rows}
+        self._row_class = type(rows[0])
+
+    @cached_property
+    def _all(self) -> Extended[P]:
+        return extended(self.group, self._ours, self._fault)
+
+    def _fault(self, name: str, row: Any) -> str | None:
+        """What is wrong with a row of another distribution."""
+        if not isinstance(row, self._row_class):
+            return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
+        if row.name != name:
+            return f"the entry point is called {name}, its plug-in {row.name}"
+        model: Any = row.settings_class()
+        if not (isinstance(model, type) and issubclass(model, Schema)):
+            return f"{row.settings}: expected a subclass of Schema"
+        if kind_of(model) != name:
+            return f'{row.settings}: expected a field `kind: Literal["{name}"]`'
+        return None
+
+    def __getitem__(self, name: str) -> P:
+        return self._all.rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all.rows)
+
+    def __len__(self) -> int:
+        return len(self._all.rows)
+
+    def origin(self, name: str) -> str:
+        """Distribution a kind comes from."""
+        return self._all.origins[name]
+
+    @property
+    def broken(self) -> tuple[Broken, ...]:
+        """Entry points that were left out."""
+        return self._all.broken
+
+    @cached_property
+    def settings(self) -> Mapping[str, type[Schema]]:
+        """Settings models by kind."""
+        return {name: row.settings_class() for name, row in self.items()}
+
+    def find(self, name: str) -> P:
+        """The row of a kind.
+
+        Raises:
+            InputError: there is none.
+        """
+        if name not in self:
+            raise InputError(f"{self.group}: no kind {name!r}: expected one of {', '.join(self)}")
+        return self[name]
+
+    def implementation(self, config: Schema) -> Any:
+        """The implementation for settings of one of the kinds.
+
+        Raises:
+            InputError: no such kind, or it does not load.
+        """
+        return self.find(str(vars(config).get("kind"))).implementation_class()
+
+    def section(self, default: str | None = None) -> "KindSection":
+        """Annotation of a configuration field that holds the settings of one of the kinds.
+
+        For instance ``tracker: Annotated[TrackerConfig, TRACKERS.section()]``.
+
+        Args:
+            default: kind of a section that names none; None = it has to.
+        """
+        return KindSection(self, default)
+
+
+@dataclass(frozen=True, eq=False)
+class KindSection:
+    """Makes a field the tagged union of a catalog's settings models."""
+
+    catalog: Catalog[Any]
+    default: str | None
+
+    @property
+    def models(self) -> tuple[type[Schema], ...]:
+        """Models the section may hold."""
+        return tuple(self.catalog.settings.values())
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """The union, told apart by ``kind``."""
+        choices = {name: handler.generate_schema(model) for name, model in self.catalog.settings.items()}
+        return core_schema.tagged_union_schema(choices, "kind" if self.default is None else self._kind)
+
+    def _kind(self, section: Any) -> Any:
+        if isinstance(section, dict):
+            return section.get("kind", self.default)
+        return getattr(section, "kind", None)
+
+
+def kind_of(model: type[BaseModel]) -> str | None:
+    """The one kind whose settings a model holds; None if it is no such model."""
+    field = model.model_fields.get("kind")
+    if field is None or get_origin(field.annotation) is not Literal:
+        return None
+    kinds = get_args(field.annotation)
+    return str(kinds[0]) if len(kinds) == 1 else None
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """All models an annotation names, those of catalogs included."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif isinstance(annotation, KindSection):
+        yield from annotation.models
+    for argument in get_args(annotation):
+        yield from models_in(argument)

@@ -1,0 +1,147 @@
+"""Catalogs: our rows, and those of distributions that are installed beside us."""
+
+import json
+import sys
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.plugins import Catalog, Plugin, kind_of, models_in
+from monstertruck_schemas import entry_points
+from monstertruck_schemas.base import Schema
+
+GROUP = "monstertruck.toys"
+
+
+class BallConfig(Schema):
+    kind: Literal["ball"] = "ball"
+    size: float = 1.0
+
+
+class CubeConfig(Schema):
+    kind: Literal["cube"]
+
+
+def row(name, settings, implementation="json:dumps", **more):
+    return Plugin(name=name, settings=f"{__name__}:{settings}", implementation=implementation, doc="A toy", **more)
+
+
+def toys():
+    return Catalog(GROUP, row("ball", "BallConfig"), row("cube", "CubeConfig", "no_such_module:Cube", extra="toys"))
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Installs a distribution with one module and entry points of toys."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def put(distribution, module, text, **entries):
+        (tmp_path / f"{module}.py").write_text(text)
+        info = tmp_path / f"{distribution}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        lines = "".join(f"{name} = {place}\n" for name, place in entries.items())
+        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{lines}")
+        monkeypatch.delitem(sys.modules, module, raising=False)
+        entry_points._installed.cache_clear()
+
+    entry_points._installed.cache_clear()
+    yield put
+    entry_points._installed.cache_clear()
+
+
+TOP = """
+from typing import Literal
+from monstertruck_runtime.plugins import Plugin
+from monstertruck_schemas.base import Schema
+
+class TopConfig(Schema):
+    kind: Literal["top"]
+    turns: int = 3
+
+TOP = Plugin(name="top", settings="spinning:TopConfig", implementation="spinning:TopConfig", doc="It spins")
+BALL = Plugin(name="ball", settings="spinning:TopConfig", implementation="spinning:TopConfig", doc="Another ball")
+WRONG = Plugin(name="wrong", settings="spinning:TopConfig", implementation="spinning:TopConfig", doc="Not of its kind")
+PLAIN = Plugin(name="plain", settings="json:dumps", implementation="json:dumps", doc="No settings")
+"""
+
+
+def test_a_catalog_names_its_kinds_and_loads_them_on_use():
+    catalog = toys()
+    assert list(catalog) == ["ball", "cube"]
+    assert catalog.origin("ball") == "monstertruckd"
+    assert catalog.implementation(BallConfig()) is json.dumps
+    with pytest.raises(InputError, match=r"cube: needs the extra \[toys\]: No module named 'no_such_module'"):
+        catalog.implementation(CubeConfig(kind="cube"))
+    with pytest.raises(InputError, match="no kind 'kite': expected one of ball, cube"):
+        catalog.find("kite")
+
+
+def test_another_distribution_adds_a_kind(install):
+    install("spinning-top", "spinning", TOP, top="spinning:TOP")
+    catalog = toys()
+    assert list(catalog) == ["ball", "cube", "top"]
+    assert catalog.origin("top") == "spinning-top 1.0"
+    read = TypeAdapter(Annotated[Schema, catalog.section()])
+    config = read.validate_json('{"kind": "top", "turns": 5}')
+    assert config.turns == 5
+    assert catalog.implementation(config) is type(config)
+    assert list(models_in(read._type))[1:] == [BallConfig, CubeConfig, type(config)]
+
+
+def test_what_is_broken_is_named_and_left_out(install):
+    install(
+        "spinning-top",
+        "spinning",
+        TOP,
+        top="spinning:TOP",
+        ball="spinning:BALL",
+        round="spinning:TOP",
+        wrong="spinning:WRONG",
+        plain="spinning:PLAIN",
+        missing="spinning:MISSING",
+        other="json:dumps",
+    )
+    install("a-broken-one", "breaks", "import sys; sys.exit('no')", kite="breaks:KITE")
+    install("z-later", "later", TOP.replace("spinning", "later"), top="later:TOP")
+    catalog = toys()
+    assert list(catalog) == ["ball", "cube", "top"]
+    assert catalog.origin("top") == "spinning-top 1.0"
+    told = {(b.origin, b.name): b.error for b in catalog.broken}
+    assert told == {
+        ("a-broken-one 1.0", "kite"): "SystemExit: no",
+        ("spinning-top 1.0", "ball"): "the name is taken by monstertruckd",
+        ("spinning-top 1.0", "missing"): "AttributeError: module 'spinning' has no attribute 'MISSING'",
+        ("spinning-top 1.0", "other"): "expected a Plugin, found function",
+        ("spinning-top 1.0", "plain"): "json:dumps: expected a subclass of Schema",
+        ("spinning-top 1.0", "round"): "the entry point is called round, its plug-in top",
+        ("spinning-top 1.0", "wrong"): 'spinning:TopConfig: expected a field `kind: Literal["wrong"]`',
+        ("z-later 1.0", "top"): "the name is taken by spinning-top 1.0",
+    }
+    assert str(catalog.broken[0]) == "monstertruck.toys: kite of a-broken-one 1.0: SystemExit: no"
+
+
+def test_a_section_tells_its_models_apart_by_kind():
+    read = TypeAdapter(Annotated[Schema, toys().section()])
+    assert read.validate_python({"kind": "cube"}) == CubeConfig(kind="cube")
+    assert read.validate_python(BallConfig(size=2.0)) == BallConfig(size=2.0)
+    assert read.dump_python(BallConfig(size=2.0)) == {"kind": "ball", "size": 2.0}
+    with pytest.raises(ValidationError, match=r"'kite'.*expected tags: 'ball', 'cube'"):
+        read.validate_python({"kind": "kite"})
+    with pytest.raises(ValidationError, match="discriminator 'kind'"):
+        read.validate_python({})
+    assert read.json_schema()["discriminator"]["propertyName"] == "kind"
+
+
+def test_a_section_with_a_default_needs_no_kind():
+    read = TypeAdapter(Annotated[Schema, toys().section("ball")])
+    assert read.validate_python({"size": 3.0}) == BallConfig(size=3.0)
+    assert read.validate_python({"kind": "cube"}) == CubeConfig(kind="cube")
+    assert read.validate_python(BallConfig()) == BallConfig()
+
+
+def test_the_kind_of_a_model():
+    assert kind_of(BallConfig) == "ball"
+    assert kind_of(Schema) is None
