@@ -108,7 +108,7 @@ class Daemon:
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.REQ_DRIVE, self.gate.request)
-        self.bus.listen(topics.PLAN_DRIVE, self.gate.wish)
+        self.bus.listen(topics.PLAN_DRIVE, self.gate.planner_request)
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)

@@ -127,7 +127,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, places: Places) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
-        paths, wishes = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
+        paths, requests = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
         drawn = None
         if config.path is not None:
@@ -141,9 +141,9 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, plac
             bus.event_sink(),
             config.gate.max_request_age,
         )
-        yield _build_tracker(config, config.tracker, bus, clock, body, wishes, places)
+        yield _build_tracker(config, config.tracker, bus, clock, body, requests, places)
         if config.planner is not None:
-            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, wishes, places)
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, places)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield StabiliserService(
             config.levelling,
@@ -165,7 +165,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, plac
 
 
 def _build_tracker(
-    config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, wishes: Publisher[DriveRequest],
+    config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, requests: Publisher[DriveRequest],
     places: Places,
 ) -> Service:  # fmt: skip
     lidar, placement = config.devices.lidar, config.placement.tracker
@@ -189,7 +189,7 @@ def _build_tracker(
             attitude="attitude" in inputs,
         )
         actor = places.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
-        return PlacedTracker(setup, clock, actor, inputs=inputs, drive=wishes, tracker=told, events=events)
+        return PlacedTracker(setup, clock, actor, inputs=inputs, drive=requests, tracker=told, events=events)
     return TrackerService(
         tracker,
         clock,
@@ -201,7 +201,7 @@ def _build_tracker(
         gate=inputs["gate"],
         scan=inputs.get("scan"),
         attitude=inputs.get("attitude"),
-        drive=wishes,
+        drive=requests,
         tracker=told,
         events=events,
     )

@@ -33,7 +33,7 @@ def build_goals(
     chassis: Chassis,
     footprint: Footprint,
     path: Publisher[Path],
-    wish: Publisher[DriveRequest],
+    planner_request: Publisher[DriveRequest],
     places: Places,
 ) -> GoalService:
     """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
@@ -65,7 +65,7 @@ def build_goals(
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         ),
-        outputs=Outputs(path, wish, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
+        outputs=Outputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, places),
     )
 

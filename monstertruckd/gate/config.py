@@ -106,7 +106,7 @@ class GateConfig(Schema):
     remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Sources outside the robot that may drive as trackers."""
     disarm_after: Positive = 1.5
-    """Seconds without a driver whose wishes can be carried out, after which the truck disarms."""
+    """Seconds without a driver whose requests can be carried out, after which the truck disarms."""
 
     scan: SensorLimit = _limit(topics.SCAN)
     scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.35

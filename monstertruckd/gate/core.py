@@ -159,9 +159,9 @@ class Gate:
         """Take a drive request from outside; returns OK, or the reason why it does not move the truck now."""
         return self._consider(request, now, self._sources.admit_request(request, now), inside=False)
 
-    def wish(self, request: DriveRequest, now: int) -> Reason:
+    def planner_request(self, request: DriveRequest, now: int) -> Reason:
         """Take a drive request of the robot's own planners; returns what ``request`` does."""
-        return self._consider(request, now, self._sources.admit_wish(request), inside=True)
+        return self._consider(request, now, self._sources.admit_planner_request(request), inside=True)
 
     def _consider(self, request: DriveRequest, now: int, admission: Reason, *, inside: bool) -> Reason:
         if admission is not Reason.OK:

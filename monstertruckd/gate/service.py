@@ -38,7 +38,7 @@ LATCH_RETRY: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """What the gate reads, by the newest message. Requests, wishes and orders are told it as they come."""
+    """What the gate reads, by the newest message. Requests and orders are passed to it as they arrive."""
 
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
@@ -136,9 +136,9 @@ class GateService:
         """Take a drive request from outside, at once; see ``Gate.request``."""
         return self._taken(Reason.INTERNAL, self._gate.request, request, self._clock.now())
 
-    def wish(self, request: DriveRequest) -> Reason:
-        """Take one of the robot's own planners, at once; see ``Gate.wish``."""
-        return self._taken(Reason.INTERNAL, self._gate.wish, request, self._clock.now())
+    def planner_request(self, request: DriveRequest) -> Reason:
+        """Take one of the robot's own planners, at once; see ``Gate.planner_request``."""
+        return self._taken(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
         """Take any service's event at once: it may be what is behind a stop."""

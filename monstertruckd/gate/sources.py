@@ -83,7 +83,7 @@ class Sources:
     def __init__(self, nonce: str, config: GateConfig) -> None:
         self.nonce = nonce
         self._config = config
-        self._wishes = Sequences()
+        self._planner_requests = Sequences()
         self._requests = Sequences()
         self._orders = Sequences()
         self._drive: dict[Key, Source] = {}
@@ -99,11 +99,11 @@ class Sources:
         reason = self._requests.accept(request, self.nonce, alive)
         return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
-    def admit_wish(self, request: DriveRequest) -> Reason:
+    def admit_planner_request(self, request: DriveRequest) -> Reason:
         """OK, or why a drive request of the robot's own planners does not count."""
         if request.role is not Role.TRACKER:
             return Reason.BAD_ROLE
-        return self._wishes.accept(request, self.nonce)
+        return self._planner_requests.accept(request, self.nonce)
 
     def admit_order(self, request: ControlRequest, now: int) -> Reason:
         """OK, or why an order does not count."""

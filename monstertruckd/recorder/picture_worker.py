@@ -72,8 +72,8 @@ class MapRenderer:
             self._raster.add(origin, origin + turned)
             self._scans += 1
         outputs: dict[str, Any] = {"scans": self._scans}
-        if (wish := inputs.get("render")) is not None:
-            outputs["png"] = render(self._raster, **wish)
+        if (request := inputs.get("render")) is not None:
+            outputs["png"] = render(self._raster, **request)
             if (file := inputs.get("file")) is not None:
                 try:
                     _save(Path(file), outputs["png"])

@@ -1,4 +1,4 @@
-"""Messages of the ``plan`` group: paths, tracker progress, and the planners' wishes to the gate."""
+"""Messages of the ``plan`` group: paths, tracker progress, and the planners' drive requests."""
 
 from enum import StrEnum
 from typing import Annotated, Literal

@@ -144,7 +144,7 @@ CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daem
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
 TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 20, 0.5)
 GOAL: Final = Topic("plan/goal", GoalState, W.PLANNER, "Progress towards the goal", 2, retained=True)
-PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The tracker's wish to the gate", 20, 0.3)
+PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The planners' drive requests to the gate", 20, 0.3)
 PLAN_STABILISER: Final = Topic(
     "plan/stabiliser",
     StabiliserCommand,

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.cli.driving_modes import SteeringMode
-from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, Wish
+from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, TeleopRequest
 from monstertruckd.tools.status import screen
 from monstertruckd.tools.status.screen import ScreenState
 
@@ -28,7 +28,7 @@ HINTS = {
 class Stream:
     """What goes to the robot."""
 
-    wish: Wish | None = None
+    request: TeleopRequest | None = None
     """Sent last; None = silence."""
     round_trip: float | None = None
     """Seconds to the robot and back; None = no answer."""
@@ -63,9 +63,9 @@ def _hint(state: ScreenState) -> Text:
 
 
 def _asked(stream: Stream) -> Text:
-    if stream.wish is None:
+    if stream.request is None:
         return Text("silent   ", style="dim")
-    speed = stream.wish.speed
+    speed = stream.request.speed
     return Text(f"{ARROWS[(speed > 0) - (speed < 0)]:9}", style="bold green" if speed else "cyan")
 
 

@@ -17,7 +17,7 @@ from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.cli.drive_screen import Stream, draw
 from monstertruckd.tools.cli.keys import KeyReader
-from monstertruckd.tools.cli.teleop import Command, Teleop, Wish
+from monstertruckd.tools.cli.teleop import Command, Teleop, TeleopRequest
 from monstertruckd.tools.cli.terminal import every_key, forget_input, when_readable
 from monstertruckd.tools.status.watch import PERIOD, Follower
 
@@ -132,12 +132,12 @@ class DriveSession:
                 self._forget()
             before = now
             self._press(self._reader.flush())
-            await self._request(client, self._teleop.wish(now))
+            await self._request(client, self._teleop.request(now))
 
-    async def _request(self, client: TruckClient, wish: Wish | None) -> None:
-        self._stream.wish = wish
-        if wish is not None:
-            await self._send(client.drive(wish.speed, wish.front, wish.rear, lease=LEASE))
+    async def _request(self, client: TruckClient, request: TeleopRequest | None) -> None:
+        self._stream.request = request
+        if request is not None:
+            await self._send(client.drive(request.speed, request.front, request.rear, lease=LEASE))
 
     async def _send(self, sending: Coroutine[Any, Any, None]) -> None:
         """A silent robot is shown instead of ending the session: it may come back."""

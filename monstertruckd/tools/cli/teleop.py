@@ -1,7 +1,7 @@
-"""Keyboard driving without a terminal: keys in, wishes and orders out. Pure.
+"""Keyboard driving without a terminal: keys in, requests and orders out. Pure.
 
 A terminal tells that a key went down and repeats it while it is held, but never that it was let go. So every driving
-key stands for a short time only, and with none standing there is one neutral wish and then silence: the truck stops
+key stands for a short time only, and with none standing there is one neutral request and then silence: the truck stops
 even if this program hangs or its link breaks, for nothing renews the lease.
 """
 
@@ -29,7 +29,7 @@ Command = Order | Literal["end"]
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class TeleopRequest:
     """What to ask of the gate."""
 
     speed: float
@@ -143,15 +143,15 @@ class Teleop:
         """All keys count as let go."""
         self._until = self._resting = self._throttle = 0
 
-    def wish(self, now: int) -> Wish | None:
+    def request(self, now: int) -> TeleopRequest | None:
         """What to ask for now: the keys' motion, once a stop after it, then nothing."""
         front, rear = axles(self.mode, self.steer, self.drift)
         rear = math.copysign(min(abs(rear), self.angle), rear)
         if now <= self._until:
             self._asking = True
-            return Wish(self._throttle * self.speed, front, rear)
+            return TeleopRequest(self._throttle * self.speed, front, rear)
         asked, self._asking, self._throttle = self._asking, now <= self._resting, 0
-        return Wish(0.0, front, rear) if asked or self._asking else None
+        return TeleopRequest(0.0, front, rear) if asked or self._asking else None
 
 
 def _stepped(steps: int, by: int) -> int:

@@ -74,7 +74,7 @@ class GoalRecord:
 
     told: list[Told] = field(default_factory=list)
     paths: list[Path] = field(default_factory=list)
-    wishes: list[int] = field(default_factory=list)
+    planner_requests: list[int] = field(default_factory=list)
     """Stamps of requests to stand still, ns."""
     asked: list[int] = field(default_factory=list)
     """When requests came by topic, ns."""
@@ -93,7 +93,7 @@ class GoalRecord:
                     assert isinstance(path, Path)
                     self.paths.append(path)
                 case topics.PLAN_DRIVE.name if self.told and asks_standstill(entry):
-                    self.wishes.append(entry.stamp)
+                    self.planner_requests.append(entry.stamp)
 
     def _tell(self, entry: LogMessage) -> None:
         state = entry.decode()
@@ -108,7 +108,7 @@ class GoalRecord:
     def ticks(self, period: int) -> list[int]:
         """Instants of the ticks that show."""
         calls = self.calls(period)
-        stamps = [one.state.stamp for one in self.told if one.sequence not in calls] + self.wishes
+        stamps = [one.state.stamp for one in self.told if one.sequence not in calls] + self.planner_requests
         shown: list[int] = []
         for stamp in sorted(stamps):
             if not shown or stamp - shown[-1] > TOGETHER:
@@ -160,9 +160,9 @@ class GoalRecord:
 
 
 def asks_standstill(entry: LogMessage) -> bool:
-    """Whether a wish to the gate is the goal service's, not the tracker's."""
-    wish = entry.decode()
-    return isinstance(wish, DriveRequest) and wish.source == SOURCE
+    """Whether a drive request is the goal service's, not the tracker's."""
+    request = entry.decode()
+    return isinstance(request, DriveRequest) and request.source == SOURCE
 
 
 def is_deformed(entry: LogMessage) -> bool:

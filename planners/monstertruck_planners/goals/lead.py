@@ -20,7 +20,7 @@ SOURCE: Final = "goals"
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 LEASE: Final = 0.25
-"""Of the wish to stand still, s."""
+"""Lease of the request to stand still, s."""
 STUB: Final = 0.01
 """Length of a path that leads nowhere, m."""
 
@@ -108,11 +108,11 @@ class Lead:
         gate, now = self._in.gate.latest, self._clock.now()
         if self.driving or gate is None or not gate.mode.active:
             return
-        self._out.wish.put(
+        self._out.planner_request.put(
             DriveRequest(
                 stamp=now,
                 received=now,
-                seq=self._out.wish.next_seq(),
+                seq=self._out.planner_request.next_seq(),
                 source=SOURCE,
                 role=Role.TRACKER,
                 lease=LEASE,

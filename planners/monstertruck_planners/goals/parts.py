@@ -40,7 +40,7 @@ class Outputs:
     """What it writes."""
 
     path: Publisher[Path]
-    wish: Publisher[DriveRequest]
+    planner_request: Publisher[DriveRequest]
     state: Publisher[GoalState]
     events: EventSink
 

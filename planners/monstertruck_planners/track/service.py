@@ -1,4 +1,4 @@
-"""The tracker as a service: poses and a path in, wishes to the gate out."""
+"""The tracker as a service: poses and a path in, drive requests to the gate out."""
 
 import asyncio
 import math

@@ -119,7 +119,7 @@ class Rig:
     def drive(self, speed=0.2, front=0.0, rear=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, inside=False, **more):
         fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
         request = DriveRequest(source=source, role=role, lease=lease, speed=speed, front=front, rear=rear, **fields)
-        return (self.gate.wish if inside else self.gate.request)(request, self.now)
+        return (self.gate.planner_request if inside else self.gate.request)(request, self.now)
 
     def order(self, order, source="ann", role=Role.GAMEPAD, **more):
         fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}

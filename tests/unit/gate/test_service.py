@@ -177,7 +177,7 @@ def test_requests_of_both_kinds_reach_the_gate():
         bench.order(Order.ARM)
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.mode is GateMode.ARMED
-        assert bench.ask(bench.service.wish, Role.TRACKER) is Reason.OK
+        assert bench.ask(bench.service.planner_request, Role.TRACKER) is Reason.OK
         await bench.clock.sleep(0.05)
         assert bench.out.state.last.holder == "tracker"
         assert bench.ask(bench.service.request, Role.GAMEPAD) is Reason.OK
@@ -261,7 +261,7 @@ def test_shutting_down_stops_at_once_and_for_good():
 
 def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
     async def main(clock):
-        for name in ("control", "request", "wish"):
+        for name in ("control", "request", "planner_request"):
             bench = Bench(clock)
             task = asyncio.create_task(bench.service.run(bench.ready))
             await clock.sleep(0.1)

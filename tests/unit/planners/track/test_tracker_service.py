@@ -88,9 +88,11 @@ class Bench:
             driving = gate is not None and gate.mode in (GateMode.ARMED, GateMode.DRIVING)
             if self.asked and driving and (fresh or self.clock.now() - self.asked[-1].stamp < SECOND // 4):
                 self.heard = len(self.asked)
-                wish = self.asked[-1]
-                self.speed = wish.speed
-                self.pose = STEERING.integrate(self.pose, *STEERING.body_twist(wish.speed, wish.front, wish.rear), 0.02)
+                request = self.asked[-1]
+                self.speed = request.speed
+                self.pose = STEERING.integrate(
+                    self.pose, *STEERING.body_twist(request.speed, request.front, request.rear), 0.02
+                )
             else:
                 self.speed = 0.0
 
@@ -141,8 +143,8 @@ def test_a_lap_from_arming_to_the_goal():
         await bench.clock.sleep(1.0)
 
     bench = on_bench(scenario, path(circle(1.0), closed=True))
-    wish = bench.asked[5]
-    assert (wish.source, wish.role, wish.nonce, wish.lease) == ("tracker", Role.TRACKER, "n1", 0.25)
+    request = bench.asked[5]
+    assert (request.source, request.role, request.nonce, request.lease) == ("tracker", Role.TRACKER, "n1", 0.25)
     assert [w.seq for w in bench.asked] == list(range(len(bench.asked)))
     assert np.diff([w.stamp for w in bench.asked]) == pytest.approx(SECOND // 20, abs=1000)
     last = bench.told[-1]

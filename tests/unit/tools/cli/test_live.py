@@ -7,7 +7,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.cli.drive_screen import Stream, draw
 from monstertruckd.tools.cli.live import shortened
-from monstertruckd.tools.cli.teleop import Teleop, Wish
+from monstertruckd.tools.cli.teleop import Teleop, TeleopRequest
 from monstertruckd.tools.status.screen import ScreenState
 
 
@@ -52,8 +52,8 @@ def test_drive_shows_what_it_asks_for():
     teleop = Teleop()
     for key in ("5", "a", "a", "z", "w"):
         teleop.press(key, SECOND)
-    text = shown(state(GateMode.DRIVING), teleop, Stream(Wish(0.1, 0.1, 0.0), round_trip=0.0123))
+    text = shown(state(GateMode.DRIVING), teleop, Stream(TeleopRequest(0.1, 0.1, 0.0), round_trip=0.0123))
     for words in ("▲ forward", "0.10 m/s", "+5.7°", "round trip 12.3 ms", "5 hybrid", "drift +2.9°"):
         assert words in text
     assert "no robot" in shown(state(GateMode.DRIVING), teleop, Stream(trouble="no robot"))
-    assert shown(ScreenState("truck", 0), teleop, Stream(Wish(-0.1, 0.0, 0.0)), 20)
+    assert shown(ScreenState("truck", 0), teleop, Stream(TeleopRequest(-0.1, 0.0, 0.0)), 20)

@@ -1,4 +1,4 @@
-"""Keys become wishes that stand for a moment only."""
+"""Keys become requests that stand for a moment only."""
 
 import pytest
 from hypothesis import given
@@ -8,7 +8,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
 from monstertruckd.tools.cli.keys import KeyReader
-from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, Wish, axles
+from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, TeleopRequest, axles
 
 START = 5 * SECOND
 
@@ -55,44 +55,44 @@ def test_any_bytes_are_survived(chunks: list[bytes]):
 
 def test_a_key_stands_for_a_moment_and_then_there_is_one_stop_and_silence():
     teleop = Teleop(level=1, first_hold=0.6, hold=0.25)
-    assert teleop.wish(START) is None, "nothing is asked for before a key"
+    assert teleop.request(START) is None, "nothing is asked for before a key"
     assert teleop.press("w", START) is None
-    assert teleop.wish(after(0.6)) == Wish(0.1, 0.0, 0.0)
-    assert teleop.wish(after(0.61)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(0.66)) is None
-    assert teleop.wish(after(9.0)) is None
+    assert teleop.request(after(0.6)) == TeleopRequest(0.1, 0.0, 0.0)
+    assert teleop.request(after(0.61)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(0.66)) is None
+    assert teleop.request(after(9.0)) is None
 
 
 def test_repetition_keeps_it_alive_and_its_end_is_noticed_sooner():
     teleop = Teleop(first_hold=0.6, hold=0.25)
     for tenth in range(0, 30, 1):
         teleop.press("w", after(tenth / 10))
-        assert teleop.wish(after(tenth / 10 + 0.09)) == Wish(0.1, 0.0, 0.0)
-    assert teleop.wish(after(2.9 + 0.25)) is not None
-    assert teleop.wish(after(2.9 + 0.26)) == Wish(0.0, 0.0, 0.0)
+        assert teleop.request(after(tenth / 10 + 0.09)) == TeleopRequest(0.1, 0.0, 0.0)
+    assert teleop.request(after(2.9 + 0.25)) is not None
+    assert teleop.request(after(2.9 + 0.26)) == TeleopRequest(0.0, 0.0, 0.0)
 
 
 def test_a_steering_key_keeps_the_truck_going_but_never_sets_it_in_motion():
     teleop = Teleop(angle=0.4)
     teleop.press("a", START)
-    assert teleop.wish(START) == Wish(0.0, 0.4 / STEPS, 0.0)
+    assert teleop.request(START) == TeleopRequest(0.0, 0.4 / STEPS, 0.0)
     teleop.press("up", after(0.1))
     teleop.press("left", after(0.2))
-    assert teleop.wish(after(0.75)) == Wish(0.1, 2 * 0.4 / STEPS, 0.0)
-    teleop.wish(after(2.0))
+    assert teleop.request(after(0.75)) == TeleopRequest(0.1, 2 * 0.4 / STEPS, 0.0)
+    teleop.request(after(2.0))
     teleop.press("left", after(3.0))
-    wish = teleop.wish(after(3.0))
-    assert wish is not None
-    assert wish.speed == 0.0, "what stood before the silence is forgotten"
+    request = teleop.request(after(3.0))
+    assert request is not None
+    assert request.speed == 0.0, "what stood before the silence is forgotten"
 
 
 def test_steering_ends_at_full_lock_and_centres():
     teleop = Teleop(angle=0.4)
     for _ in range(3 * STEPS):
         teleop.press("d", START)
-    assert teleop.wish(START) == Wish(0.0, -0.4, 0.0)
+    assert teleop.request(START) == TeleopRequest(0.0, -0.4, 0.0)
     teleop.press("x", START)
-    assert teleop.wish(START) == Wish(0.0, 0.0, 0.0)
+    assert teleop.request(START) == TeleopRequest(0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_no_mode_asks_for_more_than_full_lock():
     teleop = Teleop(angle=0.4, mode=SteeringMode.HYBRID)
     for key in "dz" * STEPS:
         teleop.press(key, START)
-    assert teleop.wish(START) == Wish(0.0, -0.4, 0.4)
+    assert teleop.request(START) == TeleopRequest(0.0, -0.4, 0.4)
 
 
 def test_keys_choose_mode_and_speed():
@@ -127,7 +127,7 @@ def test_keys_choose_mode_and_speed():
     for _ in range(9):
         teleop.press("-", START)
     assert teleop.speed == SPEEDS[0]
-    assert teleop.wish(START) is None, "these keys drive nothing"
+    assert teleop.request(START) is None, "these keys drive nothing"
 
 
 @pytest.mark.parametrize(
@@ -137,38 +137,38 @@ def test_keys_choose_mode_and_speed():
 def test_orders_and_the_end_silence_the_keys(key: str, command: object):
     teleop = Teleop()
     teleop.press("w", START)
-    teleop.wish(START)
+    teleop.request(START)
     assert teleop.press(key, START) == command
-    assert teleop.wish(after(0.05)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(0.1)) is None
+    assert teleop.request(after(0.05)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(0.1)) is None
 
 
 def test_losing_the_focus_silences_the_keys():
     teleop = Teleop()
     teleop.press("w", START)
-    teleop.wish(START)
+    teleop.request(START)
     assert teleop.press("focus out", START) is None
-    assert teleop.wish(after(0.05)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(0.1)) is None
+    assert teleop.request(after(0.05)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(0.1)) is None
 
 
 def test_arming_holds_the_truck_at_rest_for_a_moment():
     teleop = Teleop(arm_hold=2.0)
     teleop.press("w", START)
     assert teleop.press("enter", START) is Order.ARM
-    assert teleop.wish(after(1.9)) == Wish(0.0, 0.0, 0.0)
+    assert teleop.request(after(1.9)) == TeleopRequest(0.0, 0.0, 0.0)
     teleop.press("w", after(1.95))
-    assert teleop.wish(after(2.0)) == Wish(0.1, 0.0, 0.0)
-    assert teleop.wish(after(2.6)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(2.7)) is None
+    assert teleop.request(after(2.0)) == TeleopRequest(0.1, 0.0, 0.0)
+    assert teleop.request(after(2.6)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(2.7)) is None
 
 
 def test_a_key_pressed_while_the_truck_is_held_at_rest_stands_no_longer_than_any_other():
     teleop = Teleop(arm_hold=2.0)
     teleop.press("enter", START)
     teleop.press("w", after(0.3))
-    assert teleop.wish(after(0.35)) == Wish(0.1, 0.0, 0.0)
-    assert teleop.wish(after(0.95)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(1.9)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(2.1)) == Wish(0.0, 0.0, 0.0)
-    assert teleop.wish(after(2.2)) is None
+    assert teleop.request(after(0.35)) == TeleopRequest(0.1, 0.0, 0.0)
+    assert teleop.request(after(0.95)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(1.9)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(2.1)) == TeleopRequest(0.0, 0.0, 0.0)
+    assert teleop.request(after(2.2)) is None

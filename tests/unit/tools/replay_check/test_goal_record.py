@@ -13,14 +13,18 @@ PERIOD = SECOND // 10
 GOAL = Pose2D(x=1.0, y=2.0, yaw=0.0)
 
 
-def record(*rows, asked=(), wishes=()):
+def record(*rows, asked=(), planner_requests=()):
     """``rows``: seconds, number, phase, and other fields of a report."""
     told = []
     for sequence, (seconds, number, phase, *rest) in enumerate(rows):
         stamp = round(seconds * SECOND)
         fields = {"goal": GOAL, "source": "me", "outcome": Reason.DRIVING} | (rest[0] if rest else {})
         told.append(Told(sequence, GoalState(stamp=stamp, received=stamp, seq=0, number=number, phase=phase, **fields)))
-    return GoalRecord(told, wishes=[round(at * SECOND) for at in wishes], asked=[round(at * SECOND) for at in asked])
+    return GoalRecord(
+        told,
+        planner_requests=[round(at * SECOND) for at in planner_requests],
+        asked=[round(at * SECOND) for at in asked],
+    )
 
 
 def test_ticks_that_left_nothing_lie_on_the_grid_of_those_that_did():
@@ -30,7 +34,7 @@ def test_ticks_that_left_nothing_lie_on_the_grid_of_those_that_did():
         (3.5, 1, GoalPhase.DRIVING),
         (4.0, 1, GoalPhase.IDLE),
         asked=[2.95],
-        wishes=[3.1, 3.1000001, 3.3],
+        planner_requests=[3.1, 3.1000001, 3.3],
     )
     assert log.start == SECOND
     assert [tick / SECOND for tick in log.ticks(PERIOD)] == [1.0, 3.0, 3.1, 3.3, 3.5, 4.0]
