@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from monstertruck_estimation.se2 import between, compose, transform
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
-from monstertruck_estimation.slam.mapper import Event, Mapper
+from monstertruck_estimation.slam.mapping import Event, Mapper
 from monstertruck_estimation.slam.scans import prepare
-from monstertruck_estimation.slam.se2 import between, compose, transform
 from slam_parts.kiss_alone import KissOdometry
 from slam_parts.logs import Log, load, scored
 

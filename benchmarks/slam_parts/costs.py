@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.estimator import MappingEstimator, prepared
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
-from monstertruck_estimation.slam.settings import GridConfig
+from monstertruck_estimation.slam.mapping import MappingEstimator
+from monstertruck_estimation.slam.scans import prepared
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.validate import load_config
 from monstertruckd.tools.logs.scans import read_scans

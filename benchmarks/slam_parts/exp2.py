@@ -30,13 +30,14 @@ from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.slam.estimator import MappingEstimator, mapper_config, prepared
-from monstertruck_estimation.slam.exchange import ScanInput
+from monstertruck_estimation.se2 import between, compose, interpolate, transform, wrap
+from monstertruck_estimation.slam.config import GridConfig, SlamConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
-from monstertruck_estimation.slam.se2 import between, compose, interpolate, transform, wrap
-from monstertruck_estimation.slam.settings import GridConfig, SlamConfig
-from monstertruck_estimation.slam.step import front_of
+from monstertruck_estimation.slam.mapping import MappingEstimator
+from monstertruck_estimation.slam.scans import prepared
 from monstertruck_estimation.slam.storage import load
+from monstertruck_estimation.slam.worker import front_of
+from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
@@ -175,7 +176,7 @@ def compared(ours: dict[str, np.ndarray], kiss: dict[str, np.ndarray]) -> dict[s
 
 def mapped(scans: list[LaserScan], mount: float, front: str = "planar") -> Track:
     """What the mapper with this front end makes of ``scans`` without the daemon."""
-    estimator = MappingEstimator(mapper_config(SlamConfig()), GridConfig(), front_of(front))
+    estimator = MappingEstimator(SlamConfig().mapper, GridConfig(), front_of(front))
     for scan in scans:
         inputs = ScanInput.of(scan, (mount, 0.0, 0.0))
         estimator.step(prepared(inputs, estimator.mapper.config.longest, estimator.twist), inputs)

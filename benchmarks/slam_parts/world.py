@@ -20,13 +20,13 @@ from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Reckoner
 from monstertruck_estimation.scan_tilt import Track, plane_slopes, plane_tilt
-from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.estimator import Estimator, MappingEstimator, prepared
-from monstertruck_estimation.slam.exchange import Estimate, Moved, ScanInput
-from monstertruck_estimation.slam.localise import LocalisingEstimator
-from monstertruck_estimation.slam.se2 import between, compose, interpolate, inverse
-from monstertruck_estimation.slam.settings import GridConfig
+from monstertruck_estimation.se2 import between, compose, interpolate, inverse
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
+from monstertruck_estimation.slam.localisation import LocalisingEstimator
+from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator
+from monstertruck_estimation.slam.scans import prepared
 from monstertruck_estimation.slam.storage import load, save
+from monstertruck_estimation.slam.worker_io import Estimate, Moved, ScanInput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import Standing

@@ -11,7 +11,7 @@ from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.fusion.config import AnyOdometry
 from monstertruck_estimation.odometry import OdometryConfig
-from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import Chassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig

@@ -10,7 +10,7 @@ from monstertruckd.tools.cli.options import ENDPOINT
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
-    from monstertruck_estimation.slam.exchange import Estimate, WorkerOutput
+    from monstertruck_estimation.slam.worker_io import Estimate, WorkerOutput
     from monstertruckd.tools.logs.scans import ScanLog
 
 app = command_group("Build, show, save and use occupancy maps.")
@@ -29,9 +29,9 @@ def build(
     json_output: JsonOption = False,
 ) -> None:
     """A map from a log's scans, and its odometry where there is one."""
-    from monstertruck_estimation.slam.exchange import WorkerInput
-    from monstertruck_estimation.slam.settings import SlamConfig
-    from monstertruck_estimation.slam.step import EstimationWorker
+    from monstertruck_estimation.slam.config import SlamConfig
+    from monstertruck_estimation.slam.worker import EstimationWorker
+    from monstertruck_estimation.slam.worker_io import WorkerInput
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.logs.scans import read_scans
 
@@ -85,8 +85,8 @@ def save(
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the map.")] = 5.0,
 ) -> None:
     """The map that a running robot has published, as map_server files."""
-    from monstertruck_estimation.slam.exchange import Patch
     from monstertruck_estimation.slam.storage import trinary
+    from monstertruck_estimation.slam.worker_io import Patch
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock, run_wall
     from monstertruck_runtime.errors import NoAnswerError
@@ -137,9 +137,9 @@ def load_command(
 @app.command("localise")
 def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
     """Where a log's scans were taken in a saved map, without knowing where it begins."""
-    from monstertruck_estimation.slam.settings import SlamConfig
-    from monstertruck_estimation.slam.step import EstimationWorker
+    from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.storage import load
+    from monstertruck_estimation.slam.worker import EstimationWorker
     from monstertruckd.tools.logs.scans import read_scans
 
     saved, scans = load(place), read_scans(log)
@@ -157,7 +157,7 @@ def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption
 
 def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["Estimate"]]:
     """Every scan through the worker; what to tell of it, and the estimates."""
-    from monstertruck_estimation.slam.exchange import Start, WorkerInput
+    from monstertruck_estimation.slam.worker_io import Start, WorkerInput
 
     first = log.scans[0].odom or (0.0, 0.0, 0.0)
     worker.step(WorkerInput(start=Start(config, first)))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.slam.exchange import ScanInput, Vector
-from monstertruck_estimation.slam.se2 import between, interpolate
+from monstertruck_estimation.se2 import between, interpolate
+from monstertruck_estimation.slam.worker_io import ScanInput, Vector
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas.sensor import LaserScan

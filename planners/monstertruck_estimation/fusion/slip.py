@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.fusion.config import LASTING, SlipConfig
-from monstertruck_estimation.fusion.operations import ScanWay, WheelWay
-from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, interpolate
+from monstertruck_estimation.fusion.filter import ScanWay, WheelWay
+from monstertruck_estimation.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_runtime.clock import SECOND
 

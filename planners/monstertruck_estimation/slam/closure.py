@@ -16,18 +16,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.correlation import correlate
-from monstertruck_estimation.slam.descriptor import describe, likeness
+from monstertruck_estimation.se2 import between, compose, inverse, rotation, transform
+from monstertruck_estimation.slam.correlation import Submap, correlate, merged
 from monstertruck_estimation.slam.frontend import degeneracy, deviations
 from monstertruck_estimation.slam.graph import optimise, residuals, trust
-from monstertruck_estimation.slam.keymap import KeyMap
+from monstertruck_estimation.slam.keyframes import KeyMap
 from monstertruck_estimation.slam.registration import measure, register
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import between, compose, inverse, rotation, transform
-from monstertruck_estimation.slam.submap import Submap, merged
-from monstertruck_estimation.slam.visibility import contradiction, in_view
 
 Array = NDArray[np.float64]
 
@@ -365,3 +363,123 @@ def _way(keymap: KeyMap, hits: list[Hit]) -> float:
     first, last = min(hit.target for hit in hits), max(hit.target for hit in hits)
     steps = np.diff(keymap.poses[first : last + 1, :2], axis=0)
     return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+
+
+VIEW_SECTORS: Final = 180
+"""Sectors of a scan's view all round."""
+VIEW_MARGIN: Final = 0.25
+"""Points this much in front of what was seen behind them were looked through, m."""
+VIEW_SLACK: Final = 0.04
+"""And this share of their range: for the yaw's error."""
+
+
+def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> float:
+    """Share of the points in view of the opposite scans, 0..1, that those looked through; 0 if none is in view.
+
+    Args:
+        one: scans, points in base.
+        poses: shape (n, 3), of ``one``.
+        others: the scans they are held against.
+        other_poses: shape (m, 3), in the same frame.
+    """
+    through, judged = 0, 0
+    for viewers, at, seen, seen_at in ((one, poses, others, other_poses), (others, other_poses, one, poses)):
+        for viewer, pose in zip(viewers, at, strict=True):
+            view = _view(viewer.points)
+            for scan, place in zip(seen, seen_at, strict=True):
+                counts = _looked_through(view, transform(between(pose, place), scan.points))
+                through += counts[0]
+                judged += counts[1]
+    return through / judged if judged else 0.0
+
+
+def in_view(viewers: list[Scan], poses: Array, points: Array) -> NDArray[np.bool_]:
+    """Which of ``points``, shape (n, 2), at least one of the scans would have seen: no nearer wall hides them.
+
+    Args:
+        viewers: scans, points in base.
+        poses: shape (m, 3), of ``viewers``, in the frame of ``points``.
+        points: shape (n, 2), m.
+    """
+    seen = np.zeros(len(points), bool)
+    for viewer, pose in zip(viewers, poses, strict=True):
+        _mark_seen(_view(viewer.points), transform(inverse(pose), points), seen)
+    return seen
+
+
+@njit(cache=True)
+def _sector(x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    return int((math.atan2(y, x) + math.pi) / (2 * math.pi) * VIEW_SECTORS) % VIEW_SECTORS
+
+
+@njit(cache=True)
+def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Least range per sector and its neighbours, m; 0 where any of the three saw nothing."""
+    nearest = np.full(VIEW_SECTORS, np.inf)
+    for i in range(points.shape[0]):
+        k = _sector(points[i, 0], points[i, 1])
+        nearest[k] = min(nearest[k], math.hypot(points[i, 0], points[i, 1]))
+    view = np.zeros(VIEW_SECTORS)
+    for k in range(VIEW_SECTORS):
+        a, b, c = nearest[k - 1], nearest[k], nearest[(k + 1) % VIEW_SECTORS]
+        if math.isfinite(a + b + c):
+            view[k] = min(a, b, c)
+    return view
+
+
+@njit(cache=True)
+def _looked_through(view, points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    through, judged = 0, 0
+    for i in range(points.shape[0]):
+        limit = view[_sector(points[i, 0], points[i, 1])]
+        r = math.hypot(points[i, 0], points[i, 1])
+        gap = VIEW_MARGIN + VIEW_SLACK * r
+        if limit > 0 and r < limit + gap:
+            judged += 1
+            if r < limit - gap:
+                through += 1
+    return through, judged
+
+
+@njit(cache=True)
+def _mark_seen(view, points, seen):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    for i in range(points.shape[0]):
+        limit = view[_sector(points[i, 0], points[i, 1])]
+        r = math.hypot(points[i, 0], points[i, 1])
+        if limit > 0 and r < limit + VIEW_MARGIN + VIEW_SLACK * r:
+            seen[i] = True
+
+
+DESCRIPTOR_REACH: Final = 5.0
+"""Points up to this far from the robot take part, m."""
+DESCRIPTOR_BINS: Final = 20
+
+
+def describe(points: Array) -> Array:
+    """Histogram, shape (DESCRIPTOR_BINS,), of the distances between ``points`` (shape (n, 2), m, about the robot).
+
+    Its sum is 1, or 0 without two points.
+    """
+    return np.asarray(_distances(points))
+
+
+def likeness(one: Array, others: Array) -> Array:
+    """Histogram intersection, 0..1, of ``one`` (DESCRIPTOR_BINS,) with each of ``others`` (n, DESCRIPTOR_BINS)."""
+    return np.asarray(np.minimum(one, others).sum(axis=1))
+
+
+@njit(cache=True)
+def _distances(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    result = np.zeros(DESCRIPTOR_BINS)
+    limit = DESCRIPTOR_REACH * DESCRIPTOR_REACH
+    total = 0
+    for i in range(points.shape[0]):
+        if points[i, 0] ** 2 + points[i, 1] ** 2 > limit:
+            continue
+        for j in range(i):
+            if points[j, 0] ** 2 + points[j, 1] ** 2 > limit:
+                continue
+            d = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            result[min(int(d / (2 * DESCRIPTOR_REACH) * DESCRIPTOR_BINS), DESCRIPTOR_BINS - 1)] += 1.0
+            total += 1
+    return result / max(total, 1)

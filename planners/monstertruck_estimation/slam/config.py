@@ -1,47 +1,109 @@
-"""Settings of the mapper: noise models and limits, the same for every sensor and place."""
+"""Settings of mapping and localisation; light, for the daemon's start."""
 
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(gt=0)]
 
 
-@dataclass(frozen=True, slots=True)
-class MapperConfig:
-    """Defaults serve a slow truck as well as a fast robot with sparse scans; nothing here is fitted to one log."""
+class MapperConfig(Schema):
+    """Noise models and limits, the same for every sensor and place; every number is positive.
 
-    key_distance: float = 0.3
+    The defaults serve a slow truck as well as a fast robot with sparse scans; none is fitted to one log.
+    """
+
+    key_distance: Positive = 0.3
     """Way after which a scan joins the map, m."""
-    key_turn: float = 0.35
+    key_turn: Positive = 0.35
     """Turn after which a scan joins the map, rad."""
-    key_points: int = 360
+    key_points: Count = 360
     """Points kept of a key scan at most."""
-    key_cell: float = 0.04
+    key_cell: Positive = 0.04
     """About one point of a key scan is kept per square of this edge, m."""
-    longest: float = 30.0
+    longest: Positive = 30.0
     """Longer ranges are not used, m."""
-    odometry_floor: tuple[float, float] = (0.02, 0.05)
+    odometry_floor: tuple[Positive, Positive] = (0.02, 0.05)
     """Standard deviation of any odometry step, m and rad."""
-    odometry_distance: float = 0.1
+    odometry_distance: Positive = 0.1
     """Standard deviation of a way per metre, and of its sideways part."""
-    odometry_turn: tuple[float, float] = (0.2, 0.1)
+    odometry_turn: tuple[Positive, Positive] = (0.2, 0.1)
     """Standard deviation of a turn per radian turned and per metre driven, rad."""
-    blind_speed: tuple[float, float] = (0.5, 0.6)
+    blind_speed: tuple[Positive, Positive] = (0.5, 0.6)
     """Standard deviation of the motion predicted without odometry, m/s and rad/s."""
-    drift_distance: tuple[float, float] = (0.01, 0.01)
+    drift_distance: tuple[Positive, Positive] = (0.01, 0.01)
     """Standard deviation of the position of a matched key scan against its neighbour, m and per metre between them."""
-    drift_turn: tuple[float, float] = (0.003, 0.005)
+    drift_turn: tuple[Positive, Positive] = (0.003, 0.005)
     """The same of its yaw, rad and per radian between them."""
-    local_spread: float = 0.15
+    local_spread: Positive = 0.15
     """Key scans surer than this to each other, m, are mapped as one submap."""
-    local_reach: float = 5.0
+    local_reach: Positive = 5.0
     """Key scans up to this far from the robot make its submap, m."""
-    local_keys: int = 20
+    local_keys: Count = 20
     """Key scans of a submap at most."""
-    neighbours: int = 4
+    neighbours: Count = 4
     """Relations from a new key scan to those it overlaps."""
-    fastest: tuple[float, float] = (5.0, 1.0)
+    fastest: tuple[Positive, Positive] = (5.0, 1.0)
     """Odometry that claims a greater way is not believed, m/s and m besides (stamps come in bursts)."""
-    most_keys: int = 4000
+    most_keys: Count = 4000
     """Key scans at most; then the most dispensable go."""
-    thinning: float = 0.1
+    thinning: Positive = 0.1
     """Share of them that goes at once."""
-    most_scans: int = 200_000
+    most_scans: Count = 200_000
     """Scans of the trajectory at most; then every second one is forgotten."""
+
+
+class GridConfig(Schema):
+    """Occupancy grid: cells and sensor model."""
+
+    resolution: Annotated[float, Field(ge=0.01, le=1)] = 0.05
+    """Edge of a cell, m."""
+    hit: Annotated[float, Field(gt=0.5, lt=1)] = 0.7
+    """Probability that a cell in which a beam ends is occupied."""
+    miss: Annotated[float, Field(gt=0, lt=0.5)] = 0.4
+    """Probability that a cell a beam has passed is occupied."""
+    limit: Annotated[float, Field(gt=0.5, lt=1)] = 0.98
+    """No cell becomes surer than this, so that what moves away is forgotten."""
+    spacing: Positive = 0.1
+    """Scans join the grid after so much way, m,"""
+    turn: Positive = 0.1
+    """or turn, rad,"""
+    pause: Positive = 1.0
+    """or seconds."""
+    remembered: Annotated[int, Field(ge=16)] = 6000
+    """Scans kept to draw the grid anew after a loop closure; of more, every other old one is forgotten."""
+
+
+class SlamConfig(Schema):
+    """Simultaneous localisation and mapping, or localisation in a saved map."""
+
+    mode: Literal["mapping", "localisation"] = "mapping"
+    map: Path | None = None
+    """Folder of the saved map; needed for localisation"""
+    save: Path | None = None
+    """Folder the map is saved to at the end and every ``save_period`` seconds; null = nowhere"""
+    save_period: Positive = 60.0
+    front: Literal["planar", "kiss"] = "planar"
+    """Scan front end"""
+    mapper: MapperConfig = MapperConfig()
+    grid: GridConfig = GridConfig()
+    max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
+    """Scans whose plane was tilted more than this are left out, rad"""
+    ceiling: Positive | None = None
+    """Height of the ceiling over the base, m, where there is one"""
+    tiles_period: Positive = 1.0
+    """Seconds between two messages of changed tiles"""
+    map_period: Positive = 10.0
+    """Seconds after which a changed map is published whole, at the latest"""
+    slew: tuple[Positive, Positive] = (0.3, 0.5)
+    """The pose in map follows corrections no faster than this, m/s and rad/s, so that trackers see no jump,"""
+    jump: Positive = 1.0
+    """unless they are greater than this, m: then at once"""
+    latency: Annotated[float, Field(gt=0, le=1)] = 0.03
+    """Seconds after which a step of the worker counts on the virtual clock"""
+    deadline: Annotated[float, Field(gt=0, le=60)] = 20.0
+    """Seconds after which a silent worker is killed"""

@@ -8,10 +8,9 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.correlation import correlate
+from monstertruck_estimation.slam.correlation import Submap, correlate
 from monstertruck_estimation.slam.registration import Fit, register
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.submap import Submap
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import splu
 
-from monstertruck_estimation.slam.se2 import between, wrap
+from monstertruck_estimation.se2 import between, wrap
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -12,10 +12,10 @@ from kiss_icp.mapping import VoxelHashMap
 from kiss_icp.registration import get_registration
 from numpy.typing import NDArray
 
+from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.frontend import LEAST_PAIRS, Match, Verdict, judge, rejected
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.submap import Submap
 
 Array = NDArray[np.float64]
 

@@ -1,24 +1,27 @@
-"""What the wheels say about the way between two scans, and how far that is to be trusted."""
+"""Motion of the base between two scans: predicted from odometry, measured by matching; the offset of their clocks."""
 
 import math
+from collections import deque
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.se2 import between, rotation
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.frontend import Match
-from monstertruck_estimation.slam.se2 import between
+from monstertruck_estimation.slam.frontend import DOUBTFUL, Match
+from monstertruck_estimation.slam.worker_io import Moved
+from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
 
-MEMORY: Final = 40
+TRUST_MEMORY: Final = 40
 """Scans over which the trust in odometry is learned."""
-OUTLIER: Final = 4.0
+MAX_INNOVATION: Final = 4.0
 """Normalised innovations count as this at most."""
-LIMITS: Final = (1.0, 3.0)
+TRUST_LIMITS: Final = (1.0, 3.0)
 """Factor on the standard deviation of the way, at least and at most."""
-CLEAR: Final = (0.15, 0.75)
+CLEAR_MATCH: Final = (0.15, 0.75)
 """Degeneracy and overlap from which a match can tell the odometry's error."""
 FIT_NOISE: Final = 0.01
 """Standard deviation of a match itself, m."""
@@ -52,7 +55,7 @@ class MotionModel:
     @property
     def factor(self) -> float:
         """Factor on the standard deviation of the way."""
-        return min(max(math.sqrt(self._square), LIMITS[0]), LIMITS[1])
+        return min(max(math.sqrt(self._square), TRUST_LIMITS[0]), TRUST_LIMITS[1])
 
     @property
     def odom(self) -> Array | None:
@@ -89,9 +92,156 @@ class MotionModel:
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: Match) -> None:
         """Take what a match made of the prediction ``delta`` (covariance ``noise``): the base moved by ``moved``."""
         self._dt, self._delta = dt, moved
-        if self._odom is None or not match.accepted or match.degeneracy < CLEAR[0] or match.overlap < CLEAR[1]:
+        if (
+            self._odom is None
+            or not match.accepted
+            or match.degeneracy < CLEAR_MATCH[0]
+            or match.overlap < CLEAR_MATCH[1]
+        ):
             return
         off = between(delta, moved)
         place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE**2)
-        innovation = min(place, OUTLIER**2) * self.factor**2
-        self._square += (innovation - self._square) / MEMORY
+        innovation = min(place, MAX_INNOVATION**2) * self.factor**2
+        self._square += (innovation - self._square) / TRUST_MEMORY
+
+
+UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
+"""Added to every information: what a scan does not tell has a standard deviation of 100 m, or of 10 rad."""
+MATCH_FLOOR: Final = (0.002, 0.001)
+"""Standard deviation of any match, m and rad: the cells of the map are not finer."""
+OVERLAP_DROP: Final = 0.15
+"""So much less than usual a match may overlap to count again after a misfit."""
+OVERLAP_GAIN: Final = 0.05
+"""Weight of one match in the usual overlap."""
+
+
+class Increments:
+    """Relates every match to the one before it.
+
+    Beside odometry only matches that overlap well tell a motion, and none tells it across a misfit: the robot may have
+    been carried, and what fits half at a wrong place does not count before the overlap is as usual again. Where
+    nothing else tells any motion, misfits are stepped over, and what was accepted counts.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[int, Array] | None = None
+        self._usual = 0.0
+        """Overlap of the matches that counted, their running mean; 0 before the first."""
+        self._least = DOUBTFUL
+
+    def take(self, stamp: int, match: Match, pose: Array, *, alone: bool, corrected: bool = False) -> Moved | None:
+        """The motion since the last match that counts.
+
+        Args:
+            stamp: of the scan, ns.
+            match: the scan's place; its covariance contains the guess, its information does not.
+            pose: shape (3,), the same place after the step, when a loop may have been closed.
+            alone: there is no odometry.
+            corrected: the map was changed at this step: the next motion begins at ``pose``.
+        """
+        if match.information is None or not (alone or match.overlap >= self._least):
+            self._least = max(DOUBTFUL, self._usual - OVERLAP_DROP)
+            if corrected or not alone:
+                self._last = None
+            return None
+        self._least = DOUBTFUL
+        self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
+        last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose)
+        if last is None:
+            return None
+        since, origin = last
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(-match.pose[2])
+        covariance = turn @ np.linalg.inv(_known(match, match.information) + UNCONSTRAINED) @ turn.T
+        covariance = (covariance + covariance.T) / 2 + np.diag(
+            np.square((MATCH_FLOOR[0], MATCH_FLOOR[0], MATCH_FLOOR[1]))
+        )
+        x, y, yaw = between(origin, match.pose).tolist()
+        return Moved(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
+
+    def forget(self) -> None:
+        """What was before cannot be compared with what comes."""
+        self._last, self._least = None, DOUBTFUL
+
+
+def _known(match: Match, information: Array) -> Array:
+    """Information without what a degenerate match says along its weak direction.
+
+    That comes from no wall, but from the ends of the walls in sight, which go along with the robot.
+    """
+    if not match.degenerate:
+        return information
+    along = np.array((math.cos(match.direction), math.sin(match.direction), 0.0))
+    weight = information @ along
+    return information - np.outer(weight, weight) / max(float(along @ weight), 1e-9)
+
+
+OFFSET_SCANS: Final = 300
+"""Scans looked at."""
+OFFSET_LEAST_SCANS: Final = 120
+"""Scans needed."""
+OFFSET_PERIOD: Final = 40
+"""Scans between two looks."""
+OFFSET_LAGS: Final = np.arange(-12, 13) * 0.05
+"""Offsets tried, s."""
+LEAST_OFFSET: Final = 0.09
+"""Smaller offsets are within the noise, s."""
+LEAST_EXCITATION: Final = 0.05
+"""Standard deviation of the turning without which nothing can be told, rad/s."""
+LEAST_CORRELATION: Final = 0.8
+"""Least correlation at the offset."""
+CORRELATION_GAIN: Final = 0.08
+"""How much better it must be than at zero."""
+
+
+class OffsetWatch:
+    """Collects matched and wheel headings of one run."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, float, float]] = deque(maxlen=OFFSET_SCANS)
+        self._seen = 0
+        self.offset: float | None = None
+        """Seconds by which odometry runs ahead of the scans; None = not known, or none."""
+
+    def add(self, stamp: int, matched: float, odom: float) -> None:
+        """Take the yaw of an accepted match and that of odometry, both rad at ``stamp``, ns."""
+        self._samples.append((stamp, matched, odom))
+        self._seen += 1
+        if self._seen % OFFSET_PERIOD == 0 and len(self._samples) >= OFFSET_LEAST_SCANS:
+            self.offset = find_offset(*(np.array(column) for column in zip(*self._samples, strict=True)))
+
+
+def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
+    """Seconds by which ``odom`` runs ahead of ``matched``; None if there is no clear offset.
+
+    Args:
+        stamps: shape (n,), ns, rising.
+        matched: shape (n,), yaw by the scans, rad.
+        odom: shape (n,), yaw by the wheels, rad.
+    """
+    times = (stamps - stamps[0]) / SECOND
+    wheel, scan = np.unwrap(odom), np.unwrap(matched)
+    margin = float(OFFSET_LAGS[-1])
+    inside = (times[:-1] >= margin) & (times[1:] <= times[-1] - margin)
+    steps = np.diff(times)[inside]
+    turning = np.diff(scan)[inside] / steps if len(steps) else np.zeros(0)
+    if len(turning) < OFFSET_LEAST_SCANS // 2 or turning.std() < LEAST_EXCITATION:
+        return None
+    likeness = np.array([_correlation(turning, times, wheel, lag, inside) for lag in OFFSET_LAGS])
+    best, still = int(np.argmax(likeness)), likeness[np.argmin(np.abs(OFFSET_LAGS))]
+    if (
+        abs(OFFSET_LAGS[best]) < LEAST_OFFSET
+        or likeness[best] < LEAST_CORRELATION
+        or likeness[best] - still < CORRELATION_GAIN
+    ):
+        return None
+    return -float(OFFSET_LAGS[best])
+
+
+def _correlation(turning: Array, times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> float:
+    shifted = np.interp(times + lag, times, wheel)
+    turned = np.diff(shifted)[inside] / np.diff(times)[inside]
+    spread = turned.std()
+    if spread < LEAST_EXCITATION:
+        return 0.0
+    return float(np.mean((turning - turning.mean()) * (turned - turned.mean())) / (turning.std() * spread))

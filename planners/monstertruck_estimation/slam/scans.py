@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from monstertruck_estimation.slam.worker_io import ScanInput, Vector
+
 Array = NDArray[np.float64]
 
 RANGE_NOISE: Final = 0.012
@@ -29,6 +31,11 @@ SLIDE: Final = 5.0
 """Standard deviation along a line, m: none of what a scan knows."""
 GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0
 """Multiples of it, less their whole part, are an even mixture of early and late beams."""
+
+
+GROUND: Final = 0.05
+"""Beams that end this near to ground or ceiling hit those, m."""
+STEEPEST: Final = math.sin(math.radians(60))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +112,48 @@ def prepare(
         np.array(twist, dtype=np.float64),
     )
     return Scan(*elements)
+
+
+def prepared(inputs: ScanInput, longest: float, twist: Vector = (0.0, 0.0, 0.0)) -> Scan:
+    """Points of a scan in base: motion undone, levelled, without what hit the ground or the ceiling.
+
+    Args:
+        inputs: the scan.
+        longest: longer ranges are not used, m.
+        twist: of the base, m/s and rad/s, if odometry does not tell it.
+    """
+    geometry = ScanGeometry(
+        inputs.start_angle,
+        inputs.angle_increment,
+        inputs.range_min,
+        inputs.range_max,
+        inputs.time_increment,
+        inputs.mount,
+    )
+    return prepare(levelled(inputs), geometry, twist if inputs.odom is None else inputs.twist, longest)
+
+
+def levelled(inputs: ScanInput) -> Array:
+    """Ranges in the horizontal; NaN where a beam met the ground or the ceiling.
+
+    A beam at angle a rises by cos(a) sx + sin(a) sy a metre, with the ``slopes`` (sx, sy) of the sensor's axes.
+    """
+    ranges = np.asarray(inputs.ranges, dtype=np.float64)
+    if inputs.slopes is None:
+        return ranges
+    angles = inputs.start_angle + inputs.angle_increment * np.arange(len(ranges))
+    rise = np.clip(np.cos(angles) * inputs.slopes[0] + np.sin(angles) * inputs.slopes[1], -STEEPEST, STEEPEST)
+    result: Array = ranges * np.sqrt(1.0 - rise**2)
+    # Levelling must not turn a no-return just beyond the limit into a range.
+    result[~(ranges < inputs.range_max)] = np.inf
+    if inputs.height is not None:
+        with np.errstate(invalid="ignore"):
+            ends = inputs.height + ranges * rise
+            hit = ends < GROUND
+            if inputs.ceiling is not None:
+                hit |= ends > inputs.ceiling - GROUND
+        result[hit] = np.nan
+    return result
 
 
 @njit(cache=True)

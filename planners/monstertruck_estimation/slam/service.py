@@ -3,18 +3,26 @@
 import asyncio
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_estimation.correction import Correction
 from monstertruck_estimation.scan_tilt import Track, plane_slopes
-from monstertruck_estimation.slam.correction import Correction
-from monstertruck_estimation.slam.exchange import Estimate, ScanInput, Start, Vector, WorkerInput, WorkerOutput
-from monstertruck_estimation.slam.messages import grid_message, scan_motion, slam_health
-from monstertruck_estimation.slam.se2 import between, interpolate
-from monstertruck_estimation.slam.settings import SlamConfig
+from monstertruck_estimation.se2 import between, interpolate
+from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_estimation.slam.worker_io import (
+    Estimate,
+    Moved,
+    Patch,
+    ScanInput,
+    Start,
+    Vector,
+    WorkerInput,
+    WorkerOutput,
+)
 from monstertruck_estimation.transforms import planar
 from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
@@ -29,7 +37,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
-TARGET: Final = "monstertruck_estimation.slam.step:EstimationWorker"
+TARGET: Final = "monstertruck_estimation.slam.worker:EstimationWorker"
 PATIENCE: Final = 180.0
 """Real seconds the worker may take to start: the first time it compiles."""
 HISTORY: Final = 128
@@ -329,3 +337,59 @@ class SlamService:
             self._events(Reason.MAP_SAVED, Severity.INFO, self.name, outputs.saved)
         if outputs.error is not None:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")
+
+
+def grid_message(patch: Patch, now: int, seq: int) -> Grid:
+    """A patch of the map as a grid of its own."""
+    rows, columns = patch.cells.shape
+    cells = np.ascontiguousarray(patch.cells).reshape(-1)
+    cells.flags.writeable = False
+    x, y = patch.origin
+    return Grid(
+        stamp=now,
+        received=now,
+        seq=seq,
+        frame="map",
+        resolution=patch.resolution,
+        width=columns,
+        height=rows,
+        origin=Pose2D(x=x, y=y, yaw=0.0),
+        cells=cells,
+    )
+
+
+def scan_motion(stamp: int, moved: Moved, now: int, seq: int) -> ScanMotion:
+    """Motion of base between two scans."""
+    x, y, yaw = moved.motion
+    return ScanMotion(
+        stamp=stamp,
+        received=now,
+        seq=seq,
+        frame="base",
+        since=moved.since,
+        motion=Pose2D(x=x, y=y, yaw=yaw),
+        covariance=np.array(moved.covariance),
+    )
+
+
+def slam_health(estimate: Estimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int) -> SlamHealth:
+    """How the newest scan fitted; ``lost`` are the scans left out and those dropped."""
+    return SlamHealth(
+        stamp=estimate.stamp,
+        received=now,
+        seq=seq,
+        frame="map",
+        standing=estimate.standing,
+        accepted=estimate.verdict == "accepted",
+        overlap=min(max(estimate.overlap, 0.0), 1.0),
+        residual=estimate.residual,
+        degeneracy=estimate.degeneracy,
+        direction=estimate.direction,
+        scans=counts["scans"],
+        keys=counts["keys"],
+        closures=counts["closures"],
+        rejected=counts["rejected"],
+        left_out=lost[0],
+        drops=lost[1],
+        offset=estimate.offset,
+    )

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monstertruck_estimation.spread import Spread
+from monstertruck_estimation.odometry import Spread
 
 NUMBER = st.floats(-3.0, 3.0)
 ROOT = st.lists(NUMBER, min_size=9, max_size=9).map(lambda numbers: np.reshape(numbers, (3, 3)))

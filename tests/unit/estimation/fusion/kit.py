@@ -6,7 +6,7 @@ import numpy as np
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
-from monstertruck_estimation.slam.se2 import between, compose
+from monstertruck_estimation.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import Attitude, Vector3

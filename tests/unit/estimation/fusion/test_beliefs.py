@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 
-from monstertruck_estimation.fusion.beliefs import advanced, initial, predicted
-from monstertruck_estimation.fusion.history import History
-from monstertruck_estimation.fusion.operations import Heading, ScanMark, ScanWay, WheelWay
-from monstertruck_estimation.slam.se2 import between, between_jacobians
+from monstertruck_estimation.fusion.estimator import History
+from monstertruck_estimation.fusion.filter import Heading, ScanMark, ScanWay, WheelWay, advanced, initial, predicted
+from monstertruck_estimation.se2 import between, between_jacobians
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.fusion.kit import config
 

@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from monstertruck_estimation.fusion.beliefs import NORTH
 from monstertruck_estimation.fusion.config import WheelTrust
+from monstertruck_estimation.fusion.filter import NORTH
 from tests.unit.estimation.fusion.kit import FIELD, Rig, attitude
 
 SENSORS = ("wheels", "compass")

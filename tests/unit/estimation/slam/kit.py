@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 
-from monstertruck_estimation.slam.mapper import Mapper, Step
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.mapping import Mapper, Step
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
-from monstertruck_estimation.slam.se2 import between, compose
 
 BEAMS = 240
 LIDAR = ScanGeometry(-math.radians(120), math.radians(240) / (BEAMS - 1), 0.02, 5.6)

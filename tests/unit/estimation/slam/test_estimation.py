@@ -7,16 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_estimation.correction import Correction
 from monstertruck_estimation.scan_tilt import plane_slopes, plane_tilt
-from monstertruck_estimation.slam import step as estimation
 from monstertruck_estimation.slam import storage
-from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.correction import Correction
-from monstertruck_estimation.slam.estimator import levelled
-from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput, WorkerOutput
-from monstertruck_estimation.slam.settings import SlamConfig
-from monstertruck_estimation.slam.step import EstimationWorker
-from monstertruck_estimation.slam.time_offset import find_offset
+from monstertruck_estimation.slam import worker as estimation
+from monstertruck_estimation.slam.config import MapperConfig, SlamConfig
+from monstertruck_estimation.slam.motion import find_offset
+from monstertruck_estimation.slam.scans import levelled
+from monstertruck_estimation.slam.worker import EstimationWorker
+from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import Standing
@@ -79,9 +78,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_worker_gives_memory_back_when_the_map_is_thinned(monkeypatch: pytest.MonkeyPatch):
     given = []
     monkeypatch.setattr(estimation, "give_back", lambda: given.append(True))
-    monkeypatch.setattr(estimation, "mapper_config", lambda _: MapperConfig(most_keys=10))
     worker, rng = EstimationWorker(), np.random.default_rng(1)
-    worker.step(WorkerInput(start=Start(SlamConfig(), tuple(pose_at(0).tolist()))))
+    config = SlamConfig(mapper=MapperConfig(most_keys=10))
+    worker.step(WorkerInput(start=Start(config, tuple(pose_at(0).tolist()))))
     thinned = 0
     for i in range(100):
         estimate = worker.step(WorkerInput(scan=scan_at(i, rng))).estimate

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.graph import Edges, drift, optimise, residuals, trust
-from monstertruck_estimation.slam.se2 import between, compose
-from monstertruck_estimation.slam.thinning import thinned
+from monstertruck_estimation.slam.keyframes import thinned
 from tests.unit.estimation.slam.kit import errors, rounds
 
 SURE = np.diag((1e4, 1e4, 4e4))

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.grid import TILE, OccupancyGrid
-from monstertruck_estimation.slam.painter import Painter
+from monstertruck_estimation.slam.config import GridConfig
+from monstertruck_estimation.slam.grid import TILE, OccupancyGrid, Painter
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.settings import GridConfig
 from monstertruck_estimation.slam.storage import elements
 
 ORIGIN = np.zeros(2)

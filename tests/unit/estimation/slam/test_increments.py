@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.frontend import Match, Verdict, rejected
-from monstertruck_estimation.slam.increments import Increments
+from monstertruck_estimation.slam.motion import Increments
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))
 

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.kiss import Kiss
-from monstertruck_estimation.slam.mapper import Event, Mapper
+from monstertruck_estimation.slam.mapping import Event, Mapper
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
-from monstertruck_estimation.slam.se2 import between, compose
 from tests.unit.estimation.slam.kit import (
     BEAMS,
     CORRIDOR,

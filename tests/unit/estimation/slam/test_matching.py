@@ -3,13 +3,12 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.correlation import LikelihoodGrid, correlate
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
 from monstertruck_estimation.slam.frontend import Planar, Verdict
 from monstertruck_estimation.slam.kiss import Kiss
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
-from monstertruck_estimation.slam.se2 import between, compose
-from monstertruck_estimation.slam.submap import Submap, merged
 from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, scan
 
 PLACE = np.array((1.8, 0.2, 1.2))

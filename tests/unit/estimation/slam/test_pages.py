@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from monstertruck_estimation.slam.painter import PAGE, Pages
+from monstertruck_estimation.slam.grid import PAGE_POINTS, Pages
 
 
 def test_scans_are_remembered_as_they_came():
@@ -28,15 +28,15 @@ def test_what_is_forgotten_leaves_no_hole():
         expected = [expected[k] for k in kept]
         assert all(np.array_equal(pages[k], scan) for k, scan in enumerate(expected))
         most = max(most, len(pages._pages))
-    assert most * PAGE < 1.3 * 240 * 5000 / 2 + 2 * PAGE
+    assert most * PAGE_POINTS < 1.3 * 240 * 5000 / 2 + 2 * PAGE_POINTS
 
 
 def test_a_scan_may_be_larger_than_a_page():
     pages = Pages()
-    scans = [np.full((count, 2), k, np.int16) for k, count in enumerate((10, PAGE + 5, 3, 2 * PAGE, 7))]
+    scans = [np.full((count, 2), k, np.int16) for k, count in enumerate((10, PAGE_POINTS + 5, 3, 2 * PAGE_POINTS, 7))]
     for scan in scans:
         pages.append(scan)
     pages.keep([1, 3, 4])
-    assert [len(pages[k]) for k in range(3)] == [PAGE + 5, 2 * PAGE, 7]
+    assert [len(pages[k]) for k in range(3)] == [PAGE_POINTS + 5, 2 * PAGE_POINTS, 7]
     assert [int(pages[k][0, 0]) for k in range(3)] == [1, 3, 4]
     assert all((pages[k] == pages[k][0, 0]).all() for k in range(3))

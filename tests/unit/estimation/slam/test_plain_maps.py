@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput
-from monstertruck_estimation.slam.settings import SlamConfig
-from monstertruck_estimation.slam.step import EstimationWorker
-from monstertruck_estimation.slam.surfaces import surfaces_of
+from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_estimation.slam.storage import surfaces_of
+from monstertruck_estimation.slam.worker import EstimationWorker
+from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_schemas.base import Pose2D

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.se2 import between
-from monstertruck_estimation.slam.store import Trail
+from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam.keyframes import Trail
 
 
 def straight(count: int = 9, every: int = 4) -> tuple[Trail, np.ndarray]:

@@ -7,6 +7,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_schemas.health import Standing
 from monstertruck_schemas.sensor import LaserScan
 
@@ -75,8 +76,7 @@ class ScanInput:
 class Start:
     """How a worker begins."""
 
-    config: object
-    """A ``SlamConfig``."""
+    config: SlamConfig
     pose: Vector = (0.0, 0.0, 0.0)
     """Base in map at the first scan."""
 

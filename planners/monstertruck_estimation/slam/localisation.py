@@ -11,21 +11,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.correlation import correlate
-from monstertruck_estimation.slam.estimator import LOST_AFTER, estimate, standing_of
-from monstertruck_estimation.slam.exchange import Estimate, Patch, ScanInput, Vector
+from monstertruck_estimation.slam.correlation import Submap, correlate, merged
 from monstertruck_estimation.slam.frontend import DOUBTFUL, Match, Planar, Verdict, deviations, rejected
-from monstertruck_estimation.slam.increments import Increments
-from monstertruck_estimation.slam.mapper import Event, Mapper
-from monstertruck_estimation.slam.motion import MotionModel
+from monstertruck_estimation.slam.mapping import LOST_AFTER, Event, Mapper, estimate, standing_of
+from monstertruck_estimation.slam.motion import Increments, MotionModel, OffsetWatch
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, spread
-from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, inverse
-from monstertruck_estimation.slam.storage import Graph, SavedMap
-from monstertruck_estimation.slam.submap import Submap, merged
-from monstertruck_estimation.slam.surfaces import surfaces_of
-from monstertruck_estimation.slam.time_offset import OffsetWatch
+from monstertruck_estimation.slam.storage import Graph, SavedMap, surfaces_of
+from monstertruck_estimation.slam.worker_io import Estimate, Patch, ScanInput, Vector
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import Standing

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.exchange import Vector
-from monstertruck_estimation.slam.se2 import between, compose, inverse
+from monstertruck_estimation.se2 import between, compose, inverse
+from monstertruck_estimation.slam.worker_io import Vector
 
 Array = NDArray[np.float64]
 

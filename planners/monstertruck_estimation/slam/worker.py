@@ -1,4 +1,4 @@
-"""Worker that maps or localises: ``monstertruck_estimation.slam.step:EstimationWorker``.
+"""Worker that maps or localises: ``monstertruck_estimation.slam.worker:EstimationWorker``.
 
 A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
 """
@@ -6,13 +6,12 @@ A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first
 import numpy as np
 
 from monstertruck_estimation.slam import storage
-from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.estimator import Estimator, MappingEstimator, mapper_config, prepared
-from monstertruck_estimation.slam.exchange import ScanInput, Start, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.frontend import FrontEnd
-from monstertruck_estimation.slam.localise import LocalisingEstimator
-from monstertruck_estimation.slam.mapper import Event
-from monstertruck_estimation.slam.settings import GridConfig, SlamConfig
+from monstertruck_estimation.slam.localisation import LocalisingEstimator
+from monstertruck_estimation.slam.mapping import Estimator, Event, MappingEstimator
+from monstertruck_estimation.slam.scans import prepared
+from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 
@@ -62,8 +61,7 @@ class EstimationWorker:
 
     def _begin(self, start: Start) -> None:
         config = start.config
-        assert isinstance(config, SlamConfig)
-        settings = mapper_config(config)
+        settings = config.mapper
         self._longest = settings.longest
         if config.mode == "localisation":
             assert config.map is not None

@@ -1,17 +1,4 @@
-"""The filter: an error-state extended Kalman filter with stochastic clones, as pure functions of a frozen belief.
-
-State: pose in odom (x, y, yaw), velocity in base (vx, vy, wz), north (yaw in odom at which the compass reads 0: the
-bias of the compass), trim (the bias of the wheels' curvature, rad/m), the place of the last scan, the pose at the
-last wheel reading, and the local deviation of the compass (iron near by, and what is left of the truck's own). That
-lasts two metres or a radian: readings taken close together err alike, and a magnet that comes nearer moves it rather
-than the yaw. All errors are additive, yaw on the circle.
-
-Wheels and scans tell motion between two instants, so they are compared with the pose and the clone of the earlier one;
-pose and clone stay correlated, and nothing is counted twice (Roumeliotis and Burdick, "Stochastic cloning", 2002).
-The clone of a scan is the pose as the scan saw it, error included: scans are matched to one map, so the error of the
-later scan of one motion is that of the earlier scan of the next, and must not add up as if they were independent.
-Covariances are updated in Joseph's form, which keeps them symmetric and positive.
-"""
+"""What may happen to the belief, each at its instant."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -20,15 +7,70 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.fusion.compass_gate import Evidence, Gate, Verdict, judged
 from monstertruck_estimation.fusion.config import LASTING, FusionConfig
-from monstertruck_estimation.fusion.heading import Evidence, Gate, Verdict, judged
-from monstertruck_estimation.fusion.operations import Heading, Operation, ScanMark, ScanWay, WheelWay
-from monstertruck_estimation.slam.se2 import between, between_jacobians, rotation
+from monstertruck_estimation.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WheelWay:
+    """The base moved by ``delta`` (dx, dy, dyaw in base at ``since``), say the wheels."""
+
+    since: int
+    stamp: int
+    delta: Array
+    """Shape (3,), m and rad, as if on level ground."""
+    covariance: Array
+    """Shape (3, 3)."""
+    slipping: bool = False
+    """The wheels are known not to hold the ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanWay:
+    """The base moved by ``delta`` between two scans."""
+
+    since: int
+    stamp: int
+    delta: Array
+    """Shape (3,), m and rad."""
+    covariance: Array
+    """Shape (3, 3), of the later scan's place on the map both are matched to, in base's axes; huge along a corridor."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMark:
+    """A scan was taken; a later one will tell how the base moved since."""
+
+    stamp: int
+    covariance: Array
+    """Shape (3, 3), of its place, as in ``ScanWay``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A reading of the compass."""
+
+    stamp: int
+    yaw: float
+    """Counter-clockwise from magnetic north, rad."""
+    disturbed: bool = False
+    """The device itself says so."""
+    taken_back: bool = False
+    """A disturbance was noticed soon after it."""
+    field: float | None = None
+    """Strength of the magnetic field, in the device's unit."""
+    tilt: tuple[float, float] | None = None
+    """Roll and pitch, rad, while they are tilt."""
+
+
+Operation = WheelWay | ScanWay | ScanMark | Heading
+
 
 SIZE: Final = 15
 POSE: Final = slice(0, 3)

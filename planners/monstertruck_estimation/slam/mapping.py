@@ -4,24 +4,27 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from functools import partial
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.closure import LoopCloser
-from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
+from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.frontend import DOUBTFUL, LEAST_PAIRS, FrontEnd, Match, Planar, Verdict, rejected
-from monstertruck_estimation.slam.keymap import KeyMap
-from monstertruck_estimation.slam.motion import MotionModel, velocity
-from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.se2 import between, compose, compose_jacobians, inverse
-from monstertruck_estimation.slam.store import Trail
-from monstertruck_estimation.slam.submap import Submap
+from monstertruck_estimation.slam.grid import Painter
+from monstertruck_estimation.slam.keyframes import KeyMap, Trail
+from monstertruck_estimation.slam.motion import Increments, MotionModel, OffsetWatch, velocity
+from monstertruck_estimation.slam.scans import Scan, prepared
+from monstertruck_estimation.slam.storage import Graph, graph_of
+from monstertruck_estimation.slam.worker_io import Estimate, Moved, Patch, ScanInput, Vector
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.health import Standing
 
 Array = NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 SWIFT: Final = (0.02, 0.5)
 """Scans this far apart tell the velocity during a scan, s."""
@@ -63,9 +66,12 @@ class Mapper:
     Args:
         config: noise models and limits.
         front: the scan front end; ``Planar`` if not given.
+        start: base in map at the first scan.
     """
 
-    def __init__(self, config: MapperConfig | None = None, front: FrontEnd | None = None) -> None:
+    def __init__(
+        self, config: MapperConfig | None = None, front: FrontEnd | None = None, start: Vector = (0.0, 0.0, 0.0)
+    ) -> None:
         self.config = config or MapperConfig()
         self.map = KeyMap(self.config)
         self._front: FrontEnd = front or Planar()
@@ -73,7 +79,7 @@ class Mapper:
         self._closer = LoopCloser()
         self._trail = Trail(self.config.most_scans)
         self._stamp: int | None = None
-        self._pose = np.zeros(3)
+        self._pose = np.array(start, dtype=np.float64)
         self._covariance = np.zeros((3, 3))
         self._submap: Submap | None = None
         self._local: NDArray[np.intp] = np.zeros(0, np.intp)
@@ -193,3 +199,164 @@ def _moved(pose: Array, covariance: Array, delta: Array, noise: Array) -> tuple[
     """Pose and covariance after a motion ``delta`` of covariance ``noise``."""
     by_pose, by_delta = compose_jacobians(pose, delta)
     return compose(pose, delta), by_pose @ covariance @ by_pose.T + by_delta @ noise @ by_delta.T
+
+
+LOST_AFTER: Final = 10
+"""Scans in a row that do not fit, after which the robot is lost."""
+
+
+class Estimator(Protocol):
+    """What the worker drives: mapping, or localisation in a saved map."""
+
+    counts: dict[str, int]
+    """Scans, key scans, closures, rejected matches."""
+
+    @property
+    def twist(self) -> Vector:
+        """Velocity of base by the last scans, m/s and rad/s."""
+        ...
+
+    def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
+        """Take a scan; None if it is not later than the one before."""
+        ...
+
+    def changes(self) -> tuple[list[Patch], bool]:
+        """Tiles that have changed since the last call, and whether the grid was drawn anew."""
+        ...
+
+    def patch(self) -> Patch:
+        """The whole grid."""
+        ...
+
+    def graph(self) -> Graph | None:
+        """What can be saved beside the grid."""
+        ...
+
+    def finish(self) -> None:
+        """Fit everything jointly."""
+        ...
+
+
+class MappingEstimator:
+    """The mapper with its grid.
+
+    Args:
+        mapper: noise models and limits.
+        grid: of the occupancy grid.
+        front: scan front end; None = the default one.
+        start: base in map at the first scan.
+    """
+
+    def __init__(
+        self, mapper: MapperConfig, grid: GridConfig, front: FrontEnd | None = None, start: Vector = (0.0, 0.0, 0.0)
+    ) -> None:
+        self.mapper = Mapper(mapper, front, start)
+        self.painter = Painter(grid)
+        self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0}
+        self._moved = False
+        self._redrawn = False
+        self._misfits = 0
+        self._offset = OffsetWatch()
+        self._increments = Increments()
+
+    @property
+    def twist(self) -> Vector:
+        """See ``Estimator``."""
+        return self.mapper.twist
+
+    def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
+        """See ``Estimator``."""
+        odom = None if inputs.odom is None else np.array(inputs.odom)
+        swept = odom is None and inputs.time_increment > 0
+        again = partial(prepared, inputs, self.mapper.config.longest) if swept else None
+        period = inputs.time_increment * math.tau / inputs.angle_increment if swept else 0.0
+        step = self.mapper.step(scan, inputs.stamp, odom, again, period)
+        if step is None:
+            return None
+        accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.map) == 1)
+        self._misfits = 0 if accepted else self._misfits + 1
+        self.counts["scans"] += 1
+        self.counts["keys"] = len(self.mapper.map)
+        self.counts["closures"] += Event.CLOSED in step.events
+        self.counts["rejected"] += Event.REJECTED in step.events
+        self._moved |= Event.CLOSED in step.events
+        if accepted:
+            self.painter.add(step.scan, step.stamp, step.pose, inputs.mount)
+            if inputs.odom is not None:
+                self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
+        closed = Event.CLOSED in step.events
+        moved = self._increments.take(step.stamp, step.match, step.pose, alone=inputs.odom is None, corrected=closed)
+        standing = Standing.LOST if self._misfits >= LOST_AFTER else standing_of(step.match, Standing.MAPPING)
+        return estimate(
+            step.stamp,
+            (step.pose, step.covariance, step.map_from_odom),
+            step.match,
+            standing,
+            tuple(map(str, step.events)),
+            self._offset.offset,
+            moved,
+        )
+
+    def changes(self) -> tuple[list[Patch], bool]:
+        """See ``Estimator``."""
+        self._follow()
+        redrawn, self._redrawn = self._redrawn, False
+        return self.painter.grid.changes(), redrawn
+
+    def patch(self) -> Patch:
+        """See ``Estimator``."""
+        self._follow()
+        return self.painter.grid.patch()
+
+    def graph(self) -> Graph | None:
+        """See ``Estimator``."""
+        return graph_of(self.mapper.map)
+
+    def finish(self) -> None:
+        """See ``Estimator``."""
+        self.mapper.finish()
+        self._moved = True
+
+    def _follow(self) -> None:
+        if self._moved:
+            self._moved = False
+            self._redrawn |= self.painter.follow(*self.mapper.trajectory())
+
+
+def standing_of(match: Match, good: Standing) -> Standing:
+    """``good``, unless the match says nothing along one direction."""
+    return Standing.DEGENERATE if match.accepted and match.degenerate else good
+
+
+def estimate(
+    stamp: int,
+    placed: tuple[Array, Array, Array | None],
+    match: Match,
+    standing: Standing,
+    events: tuple[str, ...],
+    offset: float | None,
+    moved: Moved | None = None,
+) -> Estimate:
+    """Plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
+    pose, covariance, correction = placed
+    return Estimate(
+        stamp=stamp,
+        pose=plain(pose),
+        covariance=tuple(float(value) for value in covariance.ravel()),
+        map_from_odom=None if correction is None else plain(correction),
+        standing=standing,
+        overlap=match.overlap,
+        residual=match.residual,
+        degeneracy=match.degeneracy,
+        direction=match.direction,
+        verdict=str(match.verdict),
+        events=events,
+        offset=offset,
+        moved=moved,
+    )
+
+
+def plain(pose: Any) -> Vector:
+    """A pose as three floats."""
+    x, y, yaw = (float(value) for value in pose)
+    return x, y, yaw

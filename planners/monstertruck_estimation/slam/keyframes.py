@@ -1,0 +1,499 @@
+"""Key scans and the relations between them: arrays that grow, and forget when told to."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse, wrap
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.correlation import Submap, merged
+from monstertruck_estimation.slam.frontend import deviations
+from monstertruck_estimation.slam.graph import Edges, drift, optimise
+from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equations, register
+from monstertruck_estimation.slam.scans import Scan
+
+Array = NDArray[np.float64]
+
+INITIAL_ROWS: Final = 64
+"""Rows at the beginning."""
+
+
+class Rows:
+    """Rows of one shape, appended in constant time."""
+
+    def __init__(self, *shape: int, dtype: type = float) -> None:
+        self._data: NDArray[Any] = np.zeros((INITIAL_ROWS, *shape), dtype)
+        self._count = 0
+
+    def append(self, row: object) -> None:
+        """Add one row."""
+        if self._count == len(self._data):
+            self._data = np.concatenate((self._data, np.zeros_like(self._data)))
+        self._data[self._count] = row
+        self._count += 1
+
+    def set(self, rows: NDArray[Any]) -> None:
+        """Have these rows and no others."""
+        data = np.zeros((max(INITIAL_ROWS, len(rows)), *self._data.shape[1:]), self._data.dtype)
+        data[: len(rows)] = rows
+        self._data, self._count = data, len(rows)
+
+    @property
+    def view(self) -> NDArray[Any]:
+        """The rows, not copied."""
+        return self._data[: self._count]
+
+    def __len__(self) -> int:
+        return self._count
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A scan that the map is made of."""
+
+    stamp: int
+    """ns."""
+    scan: Scan
+    """Thinned points in base."""
+    cloud: Cloud
+    """The same, hashed."""
+
+
+class EdgeStore:
+    """Growing ``Edges``."""
+
+    def __init__(self) -> None:
+        self._ends = Rows(2, dtype=np.int64)
+        self._measured = Rows(3)
+        self._information = Rows(3, 3)
+        self._spread = Rows(2)
+        self._loop = Rows(dtype=bool)
+        self._odometry = Rows(dtype=bool)
+
+    def add(
+        self,
+        origin: int,
+        target: int,
+        measured: Array,
+        information: Array,
+        spread: tuple[float, float],
+        *,
+        loop: bool = False,
+        odometry: bool = False,
+    ) -> None:
+        """One relation; ``spread`` are the variances (m^2, rad^2) with which it takes part in drift bounds."""
+        self._ends.append((origin, target))
+        self._measured.append(measured)
+        self._information.append(information)
+        self._spread.append(spread)
+        self._loop.append(loop)
+        self._odometry.append(odometry)
+
+    def cut(self, count: int) -> None:
+        """Forget all relations after the first ``count``."""
+        for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
+            rows.set(rows.view[:count])
+
+    def replace(self, edges: Edges, spread: Array, odometry: NDArray[np.bool_]) -> None:
+        """Have these relations and no others."""
+        self._ends.set(np.stack((edges.origin, edges.target), axis=1))
+        self._measured.set(edges.measured)
+        self._information.set(edges.information)
+        self._spread.set(spread)
+        self._loop.set(edges.loop)
+        self._odometry.set(odometry)
+
+    def edges(self) -> Edges:
+        """Views of all relations."""
+        ends = self._ends.view
+        return Edges(ends[:, 0], ends[:, 1], self._measured.view, self._information.view, self._loop.view)
+
+    @property
+    def spread(self) -> Array:
+        """Shape (n, 2)."""
+        return self._spread.view
+
+    @property
+    def odometry(self) -> NDArray[np.bool_]:
+        """Shape (n,): whether odometry gave the relation."""
+        return self._odometry.view
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+
+class Trail:
+    """Every scan's place relative to a key scan, so that the whole trajectory moves with the graph.
+
+    A scan that becomes a key scan is there twice: where the key scan before it saw it, and as itself. What the graph
+    has moved the one against the other is spread over the scans between, or every key scan would be a jolt.
+
+    Args:
+        most: scans remembered; beyond that every second one is forgotten.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._stamps = Rows(dtype=np.int64)
+        self._keys = Rows(dtype=np.int64)
+        self._relative = Rows(3)
+
+    def append(self, stamp: int, key: int, relative: Array) -> None:
+        """One more scan."""
+        self._stamps.append(stamp)
+        self._keys.append(key)
+        self._relative.append(relative)
+        if len(self._stamps) > self._most:
+            for rows in (self._stamps, self._keys, self._relative):
+                rows.set(rows.view[::2])
+
+    def move(self, stand_in: NDArray[np.int64], offset: Array) -> None:
+        """Key k is now known as ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
+        keys = self._keys.view
+        self._relative.set(compose(offset[keys], self._relative.view))
+        self._keys.set(stand_in[keys])
+
+    def poses(self, keys: Array) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (n,) and poses (n, 3), given those of the key scans."""
+        stamps = self._stamps.view.copy()
+        poses = compose(keys[self._keys.view], self._relative.view)
+        joints = np.flatnonzero(stamps[1:] == stamps[:-1])
+        apart = poses[joints + 1] - poses[joints]
+        apart[:, 2] = wrap(apart[:, 2])
+        begins = np.append(0, joints + 1)[: len(joints)]
+        for begin, end, off in zip(begins, joints, apart, strict=True):
+            share = (stamps[begin:end] - stamps[begin]) / max(stamps[end] - stamps[begin], 1)
+            poses[begin:end] += share[:, None] * off
+        return np.delete(stamps, joints), np.delete(poses, joints, axis=0)
+
+
+Numbers = NDArray[np.intp]
+
+RECENT: Final = 5
+"""Key scans this few apart are neighbours in time: their relation is no loop."""
+LINK_OVERLAP: Final = 0.4
+LINK_PAIRS: Final = 20
+LINK_FARTHEST: Final = (0.15, 0.1)
+"""Two key scans that the submap put right do not move further than this against each other, m and rad."""
+LINK_FLOOR: Final = (0.005, 0.005, 0.002)
+"""Standard deviation of any relation between scans, m and rad."""
+VIEW: Final = 0.7
+"""A radian between two views counts as this many metres."""
+
+
+class KeyMap:
+    """Key scans with poses in map, and the graph between them.
+
+    Args:
+        config: noise and limits.
+    """
+
+    def __init__(self, config: MapperConfig) -> None:
+        self.config = config
+        self.keys: list[Key] = []
+        self.poses: Array = np.zeros((0, 3))
+        self.edges = EdgeStore()
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def add(self, scan: Scan, stamp: int, pose: Array) -> None:
+        """A new key scan, without relations."""
+        kept = scan.thinned(self.config.key_cell, self.config.key_points)
+        self.keys.append(Key(stamp, kept, Cloud.of(kept)))
+        self.poses = np.vstack((self.poses, pose))
+
+    def relate_by_odometry(self, delta: Array, covariance: Array) -> None:
+        """The way from the last key scan but one to the last."""
+        new = len(self) - 1
+        place, turn = deviations(covariance)
+        information: Array = np.asarray(np.linalg.inv(covariance + 1e-6 * np.eye(3)), dtype=np.float64)
+        self.edges.add(new - 1, new, delta, information, (place**2, turn**2), odometry=True)
+
+    def relate_by_scans(self, local: Numbers) -> None:
+        """Relations of the newest key scan to those of ``local`` that it overlaps, the nearest first."""
+        new = len(self) - 1
+        order = local[np.argsort(self._closeness(local, self.poses[new]), kind="stable")]
+        linked = 0
+        for other in (new - 1, *(int(k) for k in order if k != new - 1)):
+            linked += self._link(other, new)
+            if linked == self.config.neighbours:
+                break
+
+    def _link(self, origin: int, target: int) -> bool:
+        """Relate two key scans that overlap where they are now; False if they do not fit."""
+        config = self.config
+        guess = between(self.poses[origin], self.poses[target])
+        fit = register(self.keys[target].scan, self.keys[origin].cloud, guess)
+        off = between(guess, fit.pose)
+        far = math.hypot(off[0], off[1]) > LINK_FARTHEST[0] or abs(off[2]) > LINK_FARTHEST[1]
+        if far or fit.overlap < LINK_OVERLAP or fit.pairs < LINK_PAIRS:
+            return False
+        place = config.drift_distance[0] + config.drift_distance[1] * math.hypot(guess[0], guess[1])
+        turn = config.drift_turn[0] + config.drift_turn[1] * abs(float(guess[2]))
+        covariance: Array = np.asarray(np.linalg.inv(fit.information + np.eye(3)), dtype=np.float64)
+        weakest, _ = deviations(covariance)
+        information = np.linalg.inv(covariance + np.diag(np.square(LINK_FLOOR)))
+        spread = (place**2 + weakest**2, turn**2)
+        self.edges.add(origin, target, fit.pose, information, spread, loop=origin < target - RECENT)
+        return True
+
+    def drift(self, source: int) -> tuple[Array, Array]:
+        """Bound of the drift against ``source``: covariances in its frame, and summed variances."""
+        return drift(self.poses, self.edges.edges(), self.edges.spread, source)
+
+    def sure(self, source: int) -> Numbers:
+        """Numbers, rising, of the key scans that are sure against ``source``."""
+        _, far = self.drift(source)
+        return np.asarray(np.flatnonzero(far <= self.config.local_spread**2))
+
+    def around(self, source: int, most: int, reach: float | None = None) -> Numbers:
+        """Numbers of the key scans near ``source`` that are sure against it, nearest first."""
+        near, centre = self.sure(source), self.poses[source]
+        off = self.poses[near, :2] - centre[:2]
+        near = near[np.hypot(off[:, 0], off[:, 1]) <= (reach or self.config.local_reach)]
+        order = np.argsort(self._closeness(near, centre), kind="stable")
+        return np.asarray(near[order][:most])
+
+    def local(self) -> Numbers:
+        """Numbers, rising, of the key scans that make the submap around the newest one."""
+        newest = len(self) - 1
+        return np.union1d(self.around(newest, self.config.local_keys), np.arange(max(newest - 2, 0), newest + 1))
+
+    def submap(self, numbers: Numbers) -> Submap:
+        """Cloud of the numbered key scans in map."""
+        return Submap(Cloud.of(merged([self.keys[k].scan for k in numbers], self.poses[numbers])))
+
+    def optimise(self) -> None:
+        """Fit all poses to all relations; the first stays."""
+        self.poses = optimise(self.poses, self.edges.edges())
+
+    def refine(self) -> None:
+        """Register all key scans jointly: seconds of work."""
+        if len(self) > 1:
+            edges = self.edges.edges()
+            self.poses = refine(self.keys, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
+
+    def thin(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
+        """Leave out key scans that others stand in for.
+
+        Returns:
+            For every former key scan whether it is kept, (n,), the number by which it is known now, (n,), and its pose
+            in the frame of the key scan of that number, (n, 3).
+        """
+        gone, stand_in, edges, spread, odometry = thinned(
+            self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.thinning
+        )
+        offset = between(self.poses[stand_in], self.poses)
+        number = np.cumsum(~gone) - 1
+        self.edges.replace(edges.renumbered(number), spread, odometry)
+        self.keys = [key for key, left_out in zip(self.keys, gone.tolist(), strict=True) if not left_out]
+        self.poses = self.poses[~gone]
+        return ~gone, number[stand_in], offset
+
+    def _closeness(self, numbers: Numbers, pose: Array) -> Array:
+        off = between(pose, self.poses[numbers])
+        return np.asarray(np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2]))
+
+
+PRUNE_SPARED: Final = 60
+"""The newest key scans are never left out."""
+"""A radian between two views counts as this many metres."""
+
+
+def redundancy(poses: Array) -> Array:
+    """Distance, m, from every pose to the nearest view of the same; shape (n,). Small means dispensable."""
+    result = np.full(len(poses), np.inf)
+    for k in range(1, len(poses)):
+        off = between(poses[k], poses)
+        distance = np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2])
+        distance[k] = np.inf
+        result[k] = distance.min()
+    return result
+
+
+def thinned(
+    poses: Array, edges: Edges, spread: Array, odometry: NDArray[np.bool_], share: float
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], Edges, Array, NDArray[np.bool_]]:
+    """Leave out the most dispensable ``share`` of the poses, no two of them related, never the first.
+
+    Every relation of one left out is composed with its surest relation, so that it holds for the neighbour at that
+    one's other end: marginalisation along one edge.
+
+    Returns:
+        Marks of those left out (n,), the neighbour that stands in for each (itself if it stays) (n,), and the relations
+        of the rest with their ``spread`` and ``odometry`` marks, in the old numbering.
+    """
+    count = len(poses)
+    surest = np.linalg.det(edges.information)
+    gone = np.zeros(count, bool)
+    stand_in = np.arange(count)
+    link = np.full(count, -1)
+    touching: list[list[int]] = [[] for _ in range(count)]
+    for k, (i, j) in enumerate(zip(edges.origin.tolist(), edges.target.tolist(), strict=True)):
+        touching[i].append(k)
+        touching[j].append(k)
+    allowance = int(share * count)
+    for node in np.argsort(redundancy(poses), kind="stable").tolist():
+        if not allowance:
+            break
+        if node == 0 or node >= count - PRUNE_SPARED or not touching[node]:
+            continue
+        others = {int(edges.origin[k] + edges.target[k] - node) for k in touching[node]}
+        if any(gone[other] for other in others):
+            continue
+        best = max(touching[node], key=lambda k: float(surest[k]))
+        gone[node], link[node] = True, best
+        stand_in[node] = int(edges.origin[best] + edges.target[best] - node)
+        allowance -= 1
+    return (gone, stand_in, *_handed_over(edges, spread, odometry, gone, stand_in, link))
+
+
+def _handed_over(
+    edges: Edges,
+    spread: Array,
+    odometry: NDArray[np.bool_],
+    gone: NDArray[np.bool_],
+    stand_in: NDArray[np.int64],
+    link: NDArray[np.int64],
+) -> tuple[Edges, Array, NDArray[np.bool_]]:
+    origin, target = edges.origin.copy(), edges.target.copy()
+    measured, information, spread = edges.measured.copy(), edges.information.copy(), spread.copy()
+    for k in np.flatnonzero(gone[origin] | gone[target]).tolist():
+        node = int(origin[k] if gone[origin[k]] else target[k])
+        best = int(link[node])
+        if k == best:
+            continue
+        far = int(origin[k] + target[k] - node)
+        first, first_spread = _seen_from(edges, best, int(stand_in[node]))
+        second, second_spread = _seen_from(edges, k, node)
+        by_first, by_second = compose_jacobians(first, second)
+        covariance = by_first @ first_spread @ by_first.T + by_second @ second_spread @ by_second.T
+        origin[k], target[k] = stand_in[node], far
+        measured[k], information[k] = compose(first, second), np.linalg.inv(covariance)
+        spread[k] += spread[best]
+    kept = (origin != target) & ~gone[origin] & ~gone[target]
+    kept &= _surest(origin, target, odometry, np.linalg.det(information))
+    moved = Edges(origin[kept], target[kept], measured[kept], information[kept], edges.loop[kept])
+    return moved, spread[kept], odometry[kept]
+
+
+def _surest(
+    origin: NDArray[np.int64], target: NDArray[np.int64], odometry: NDArray[np.bool_], sureness: Array
+) -> NDArray[np.bool_]:
+    """Marks of the best relation of each kind between two key scans.
+
+    Relations handed over share what they were composed with: taken together they would claim more than they know, and
+    their number would grow with the way.
+    """
+    low, high = np.minimum(origin, target), np.maximum(origin, target)
+    order = np.lexsort((-sureness, odometry, high, low))
+    keys = np.stack((low, high, odometry))[:, order]
+    first = np.ones(len(order), bool)
+    first[1:] = (keys[:, 1:] != keys[:, :-1]).any(axis=0)
+    result = np.zeros(len(order), bool)
+    result[order[first]] = True
+    return result
+
+
+def _seen_from(edges: Edges, k: int, node: int) -> tuple[Array, Array]:
+    """Measurement and covariance of edge ``k`` with ``node`` as origin."""
+    measured, covariance = edges.measured[k], np.linalg.inv(edges.information[k])
+    if edges.origin[k] == node:
+        return measured, covariance
+    c, s = np.cos(measured[2]), np.sin(measured[2])
+    back = inverse(measured)
+    turn = -np.array(((c, s, -back[1]), (-s, c, back[0]), (0.0, 0.0, 1.0)))
+    return back, turn @ covariance @ turn.T
+
+
+REFINE_NEIGHBOURS: Final = 2
+"""Key scans before it that each is paired with anyway."""
+REFINE_PARTNERS: Final = 12
+"""Earlier key scans each is paired with, at most."""
+REFINE_REACH: Final = 4.5
+"""Distance of a partner at most, m; an angle of view counts as REFINE_TURN metres per radian."""
+REFINE_TURN: Final = 1.0
+REFINE_SPACING: Final = 1.0
+"""Of the key scans on this much way one at most is a partner, beside the neighbours in time, m."""
+REFINE_STRETCH: Final = 4
+"""Key scans within which a pair takes the place of a loop's relation."""
+REFINE_OVERLAP: Final = 0.4
+REFINE_FARTHEST: Final = 0.2
+"""A pair that wishes to move further than this, m, is not believed in this round."""
+
+
+def partners(poses: Array) -> NDArray[np.int64]:
+    """Pairs (earlier, later), shape (n, 2): the two before in time, and the nearest of every stretch of the past."""
+    result: list[tuple[int, int]] = []
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    stretch = np.floor(np.cumsum(steps) / REFINE_SPACING).astype(np.int64)
+    for k in range(1, len(poses)):
+        result += [(j, k) for j in range(max(k - REFINE_NEIGHBOURS, 0), k)]
+        off = between(poses[k], poses[: max(k - REFINE_NEIGHBOURS, 0)])
+        cost = np.hypot(off[:, 0], off[:, 1]) + REFINE_TURN * np.abs(off[:, 2])
+        near = np.flatnonzero(cost < REFINE_REACH)
+        near = near[np.argsort(cost[near], kind="stable")]
+        _, first = np.unique(stretch[near], return_index=True)
+        result += [(int(j), k) for j in near[np.sort(first)][:REFINE_PARTNERS]]
+    return np.array(result, dtype=np.int64).reshape(-1, 2)
+
+
+def refine(keys: list[Key], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:
+    """Poses, shape (n, 3), at which all scans fit each other best.
+
+    Args:
+        keys: the key scans.
+        poses: shape (n, 3), where they are.
+        steady: relations that hold anyway (odometry).
+        loops: relations that hold where no pair of scans takes their place: two views of one place from opposite sides
+            overlap too little to be a pair, and without their closure what follows it would drift away again.
+        rounds: at most.
+    """
+    pairs = partners(poses)
+    for turn in range(rounds):
+        reach = CELL if turn < rounds // 2 else CELL / 2
+        wishes = _linearised(keys, poses, pairs, reach)
+        missed = loops.chosen(~_covered(loops, wishes))
+        moved = optimise(poses, steady.joined(missed).joined(wishes), iterations=3)
+        change = float(np.abs(between(poses, moved)[:, :2]).max())
+        poses = moved
+        if change < 5e-4 and reach < CELL:
+            break
+    return poses
+
+
+def _covered(loops: Edges, wishes: Edges) -> NDArray[np.bool_]:
+    """Which of ``loops`` have a wish between key scans within about ``REFINE_STRETCH`` of both ends."""
+    known = np.unique(_stretches(wishes.origin, wishes.target, 0, 0))
+    result = np.zeros(len(loops), bool)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        result |= np.isin(_stretches(loops.origin, loops.target, i, j), known)
+    return result
+
+
+def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: int) -> NDArray[np.int64]:
+    """One number for the two stretches that a relation joins, each that many further."""
+    return np.asarray((origin // REFINE_STRETCH + i) * (1 << 32) + target // REFINE_STRETCH + j)
+
+
+def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
+    """One relation per overlapping pair: where a Gauss-Newton step would take it, and how sure that is."""
+    places = between(poses[pairs[:, 0]], poses[pairs[:, 1]])
+    measured, information, kept = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
+    for k, (i, j) in enumerate(pairs.tolist()):
+        h, g, found = normal_equations(keys[j].scan, keys[i].cloud, places[k], reach)
+        if found < REFINE_OVERLAP * len(keys[j].scan):
+            continue
+        step = -np.linalg.solve(h + np.diag((1.0, 1.0, 1.0)), g)
+        if np.hypot(step[0], step[1]) > REFINE_FARTHEST:
+            continue
+        measured[k], information[k], kept[k] = places[k] + step, h, True
+    measured[:, 2] = wrap(measured[:, 2])
+    return Edges(pairs[:, 0], pairs[:, 1], measured, information, pairs[:, 1] - pairs[:, 0] > REFINE_NEIGHBOURS).chosen(
+        kept
+    )
