@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
@@ -19,7 +20,6 @@ from monstertruck_schemas.state import Grid
 if TYPE_CHECKING:
     from monstertruck_planners.collision_kernels import BodyData, FieldData
 
-Array = NDArray[np.float64]
 
 OCCUPIED = 50
 """Occupancy, percent, from which a grid cell is an obstacle."""

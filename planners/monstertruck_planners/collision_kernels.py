@@ -11,9 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_planners.route.motion_rows import advance
-
-FloatArray = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.route.motion import advance
 
 HALF_DIAGONAL = sqrt(0.5)
 
@@ -35,7 +34,7 @@ class FieldData(NamedTuple):
 class BodyData(NamedTuple):
     """A footprint: discs on the x axis, and the rectangle they cover (half sizes 0: the discs are the footprint)."""
 
-    discs: FloatArray
+    discs: Array
     """Centres, m."""
     radius: float
     half_length: float
@@ -132,7 +131,7 @@ def room(field: FieldData, body: BodyData, margin: float, x: float, y: float, ya
 
 
 @njit(cache=True)
-def free_poses(field: FieldData, body: BodyData, margin: float, poses: FloatArray) -> NDArray[np.bool_]:
+def free_poses(field: FieldData, body: BodyData, margin: float, poses: Array) -> NDArray[np.bool_]:
     """Whether each pose (m, 3) is free."""
     result = np.empty(len(poses), np.bool_)
     for i in range(len(poses)):

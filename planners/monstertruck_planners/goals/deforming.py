@@ -15,7 +15,7 @@ from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose,
 from monstertruck_planners.goals.planning import answer_of
 from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
 from monstertruck_planners.local.catalog import make_deformer
-from monstertruck_planners.local.planner import passed
+from monstertruck_planners.local.core import passed
 from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import moved

@@ -8,16 +8,15 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

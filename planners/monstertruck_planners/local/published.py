@@ -12,21 +12,20 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DiscFootprint, DistanceField
-from monstertruck_planners.local import bubbles
+from monstertruck_planners.local import elastic_band
 from monstertruck_planners.local.api import DeformResult, Guide, Memory
-from monstertruck_planners.local.band import rules_of, stretch
 from monstertruck_planners.local.config import BandConfig, PublishedConfig
-from monstertruck_planners.local.planner import Local, Surveyor, checked
+from monstertruck_planners.local.core import Local, Surveyor, checked
+from monstertruck_planners.local.elastic_band import rules_of, stretch
 from monstertruck_planners.local.rsband import ends_at
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath, joined, moved
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 INSCRIBED = 0.17
 """Half the truck's width, m."""
@@ -93,8 +92,8 @@ class Published:
         if band is None:
             return None
         field, cover = surroundings.data(), self._band.cover
-        own = 0.5 * bubbles.clearance(field, cover, *here)
-        radii = [0.5 * bubbles.clearance(field, cover, *pose) for pose in band.poses]
+        own = 0.5 * elastic_band.clearance(field, cover, *here)
+        radii = [0.5 * elastic_band.clearance(field, cover, *pose) for pose in band.poses]
         reach = self._rules.overlap * (np.minimum(radii, self._rules.largest) + min(own, self._rules.largest))
         touching = np.flatnonzero(np.hypot(*(band.poses[:, :2] - here[:2]).T) < reach)
         return band.part(int(touching[-1]) if len(touching) else 0, len(band.poses))

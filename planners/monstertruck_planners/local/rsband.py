@@ -9,18 +9,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
-from monstertruck_planners.local.band import rules_of, stretch
 from monstertruck_planners.local.config import RsbandConfig
-from monstertruck_planners.local.planner import CUSP_REACHED, RUN_ENDED, Local, Surveyor, costs_of, rest_of, runs
+from monstertruck_planners.local.core import CUSP_REACHED, RUN_ENDED, Local, Surveyor, costs_of, rest_of, runs
+from monstertruck_planners.local.elastic_band import rules_of, stretch
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 FURTHER = (1.0, 1.5, 2.0, 3.0)
 """Sub-goals tried, as factors on their distance."""

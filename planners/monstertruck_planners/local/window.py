@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import binary_dilation
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
-
-Array = NDArray[np.float64]
 
 
 class WindowConfig(Schema):

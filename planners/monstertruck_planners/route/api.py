@@ -8,18 +8,18 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceField, Footprint
 from monstertruck_planners.route.config import DriveCosts, Unknown
 from monstertruck_planners.route.motion import MotionPath, moved
-from monstertruck_planners.route.pricing import Layer
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
+from monstertruck_planners.route.search import Layer
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
 
-Array = NDArray[np.float64]
 Clock = Callable[[], float]
 
 

@@ -8,12 +8,11 @@ result is not drivable as it is: turning radius and footprint are not looked at.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monstertruck_planners.route import distance_to_go as togo
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.route import heuristic as togo
 from monstertruck_planners.route.api import Budget, Clock, RouteMap, RouteResult, Vehicle, check_ends
 from monstertruck_planners.route.config import GridAstarConfig
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 INSCRIBED_COST = 252.0
 

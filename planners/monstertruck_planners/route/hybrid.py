@@ -8,21 +8,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monstertruck_planners.route import distance_to_go as togo
-from monstertruck_planners.route import hybrid_search as search
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.route import heuristic as togo
+from monstertruck_planners.route import search
 from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.fit import close_slits
-from monstertruck_planners.route.hunt import CHUNK, LEVELS, MOST_NODES, Hunt, Level, Question
+from monstertruck_planners.route.corridors import brush_way, cheapest_new, close_slits
+from monstertruck_planners.route.heuristic import turning_table
+from monstertruck_planners.route.hybrid_search import CHUNK, LEVELS, MOST_NODES, Hunt, Level, Question
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.pricing import Layer
-from monstertruck_planners.route.redraft import redraft
-from monstertruck_planners.route.shorten import Draft, shorten, tidy
-from monstertruck_planners.route.turning_table import turning_table
-from monstertruck_planners.route.ways import brush_way, cheapest_new
+from monstertruck_planners.route.search import Layer
+from monstertruck_planners.route.smoothing import Draft, redraft, shorten, tidy
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 CHECK_STEP = 0.01
 """Between two collision checks close to obstacles, m."""

@@ -5,62 +5,42 @@ Beside the short moves a node tries the best obstacle-free motion to the goal an
 others, "Practical search techniques in path planning for autonomous driving", 2008.
 """
 
-from math import atan2, floor, inf, pi, sqrt
+import math
+from dataclasses import dataclass
+from math import atan2, floor, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_planners.collision_kernels import BodyData, FieldData, row_free
-from monstertruck_planners.route.crab_words import MOST_ROWS, connect
-from monstertruck_planners.route.distance_to_go import FAR, UNIT, ToGo, cell_at, walk
-from monstertruck_planners.route.heap import drop, push
-from monstertruck_planners.route.motion_rows import advance
-from monstertruck_planners.route.pricing import Layer, row_price
-from monstertruck_planners.route.reeds_shepp_words import COST
-from monstertruck_planners.route.turning_table import turning_bound
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision_kernels import BodyData, FieldData
+from monstertruck_planners.route.api import Budget
+from monstertruck_planners.route.heuristic import ToGo, cell_at, estimate, walk
+from monstertruck_planners.route.motion import advance
+from monstertruck_planners.route.reeds_shepp import COST, MOST_ROWS, connect
+from monstertruck_planners.route.search import EXHAUSTED, FOUND, RUNNING, Car, Layer, drop, push, rows_cost, rows_free
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-RUNNING, FOUND, EXHAUSTED = 0, 1, 2
 
 LEAP = -1
 """Action of a node reached by ``connect``; others are numbers of moves."""
 
 
-class Car(NamedTuple):
-    """What may be driven and what it costs."""
-
-    radius: float
-    crab: float
-    weights: FloatArray
-    """Shape (3,): per metre backward, of a cusp in turning radii, per metre of translation."""
-    swing: float
-    """Of every row, whose beginning turns the wheels, m."""
-    moves: FloatArray
-    """Shape (p, 3): the short moves, as motion rows."""
-    leaps: FloatArray
-    """Lengths of the leaps along the way, m, longest first."""
-    step: float
-    """Of the collision check, m."""
-    margin: float
-    """Kept on all sides of the footprint, m."""
-
-
 class Nodes(NamedTuple):
     """Memory of one search."""
 
-    pose: FloatArray
+    pose: Array
     """Shape (n, 3)."""
-    cost: FloatArray
+    cost: Array
     parent: IntArray
     action: IntArray
-    sense: FloatArray
+    sense: Array
     """+1 or -1: direction at the end; 0 at the start."""
     closed: NDArray[np.bool_]
-    keys: FloatArray
+    keys: Array
     items: IntArray
     """The heap."""
     table: NDArray[np.int32]
@@ -74,58 +54,14 @@ USED, WAITING, EXPANDED, LAST = 0, 1, 2, 3
 
 
 @njit(cache=True)
-def estimate(
-    field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: FloatArray, x: float, y: float, yaw: float
-) -> float:
-    """The greater of both heuristics, m; inf off the known ways."""
-    row, column = cell_at(field, go.cell, x, y)
-    if not (0 <= row < go.cost.shape[0] and 0 <= column < go.cost.shape[1]) or go.cost[row, column] >= FAR:
-        return inf
-    return float(max(go.cost[row, column] * go.cell / UNIT, turning_bound(table, car.radius, x, y, yaw, goal)))
-
-
-@njit(cache=True)
-def rows_cost(
-    field: FieldData, layer: Layer, car: Car, pose: FloatArray, rows: FloatArray, count: int, sense: float
-) -> float:
-    """Cost of rows driven from a pose after a row of direction ``sense``, m."""
-    total = 0.0
-    x, y, yaw = pose[0], pose[1], pose[2]
-    for i in range(count):
-        length = rows[i, 0]
-        weight = 1.0 if length > 0.0 else car.weights[0]
-        if rows[i, 2] != 0.0:
-            weight *= car.weights[2]
-        total += abs(length) * weight + car.swing
-        if length * sense < 0.0:
-            total += car.weights[1] * car.radius
-        sense = length
-        if layer.price.size > 0:
-            total += row_price(field, layer, x, y, yaw, length, rows[i, 1], rows[i, 2])
-        x, y, yaw = advance(x, y, yaw, length, rows[i, 1], rows[i, 2])
-    return total
-
-
-@njit(cache=True)
-def rows_free(field: FieldData, body: BodyData, car: Car, pose: FloatArray, rows: FloatArray, count: int) -> bool:
-    """Whether the footprint may drive the rows from a pose."""
-    x, y, yaw = pose[0], pose[1], pose[2]
-    for i in range(count):
-        if not row_free(field, body, car.margin, car.step, x, y, yaw, rows[i, 0], rows[i, 1], rows[i, 2]):
-            return False
-        x, y, yaw = advance(x, y, yaw, rows[i, 0], rows[i, 1], rows[i, 2])
-    return True
-
-
-@njit(cache=True)
 def add(
-    field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: FloatArray, nodes: Nodes, greed: float,
+    field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: Array, nodes: Nodes, greed: float,
     x: float, y: float, yaw: float, cost: float, parent: int, action: int, sense: float, bound: float,
 ) -> None:  # fmt: skip
     """Put a pose on the open list if it is the cheapest in its cell and may lead to a solution below ``bound``."""
     if nodes.counts[USED] >= len(nodes.cost):
         return
-    left = estimate(field, go, table, car, goal, x, y, yaw)
+    left = estimate(field, go, table, car.radius, goal, x, y, yaw)
     if cost + left >= bound:
         return
     row, column = cell_at(field, nodes.cell, x, y)
@@ -153,7 +89,7 @@ def add(
 
 
 @njit(cache=True)
-def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: float, target: FloatArray) -> bool:
+def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: float, target: Array) -> bool:
     """Pose ``leap`` metres along the way to the goal; False if the goal is nearer."""
     row, column = cell_at(field, go.cell, x, y)
     row, column = walk(go.step, row, column, leap / go.cell)
@@ -170,7 +106,7 @@ def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: f
 @njit(cache=True)
 def expand(
     field: FieldData, body: BodyData, layer: Layer, go: ToGo, table: NDArray[np.float32], car: Car,
-    goal: FloatArray, nodes: Nodes, greed: float, bound: float, sight: float, count: int,
+    goal: Array, nodes: Nodes, greed: float, bound: float, sight: float, count: int,
 ) -> int:  # fmt: skip
     """Expand up to ``count`` nodes.
 
@@ -236,7 +172,7 @@ def expand(
 
 
 @njit(cache=True)
-def trace(car: Car, goal: FloatArray, nodes: Nodes) -> FloatArray:
+def trace(car: Car, goal: Array, nodes: Nodes) -> Array:
     """Motion rows of the solution at ``counts[LAST]``, from the start to the goal."""
     rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, nodes.counts[LAST]
@@ -266,3 +202,116 @@ def trace(car: Car, goal: FloatArray, nodes: Nodes) -> FloatArray:
                 result[used, k] = rows[j, k]
             used += 1
     return result[:used].copy()
+
+
+CHUNK = 256
+"""Nodes expanded between two looks at the budget."""
+
+MOST_NODES = 400_000
+"""In one """
+
+
+MOST_POSES = 1 << 26
+"""Told apart in one search: a table of 256 MB, of which only what is visited takes memory."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """How finely poses are told apart."""
+
+    cell: float
+    """In turning radii."""
+    move: float
+    """The same."""
+    headings: int = 36
+
+    def fitting(self, field: FieldData, radius: float) -> "Level":
+        """This level, or on a map too large for it a coarser one.
+
+        Args:
+            field: the map.
+            radius: turning radius, m.
+        """
+        poses = field.occupied.size * (field.resolution / (self.cell * radius)) ** 2 * self.headings
+        factor = max(math.sqrt(poses / MOST_POSES), 1.0)
+        return Level(self.cell * factor, self.move * factor, self.headings)
+
+
+LEVELS = (Level(0.35, 0.55), Level(0.15, 0.25), Level(0.06, 0.1, 72))
+"""The second one is for narrow places, where the first finds nothing soon; the third where that is at its end."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is looked for."""
+
+    field: FieldData
+    body: BodyData
+    layer: Layer
+    table: NDArray[np.float32]
+    """See ``turning_table``."""
+    start: Array
+    goal: Array
+    """Poses, shape (3,)."""
+    greed: float
+    budget: Budget
+    """Takes down the nodes expanded."""
+    statistics: dict[str, float]
+    """The same, under "expanded"."""
+
+
+class Hunt:
+    """One search.
+
+    Args:
+        question: what is looked for.
+        car: what may be driven, with moves of the level.
+        go: ways to the goal.
+        level: how fine.
+        sight: the goal is tried directly from this near, m.
+    """
+
+    def __init__(self, question: Question, car: Car, go: ToGo, level: Level, sight: float = np.inf) -> None:
+        self._asked, self._car, self._go, self._sight = question, car, go, sight
+        self._nodes = _room(question.field, level.cell * car.radius, level.headings)
+        self.exhausted = False
+        """Whether there is nothing left to look at."""
+        (x, y, yaw), greed = question.start, question.greed
+        add(
+            question.field, go, question.table, car, question.goal, self._nodes, greed, x, y, yaw, 0.0, -1,
+            LEAP, 0.0, np.inf,
+        )  # fmt: skip
+
+    def go_on(self, count: int, reserve: float = 0.0) -> Array | None:
+        """Expand about ``count`` more nodes, while more than ``reserve`` of the budget is left.
+
+        Returns:
+            Motion rows from start to goal, if they were found.
+        """
+        asked, nodes = self._asked, self._nodes
+        first = int(nodes.counts[EXPANDED])
+        status = EXHAUSTED if self.exhausted else RUNNING
+        while status == RUNNING and asked.budget.left() > reserve:
+            before = int(nodes.counts[EXPANDED])
+            if before - first >= count:
+                break
+            status = expand(
+                asked.field, asked.body, asked.layer, self._go, asked.table, self._car, asked.goal, nodes, asked.greed,
+                np.inf, self._sight, CHUNK,
+            )  # fmt: skip
+            done = int(nodes.counts[EXPANDED]) - before
+            asked.budget.work += done
+            asked.statistics["expanded"] += done
+        self.exhausted = status == EXHAUSTED
+        return trace(self._car, asked.goal, nodes) if status == FOUND else None
+
+
+def _room(field: FieldData, cell: float, headings: int) -> Nodes:
+    """Memory for the nodes of a search."""
+    n = MOST_NODES
+    rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
+    return Nodes(
+        np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n),
+        np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
+        np.zeros((rows, columns, headings), np.int32), cell, np.zeros(4, np.int64),
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The path object that all planners share: exact pieces of constant curvature, and poses sampled from them. Compiled.
+"""The path object that all planners share: exact pieces of constant curvature, and sampled poses. Loads numba.
 
 A path belongs to a reference point of the truck: front-steered motions are those of the rear axle's middle, all others
 those of the base. ``base_poses`` and ``message`` speak of the base.
@@ -7,16 +7,74 @@ those of the base. ``base_poses`` and ``message`` speak of the base.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import ceil, cos, sin
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_planners.route import motion_rows
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
 
-Array = NDArray[np.float64]
+
+@njit(cache=True)
+def advance(
+    x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
+) -> tuple[float, float, float]:
+    """Pose after ``length`` metres of one row."""
+    half = 0.5 * curvature * length
+    chord = length if abs(half) < 1e-7 else length * sin(half) / half
+    course = yaw + sideslip + half
+    return x + chord * cos(course), y + chord * sin(course), yaw + 2.0 * half
+
+
+@njit(cache=True)
+def _pose_along(pose: Array, row: Array, travelled: float) -> Array:
+    """Pose (3,) reached from ``pose`` after ``travelled`` metres (not below 0) of the row."""
+    length = travelled if row[0] > 0.0 else -travelled
+    x, y, yaw = advance(pose[0], pose[1], pose[2], length, row[1], row[2])
+    return np.array([x, y, yaw])
+
+
+@njit(cache=True)
+def _end_poses(start: Array, rows: Array) -> Array:
+    """Pose before the first row and after each, shape (n + 1, 3)."""
+    poses = np.empty((len(rows) + 1, 3))
+    x, y, yaw = start[0], start[1], start[2]
+    poses[0, 0], poses[0, 1], poses[0, 2] = x, y, yaw
+    for i in range(len(rows)):
+        x, y, yaw = advance(x, y, yaw, rows[i, 0], rows[i, 1], rows[i, 2])
+        poses[i + 1, 0], poses[i + 1, 1], poses[i + 1, 2] = x, y, yaw
+    return poses
+
+
+@njit(cache=True)
+def _sample_poses(start: Array, rows: Array, step: float) -> tuple[Array, NDArray[np.int64]]:
+    """Poses at most ``step`` metres apart, the _end_poses of all rows among them.
+
+    Returns:
+        Shape (m, 4): x, y, yaw and metres travelled; and shape (m,), the row that leads to each pose (0 for the first).
+    """
+    total = 1
+    for i in range(len(rows)):
+        total += max(ceil(abs(rows[i, 0]) / step - 1e-9), 1)
+    poses, index = np.empty((total, 4)), np.empty(total, np.int64)
+    x, y, yaw, travelled = start[0], start[1], start[2], 0.0
+    poses[0, 0], poses[0, 1], poses[0, 2], poses[0, 3], index[0] = x, y, yaw, 0.0, 0
+    k = 1
+    for i in range(len(rows)):
+        length, curvature, sideslip = rows[i, 0], rows[i, 1], rows[i, 2]
+        count = max(ceil(abs(length) / step - 1e-9), 1)
+        for j in range(1, count + 1):
+            share = length * j / count
+            px, py, pyaw = advance(x, y, yaw, share, curvature, sideslip)
+            poses[k, 0], poses[k, 1], poses[k, 2], poses[k, 3], index[k] = px, py, pyaw, travelled + abs(share), i
+            k += 1
+        x, y, yaw = poses[k - 1, 0], poses[k - 1, 1], poses[k - 1, 2]
+        travelled += abs(length)
+    return poses, index
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +182,7 @@ class MotionPath:
     @cached_property
     def ends(self) -> Array:
         """Pose of the reference point before the first segment and after each, shape (n + 1, 3)."""
-        return np.asarray(motion_rows.ends(self.start, self.rows))
+        return np.asarray(_end_poses(self.start, self.rows))
 
     @property
     def end(self) -> Array:
@@ -139,7 +197,7 @@ class MotionPath:
         """
         if not step > 0.0:
             raise InputError(f"sampling step {step} m: expected above 0")
-        poses, index = motion_rows.sample(self.start, self.rows, step)
+        poses, index = _sample_poses(self.start, self.rows, step)
         rows = self.rows[index] if len(self.rows) else np.array([[1.0, 0.0, 0.0]])
         return Samples(poses[:, :3], poses[:, 3], rows[:, 1], rows[:, 2], np.sign(rows[:, 0]), index)
 
@@ -171,7 +229,7 @@ class MotionPath:
         i = min(int(np.searchsorted(before, begin, side="right")) - 1, max(len(rows) - 1, 0))
         start = self.start
         if len(rows):
-            start = motion_rows.along(self.ends[i], self.rows[i], begin - before[i])
+            start = _pose_along(self.ends[i], self.rows[i], begin - before[i])
         steering = tuple(s for s, kept in zip(self.steering, keep.tolist(), strict=True) if kept)
         return MotionPath(start, rows[keep], steering, self.reference)  # type: ignore[arg-type]
 

@@ -2,16 +2,420 @@
 
 import math
 from dataclasses import dataclass, field
+from math import acos, asin, atan2, ceil, cos, floor, inf, pi, sin, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numba import njit
+from numpy.typing import ArrayLike
 
-from monstertruck_planners.route import crab_words, reeds_shepp_words
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Steering
 
-Array = NDArray[np.float64]
+SLACK = 1e-10
+"""Rounding allowed where a formula asks for a sign."""
+
+LSL, LSR, LRL, LRLR_SAME, LRLR_CUSP, LRSL, LRSR, LRSLR = range(8)
+
+TURNS = np.array(
+    [
+        [1, 0, 1, 0, 0],
+        [1, 0, -1, 0, 0],
+        [1, -1, 1, 0, 0],
+        [1, -1, 1, -1, 0],
+        [1, -1, 1, -1, 0],
+        [1, -1, 0, 1, 0],
+        [1, -1, 0, -1, 0],
+        [1, -1, 0, 1, -1],
+    ],
+    dtype=np.float64,
+)
+"""Curvature of each piece of a pattern."""
+
+PIECES = np.array([3, 3, 3, 4, 4, 4, 4, 5], dtype=np.int64)
+
+COST, PATTERN, FLIP, MIRROR, BACKWARD, T, U, V = range(8)
+"""Fields of a solution: cost, pattern, three symmetries (1 or -1), three lengths."""
+
+
+@njit(cache=True)
+def _up(angle: float) -> float:
+    """Angle in (-pi, pi], a rounding error above -pi counting as pi."""
+    return float(angle - 2 * pi * ceil((angle - pi - SLACK) / (2 * pi)))
+
+
+@njit(cache=True)
+def _down(angle: float) -> float:
+    """Angle in [-pi, pi), a rounding error below pi counting as -pi."""
+    return float(angle - 2 * pi * floor((angle + pi + SLACK) / (2 * pi)))
+
+
+@njit(cache=True)
+def _lengths(pattern: int, t: float, u: float, v: float, out: Array) -> None:
+    """Signed lengths of a pattern's pieces."""
+    out[0], out[1], out[2], out[3], out[4] = t, u, v, 0.0, 0.0
+    if pattern == LRLR_SAME:
+        out[2], out[3] = -u, v
+    elif pattern == LRLR_CUSP:
+        out[2], out[3] = u, v
+    elif pattern in (LRSL, LRSR):
+        out[1], out[2], out[3] = -pi / 2, u, v
+    elif pattern == LRSLR:
+        out[1], out[2], out[3], out[4] = -pi / 2, u, -pi / 2, v
+
+
+@njit(cache=True)
+def _offer(
+    best: Array, pieces: Array, weights: Array, pattern: int,
+    flip: float, mirror: float, backward: float, t: float, u: float, v: float,
+) -> None:  # fmt: skip
+    """Keep the solution if it costs less than the best so far."""
+    length = abs(t) + abs(u) + abs(v)
+    if pattern in (LRLR_SAME, LRLR_CUSP):
+        length += abs(u)
+    elif pattern in (LRSL, LRSR):
+        length += pi / 2
+    elif pattern == LRSLR:
+        length += pi
+    if length >= best[COST]:
+        return
+    cost = length
+    if weights[0] != 1.0 or weights[1] != 0.0:
+        _lengths(pattern, t, u, v, pieces)
+        cost = _weigh(pieces, flip, weights)
+        if cost >= best[COST]:
+            return
+    best[COST], best[PATTERN], best[FLIP], best[MIRROR], best[BACKWARD] = cost, pattern, flip, mirror, backward
+    best[T], best[U], best[V] = t, u, v
+
+
+@njit(cache=True)
+def _weigh(pieces: Array, flip: float, weights: Array) -> float:
+    cost, before = 0.0, 0.0
+    for i in range(5):
+        length = flip * pieces[i]
+        if abs(length) <= SLACK:
+            continue
+        cost += length if length > 0.0 else -weights[0] * length
+        if length * before < 0.0:
+            cost += weights[1]
+        before = length
+    return float(cost)
+
+
+@njit(cache=True)
+def _tau_omega(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float, float]:
+    """First and last angle of the four-arc patterns, whose middle angles are u and v."""
+    delta = u - v
+    a, b = sin(u) - sin(delta), cos(u) - cos(delta) - 1.0
+    t = atan2(eta * a - xi * b, xi * a + eta * b)
+    if 2.0 * (cos(delta) - cos(v) - cos(u)) + 3.0 < 0.0:
+        t += pi
+    return t, t - u + v - phi
+
+
+@njit(cache=True)
+def _three_arcs(
+    best: Array, pieces: Array, weights: Array, flip: float, mirror: float, backward: float,
+    phi: float, r1: float, a1: float, r2: float, xi2: float, eta2: float,
+) -> None:  # fmt: skip
+    """Patterns that are also valid in reversed order: LRL, LRSL, LRSR; polar (r, a) of the end circle's centre."""
+    if r1 <= 4.0 and 0.5 * r1 < best[COST]:
+        u = -2.0 * asin(r1 / 4.0)
+        t = _up(a1 + u / 2 + pi)
+        if t >= -SLACK:
+            _offer(best, pieces, weights, LRL, flip, mirror, backward, t, u, _up(phi - t + u))
+    if r1 >= 2.0:
+        r = sqrt(r1 * r1 - 4.0)
+        u = 2.0 - r
+        if u <= SLACK and pi / 2 - u < best[COST]:
+            t = _up(a1 + atan2(r, -2.0))
+            v = _down(phi - pi / 2 - t)
+            if t >= -SLACK and v <= SLACK:
+                _offer(best, pieces, weights, LRSL, flip, mirror, backward, t, u, v)
+    if r2 >= 2.0 and pi / 2 + r2 - 2.0 < best[COST]:
+        u = 2.0 - r2
+        t = _up(atan2(xi2, -eta2))
+        v = _down(t + pi / 2 - phi)
+        if t >= -SLACK and v <= SLACK:
+            _offer(best, pieces, weights, LRSR, flip, mirror, backward, t, u, v)
+
+
+@njit(cache=True)
+def _others(
+    best: Array, pieces: Array, weights: Array, flip: float, mirror: float,
+    phi: float, r1: float, a1: float, r2: float, a2: float, xi2: float, eta2: float,
+) -> None:  # fmt: skip
+    """Patterns that reversed are again one of their own."""
+    t = _up(a1)
+    if t >= -SLACK and r1 + t < best[COST]:
+        v = _up(phi - t)
+        if v >= -SLACK:
+            _offer(best, pieces, weights, LSL, flip, mirror, 1.0, t, r1, v)
+    if r2 >= 2.0:
+        u = sqrt(r2 * r2 - 4.0)
+        if u < best[COST]:
+            t = _up(a2 + atan2(2.0, u))
+            v = _up(t - phi)
+            if t >= -SLACK and v >= -SLACK:
+                _offer(best, pieces, weights, LSR, flip, mirror, 1.0, t, u, v)
+        u = 4.0 - u
+        if u <= SLACK and pi - u < best[COST]:
+            t = _up(atan2((4.0 - u) * xi2 - 2.0 * eta2, -2.0 * xi2 + (u - 4.0) * eta2))
+            v = _up(t - phi)
+            if t >= -SLACK and v >= -SLACK:
+                _offer(best, pieces, weights, LRSLR, flip, mirror, 1.0, t, u, v)
+    rho = (2.0 + r2) / 4.0
+    if rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
+        u = acos(rho)
+        t, v = _tau_omega(u, -u, xi2, eta2, phi)
+        t, v = _up(t), _down(v)
+        if t >= -SLACK and v <= SLACK:
+            _offer(best, pieces, weights, LRLR_SAME, flip, mirror, 1.0, t, u, v)
+    rho = (20.0 - r2 * r2) / 16.0
+    if 0.0 <= rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
+        u = -acos(rho)
+        t, v = _tau_omega(u, u, xi2, eta2, phi)
+        t, v = _up(t), _up(v)
+        if t >= -SLACK and v >= -SLACK:
+            _offer(best, pieces, weights, LRLR_CUSP, flip, mirror, 1.0, t, u, v)
+
+
+@njit(cache=True)
+def solve(x: float, y: float, phi: float, weights: Array, best: Array, pieces: Array) -> None:
+    """Cheapest word from the origin to (x, y, phi).
+
+    Args:
+        x: in turning radii.
+        y: in turning radii.
+        phi: rad.
+        weights: cost of a radius backward (at least 1), and of a change of direction (at least 0).
+        best: shape (8,), gets the solution.
+        pieces: shape (5,), scratch.
+    """
+    best[COST] = inf
+    sin_phi, cos_phi = sin(phi), cos(phi)
+    back_x, back_y = x * cos_phi + y * sin_phi, x * sin_phi - y * cos_phi
+    for k in range(4):
+        flip = -1.0 if k & 1 else 1.0
+        mirror = -1.0 if k & 2 else 1.0
+        turn = flip * mirror
+        px, py, s, angle = flip * x, mirror * y, turn * sin_phi, turn * phi
+        xi1, eta1, xi2, eta2 = px - s, py - 1.0 + cos_phi, px + s, py - 1.0 - cos_phi
+        r1, a1, r2 = sqrt(xi1 * xi1 + eta1 * eta1), atan2(eta1, xi1), sqrt(xi2 * xi2 + eta2 * eta2)
+        _others(best, pieces, weights, flip, mirror, angle, r1, a1, r2, atan2(eta2, xi2), xi2, eta2)
+        _three_arcs(best, pieces, weights, flip, mirror, 1.0, angle, r1, a1, r2, xi2, eta2)
+        px, py = flip * back_x, mirror * back_y
+        xi1, eta1, xi2, eta2 = px - s, py - 1.0 + cos_phi, px + s, py - 1.0 - cos_phi
+        r1, a1, r2 = sqrt(xi1 * xi1 + eta1 * eta1), atan2(eta1, xi1), sqrt(xi2 * xi2 + eta2 * eta2)
+        _three_arcs(best, pieces, weights, flip, mirror, -1.0, angle, r1, a1, r2, xi2, eta2)
+
+
+@njit(cache=True)
+def spell(best: Array, radius: float, rows: Array, pieces: Array) -> int:
+    """Write a solution as at most 5 rows (signed length m, curvature 1/m, sideslip rad); returns their number."""
+    pattern = int(best[PATTERN])
+    count = PIECES[pattern]
+    _lengths(pattern, best[T], best[U], best[V], pieces)
+    written = 0
+    for i in range(count):
+        k = i if best[BACKWARD] > 0.0 else count - 1 - i
+        length = best[FLIP] * pieces[k]
+        if abs(length) <= SLACK:
+            continue
+        rows[written, 0] = length * radius
+        rows[written, 1] = best[MIRROR] * TURNS[pattern, k] / radius
+        rows[written, 2] = 0.0
+        written += 1
+    return written
+
+
+@njit(cache=True)
+def relative(start: Array, goal: Array, radius: float) -> tuple[float, float, float]:
+    """Goal seen from the start, lengths in turning radii, the angle within +-pi."""
+    dx, dy = (goal[0] - start[0]) / radius, (goal[1] - start[1]) / radius
+    c, s = cos(start[2]), sin(start[2])
+    turn = goal[2] - start[2]
+    return dx * c + dy * s, dy * c - dx * s, turn - 2 * pi * floor((turn + pi) / (2 * pi))
+
+
+@njit(cache=True)
+def _word_distances(starts: Array, goals: Array, radius: float, weights: Array) -> Array:
+    """Cost of the cheapest word of every pair, in radii times ``radius``."""
+    result = np.empty(len(starts))
+    best, pieces = np.empty(8), np.empty(5)
+    for i in range(len(starts)):
+        x, y, phi = relative(starts[i], goals[i], radius)
+        solve(x, y, phi, weights, best, pieces)
+        result[i] = best[COST] * radius
+    return result
+
+
+MOST_ROWS = 5
+
+
+@njit(cache=True)
+def _wrap(angle: float) -> float:
+    while angle > pi:
+        angle -= 2 * pi
+    while angle <= -pi:
+        angle += 2 * pi
+    return angle
+
+
+@njit(cache=True)
+def _try(word: Array, count: int, mirror: float, weights: Array, best: Array, rows: Array, kept: int) -> int:
+    """Take the word (its rows not yet mirrored) if it is the cheapest so far; returns the number of rows kept."""
+    cost, before = 0.0, 0.0
+    for i in range(count):
+        length = word[i, 0]
+        if abs(length) <= SLACK:
+            continue
+        weight = 1.0 if length > 0.0 else weights[0]
+        if word[i, 2] != 0.0:
+            weight *= weights[2]
+        cost += abs(length) * weight
+        if length * before < 0.0:
+            cost += weights[1]
+        before = length
+    if cost >= best[COST] - SLACK:
+        return kept
+    best[COST] = cost
+    kept = 0
+    for i in range(count):
+        if abs(word[i, 0]) > SLACK:
+            rows[kept, 0], rows[kept, 1], rows[kept, 2] = word[i, 0], mirror * word[i, 1], mirror * word[i, 2]
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def _put(word: Array, i: int, length: float, curvature: float, sideslip: float) -> None:
+    word[i, 0], word[i, 1], word[i, 2] = length, curvature, sideslip
+
+
+@njit(cache=True)
+def _arc_crab_arc(
+    x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
+    word: Array, best: Array, rows: Array, kept: int,
+) -> int:  # fmt: skip
+    """Left arc, translation, left or right arc; the translation leads from one turning circle to the other."""
+    xi, eta = x - sin(phi), y - 1.0 + cos(phi)
+    r, a = sqrt(xi * xi + eta * eta), atan2(eta, xi)
+    xi2, eta2 = x + sin(phi), y - 1.0 - cos(phi)
+    a2 = atan2(eta2, xi2)
+    for k in range(4):
+        slip = crab if k & 1 else -crab
+        sign = 1.0 if k & 2 else -1.0
+        t = _wrap(a + (0.0 if sign > 0.0 else pi) - slip)
+        _put(word, 0, t, 1.0, 0.0)
+        _put(word, 1, sign * r, 0.0, slip)
+        _put(word, 2, _wrap(phi - t), 1.0, 0.0)
+        kept = _try(word, 3, mirror, weights, best, rows, kept)
+        # In the frame turned by t the centres differ by (u cos, u sin - 2).
+        root = 4.0 * sin(slip) ** 2 + xi2 * xi2 + eta2 * eta2 - 4.0
+        if root < 0.0:
+            continue
+        u = 2.0 * sin(slip) + sign * sqrt(root)
+        t = _wrap(a2 - atan2(u * sin(slip) - 2.0, u * cos(slip)))
+        _put(word, 0, t, 1.0, 0.0)
+        _put(word, 1, u, 0.0, slip)
+        _put(word, 2, _wrap(t - phi), -1.0, 0.0)
+        kept = _try(word, 3, mirror, weights, best, rows, kept)
+    return kept
+
+
+@njit(cache=True)
+def _translate(word: Array, first: int, x: float, y: float, crab: float) -> int:
+    """Rows of the shortest translation by (x, y), from index ``first`` on; returns their number."""
+    r = sqrt(x * x + y * y)
+    angle = atan2(y, x)
+    if abs(angle) <= crab:
+        _put(word, first, r, 0.0, angle)
+        return 1
+    angle = atan2(-y, -x)
+    if abs(angle) <= crab:
+        _put(word, first, -r, 0.0, angle)
+        return 1
+    along, aside = x / cos(crab), y / sin(crab)
+    _put(word, first, 0.5 * (along + aside), 0.0, crab)
+    _put(word, first + 1, 0.5 * (along - aside), 0.0, -crab)
+    return 2
+
+
+@njit(cache=True)
+def _arc_and_crab(
+    x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
+    word: Array, best: Array, rows: Array, kept: int,
+) -> int:  # fmt: skip
+    """Left arc and translation in both orders."""
+    px, py = x - sin(phi), y - 1.0 + cos(phi)
+    c, s = cos(phi), sin(phi)
+    _put(word, 0, phi, 1.0, 0.0)
+    count = _translate(word, 1, px * c + py * s, py * c - px * s, crab)
+    kept = _try(word, 1 + count, mirror, weights, best, rows, kept)
+    count = _translate(word, 0, px, py, crab)
+    _put(word, count, phi, 1.0, 0.0)
+    return _try(word, count + 1, mirror, weights, best, rows, kept)
+
+
+@njit(cache=True)
+def connect(
+    start: Array, goal: Array, radius: float, crab: float, weights: Array,
+    rows: Array, best: Array, scratch: Array,
+) -> int:  # fmt: skip
+    """Cheapest motion from one pose to another.
+
+    Args:
+        start: x, y (m), yaw (rad).
+        goal: the same.
+        radius: turning radius, m.
+        crab: largest angle of a translation, rad; 0 for none.
+        weights: cost per metre backward and of a change of direction (in radii), factor on translations.
+        rows: shape (5, 3), gets the motion: signed length m, curvature 1/m, sideslip rad.
+        best: shape (8,), gets the cost in radii as its first field.
+        scratch: shape (4, 3).
+
+    Returns:
+        Number of rows.
+    """
+    x, y, phi = relative(start, goal, radius)
+    pieces = scratch.reshape(12)[:5]
+    solve(x, y, phi, weights, best, pieces)
+    kept = spell(best, radius, rows, pieces)
+    if crab <= 0.0:
+        return kept
+    own = kept
+    kept = -1
+    for k in range(2):
+        mirror = 1.0 if k == 0 else -1.0
+        kept = _arc_crab_arc(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, rows, kept)
+        kept = _arc_and_crab(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, rows, kept)
+    if kept < 0:
+        return own
+    for i in range(kept):
+        rows[i, 0] *= radius
+        rows[i, 1] /= radius
+    return kept
+
+
+@njit(cache=True)
+def _crab_distances(starts: Array, goals: Array, radius: float, crab: float, weights: Array) -> Array:
+    """Cost in metres of the cheapest motion of every pair."""
+    result = np.empty(len(starts))
+    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.full(8, inf), np.empty((4, 3))
+    for i in range(len(starts)):
+        connect(starts[i], goals[i], radius, crab, weights, rows, best, scratch)
+        result[i] = best[COST] * radius
+    return result
+
+
+@njit(cache=True)
+def rows_between(start: Array, goal: Array, radius: float, crab: float, weights: Array) -> Array:
+    """Rows of the cheapest motion, shape (n, 3)."""
+    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.full(8, inf), np.empty((4, 3))
+    return rows[: connect(start, goal, radius, crab, weights, rows, best, scratch)]
 
 
 @dataclass(frozen=True)
@@ -71,13 +475,13 @@ class ReedsShepp:
         """
         a, b = np.broadcast_arrays(_poses(starts), _poses(goals))
         if self.crab_angle:
-            return crab_words.distances(a, b, self.radius, self.crab_angle, self.weights)
-        return reeds_shepp_words.distances(a, b, self.radius, self.weights)
+            return _crab_distances(a, b, self.radius, self.crab_angle, self.weights)
+        return _word_distances(a, b, self.radius, self.weights)
 
     def path(self, start: ArrayLike, goal: ArrayLike) -> MotionPath:
         """Best motion from one pose to another."""
         a, b = _poses(start)[0], _poses(goal)[0]
-        rows = crab_words.rows_between(a, b, self.radius, self.crab_angle, self.weights)
+        rows = rows_between(a, b, self.radius, self.crab_angle, self.weights)
         return MotionPath(a, rows, self.steering, self.reference)
 
 

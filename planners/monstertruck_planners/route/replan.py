@@ -5,15 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.route.api import Clock, RouteMap, RouteResult
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 SAME_GOAL = 1e-3
 """Goals nearer than this are the same, m and rad."""

@@ -8,13 +8,12 @@ import pytest
 
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.local.api import Guide, Memory, Session
-from monstertruck_planners.local.band import cover_of
 from monstertruck_planners.local.catalog import KINDS, make_deformer
 from monstertruck_planners.local.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.local.least_squares import cost_and_gradient
-from monstertruck_planners.local.planner import Local, Surveyor, onward, passed, rest_of
+from monstertruck_planners.local.core import Local, Surveyor, onward, passed, rest_of
+from monstertruck_planners.local.elastic_band import cover_of
 from monstertruck_planners.local.published import oriented
-from monstertruck_planners.local.teb import resampled, terms_of
+from monstertruck_planners.local.teb import cost_and_gradient, resampled, terms_of
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_runtime.errors import InputError

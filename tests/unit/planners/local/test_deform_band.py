@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.collision import DiscFootprint, Footprint, clearance_to_points
-from monstertruck_planners.local import bubbles
+from monstertruck_planners.local import elastic_band
 from monstertruck_planners.local.api import Guide
-from monstertruck_planners.local.band import cover_of, rules_of, stretch
 from monstertruck_planners.local.config import BandConfig
+from monstertruck_planners.local.elastic_band import cover_of, rules_of, stretch
 from monstertruck_runtime.errors import InputError
 from tests.unit.planners.local.deform_kit import RES, line, window
 
@@ -36,7 +36,7 @@ def test_clearance_is_that_of_the_footprint_at_its_heading():
     poses = np.array([[2.0, 2.0, yaw] for yaw in np.linspace(0, 3.1, 12)])
     edge = np.array([[2.6, y] for y in np.linspace(1.8, 2.2, 30)])
     exact = clearance_to_points(Footprint(), poses, edge)
-    got = [bubbles.clearance(field.data(), COVER, *pose) for pose in poses]
+    got = [elastic_band.clearance(field.data(), COVER, *pose) for pose in poses]
     assert np.abs(got - exact).max() < RES
 
 
@@ -45,7 +45,7 @@ def test_band_moves_off_an_obstacle_beside_it_and_keeps_its_ends():
     guide = line(end=3.4, y=2.08)
     band = stretch(guide, field, COVER, RULES)
     assert band.guide is not None
-    before = min(bubbles.clearance(field.data(), COVER, *pose) for pose in guide.poses)
+    before = min(elastic_band.clearance(field.data(), COVER, *pose) for pose in guide.poses)
     assert band.radii.min() > before + 0.05
     assert np.allclose(band.guide.poses[[0, -1]], guide.poses[[0, -1]])
     gaps = np.hypot(*np.diff(band.guide.poses[:, :2], axis=0).T)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from monstertruck_planners.local import bubbles
+from monstertruck_planners.local import elastic_band
 from monstertruck_planners.local.api import Memory
 from monstertruck_planners.local.catalog import make_deformer
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
-from monstertruck_planners.local.planner import Surveyor
+from monstertruck_planners.local.core import Surveyor
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.local.deform_kit import drivable, line, window
@@ -45,7 +45,7 @@ def test_nothing_comes_nearer_on_the_way_out(car, y):
     out = surveyor.loosened(field, pose)
     assert drivable(vehicle, out)
     assert field.free(vehicle.footprint, out.end[None], 0.02)[0]
-    clearances = [bubbles.clearance(field.data(), surveyor.cover, *p) for p in out.sample(0.01).poses]
+    clearances = [elastic_band.clearance(field.data(), surveyor.cover, *p) for p in out.sample(0.01).poses]
     assert min(np.diff(clearances)) > -0.003
 
 

@@ -7,8 +7,7 @@ from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
 from monstertruck_planners.route.catalog import CONFIGS, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
-from monstertruck_planners.route.lattice import LatticePlanner
-from monstertruck_planners.route.lattice_moves import ANGLES, make_moves
+from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_moves
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground

@@ -7,9 +7,9 @@ import pytest
 
 from monstertruck_planners.collision import DistanceField, Footprint
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.fit import fits
-from monstertruck_planners.route.hunt import LEVELS, MOST_POSES
+from monstertruck_planners.route.corridors import fits
 from monstertruck_planners.route.hybrid import HybridPlanner, narrower
+from monstertruck_planners.route.hybrid_search import LEVELS, MOST_POSES
 from monstertruck_planners.route.replan import Waypoint, plan_through, replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground

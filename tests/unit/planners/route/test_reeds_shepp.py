@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_planners.route import reeds_shepp_words as words
+from monstertruck_planners.route import reeds_shepp as words
 from monstertruck_planners.route.motion import MotionPath, joined, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from monstertruck_runtime.errors import InputError

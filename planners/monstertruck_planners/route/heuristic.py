@@ -4,13 +4,17 @@ The first of the two heuristics, and the guide of the search: every cell also kn
 if any cell inside it may hold the middle of the footprint; near obstacles a metre counts more: the truck is no point.
 """
 
+from functools import lru_cache
+from math import cos, floor, inf, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData
+from monstertruck_planners.route.reeds_shepp import COST, MOST_ROWS, connect
 
 UNIT = 100
 """Cost of a step to the next column or row in the open."""
@@ -177,3 +181,61 @@ def cells_on_way(step: NDArray[np.int8], row: int, column: int) -> NDArray[np.in
             return cells[:used].copy()
         row += STEPS[k, 1]
         column += STEPS[k, 0]
+
+
+TABLE_REACH = 4.0
+"""Half size of the table, turning radii."""
+TABLE_SPACING = 0.25
+TABLE_HEADINGS = 36
+
+
+@njit(cache=True)
+def _fill(crab: float) -> NDArray[np.float32]:
+    across = round(2 * TABLE_REACH / TABLE_SPACING) + 1
+    table = np.empty((across, (across + 1) // 2, TABLE_HEADINGS), np.float32)
+    start, goal = np.zeros(3), np.zeros(3)
+    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.full(8, inf), np.empty((4, 3))
+    weights = np.array([1.0, 0.0, 1.0])
+    for i in range(across):
+        for j in range((across + 1) // 2):
+            for k in range(TABLE_HEADINGS):
+                goal[0], goal[1], goal[2] = (
+                    i * TABLE_SPACING - TABLE_REACH,
+                    j * TABLE_SPACING,
+                    2 * pi * k / TABLE_HEADINGS,
+                )
+                connect(start, goal, 1.0, crab, weights, rows, best, scratch)
+                table[i, j, k] = best[COST]
+    return table
+
+
+@lru_cache(maxsize=8)
+def turning_table(crab: float) -> NDArray[np.float32]:
+    """Lengths from the origin, shape (x from -TABLE_REACH, y from 0, heading from 0)."""
+    return np.asarray(_fill(crab))
+
+
+@njit(cache=True)
+def turning_bound(table: NDArray[np.float32], radius: float, x: float, y: float, yaw: float, goal: Array) -> float:
+    """Length in metres from a pose to the goal, at the nearest entry; the straight distance beyond the table."""
+    dx, dy = (x - goal[0]) / radius, (y - goal[1]) / radius
+    # The way back is as long: look from the goal.
+    c, s = cos(goal[2]), sin(goal[2])
+    px, py, turn = dx * c + dy * s, dy * c - dx * s, yaw - goal[2]
+    if abs(px) > TABLE_REACH or abs(py) > TABLE_REACH:
+        return radius * sqrt(px * px + py * py)
+    if py < 0.0:
+        py, turn = -py, -turn
+    k = floor(turn / (2 * pi) * TABLE_HEADINGS + 0.5) % TABLE_HEADINGS
+    return radius * float(table[int((px + TABLE_REACH) / TABLE_SPACING + 0.5), int(py / TABLE_SPACING + 0.5), k])
+
+
+@njit(cache=True)
+def estimate(
+    field: FieldData, go: ToGo, table: NDArray[np.float32], radius: float, goal: Array, x: float, y: float, yaw: float
+) -> float:
+    """The greater of both heuristics, m; inf off the known ways."""
+    row, column = cell_at(field, go.cell, x, y)
+    if not (0 <= row < go.cost.shape[0] and 0 <= column < go.cost.shape[1]) or go.cost[row, column] >= FAR:
+        return inf
+    return float(max(go.cost[row, column] * go.cell / UNIT, turning_bound(table, radius, x, y, yaw, goal)))

@@ -5,6 +5,8 @@ and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with
 published planner; what is different there is named at ``Rules``.
 """
 
+import math
+from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
@@ -12,9 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import DiscFootprint, DistanceField, Footprint
 from monstertruck_planners.collision_kernels import FieldData
+from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.config import BandConfig
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MOST = 400
@@ -24,10 +29,10 @@ MOST = 400
 class Cover(NamedTuple):
     """Discs that together cover a footprint, and hardly more."""
 
-    x: FloatArray
-    y: FloatArray
+    x: Array
+    y: Array
     """Centres, m, seen from the pose."""
-    radius: FloatArray
+    radius: Array
     """m."""
     reach: float
     """Greatest distance of a centre from the pose, m."""
@@ -93,18 +98,18 @@ def _radius(field: FieldData, cover: Cover, rules: Rules, x: float, y: float, ya
 
 
 @njit(cache=True)
-def _apart(rules: Rules, band: FloatArray, i: int, j: int) -> float:
+def _apart(rules: Rules, band: Array, i: int, j: int) -> float:
     turned = abs((band[i, 2] - band[j, 2] + pi) % (2 * pi) - pi)
     return float(hypot(band[i, 0] - band[j, 0], band[i, 1] - band[j, 1]) + rules.reach * turned)
 
 
 @njit(cache=True)
-def _touch(rules: Rules, band: FloatArray, i: int, j: int) -> bool:
+def _touch(rules: Rules, band: Array, i: int, j: int) -> bool:
     return bool(_apart(rules, band, i, j) < rules.overlap * (band[i, 3] + band[j, 3]))
 
 
 @njit(cache=True)
-def _insert(band: FloatArray, fixed: BoolArray, count: int, i: int) -> None:
+def _insert(band: Array, fixed: BoolArray, count: int, i: int) -> None:
     """A bubble half-way between i - 1 and i, at index i; it takes the direction of the later one."""
     for k in range(count, i, -1):
         for m in range(6):
@@ -119,9 +124,7 @@ def _insert(band: FloatArray, fixed: BoolArray, count: int, i: int) -> None:
 
 
 @njit(cache=True)
-def refine(
-    field: FieldData, cover: Cover, rules: Rules, band: FloatArray, fixed: BoolArray, count: int
-) -> tuple[int, bool]:
+def refine(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int) -> tuple[int, bool]:
     """Fill gaps between bubbles and take out those that are not needed.
 
     Args:
@@ -165,7 +168,7 @@ def refine(
 
 @njit(cache=True)
 def _force(
-    field: FieldData, cover: Cover, rules: Rules, before: FloatArray, here: FloatArray, after: FloatArray
+    field: FieldData, cover: Cover, rules: Rules, before: Array, here: Array, after: Array
 ) -> tuple[float, float]:
     """Pull of both neighbours and push of obstacles on a bubble, across the band."""
     fx, fy = 0.0, 0.0
@@ -192,7 +195,7 @@ def _force(
 
 
 @njit(cache=True)
-def _move(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, i: int) -> None:
+def _move(field: FieldData, cover: Cover, rules: Rules, band: Array, i: int) -> None:
     """Let one bubble go where its force pushes it, as long as it stays free and near its neighbours."""
     before, here, after = band[i - 1], band[i], band[i + 1]
     fx, fy = _force(field, cover, rules, before, here, after)
@@ -228,7 +231,7 @@ def _move(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, i: int
 
 
 @njit(cache=True)
-def face(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, fixed: BoolArray, count: int) -> None:
+def face(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int) -> None:
     """Turn every bubble along the band, by its sideslip beside it, unless it is fixed or would touch something."""
     for i in range(1, count - 1):
         if fixed[i]:
@@ -242,7 +245,7 @@ def face(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, fixed: 
 
 
 @njit(cache=True)
-def measure(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, count: int) -> int:
+def measure(field: FieldData, cover: Cover, rules: Rules, band: Array, count: int) -> int:
     """Take all radii anew.
 
     Returns:
@@ -258,7 +261,7 @@ def measure(field: FieldData, cover: Cover, rules: Rules, band: FloatArray, coun
 
 @njit(cache=True)
 def optimise(
-    field: FieldData, cover: Cover, rules: Rules, band: FloatArray, fixed: BoolArray, count: int
+    field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int
 ) -> tuple[int, bool]:
     """Move a band that holds to its equilibrium; ends and cusps stay.
 
@@ -278,3 +281,105 @@ def optimise(
         if not holds:
             return count, False
     return count, True
+
+
+LAYER = 0.035
+"""Depth of the outline's discs below it, m: they stand out by 0.4 of it."""
+
+SPACING = 0.2
+"""Largest distance of bubbles, m."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """What became of a band."""
+
+    guide: Guide | None
+    """None: it does not hold."""
+    broken: int
+    """Bubbles before the first one that touches something; their number if none does."""
+    radii: Array
+    """Shape (n,), m; of the guide's poses."""
+
+
+def cover_of(footprint: Footprint | DiscFootprint) -> Cover:
+    """Discs that cover a footprint: of a rectangle small ones along the outline and large ones inside."""
+    if isinstance(footprint, DiscFootprint):
+        x = np.array(footprint.centres)
+        return _cover(x, np.zeros(len(x)), np.full(len(x), footprint.radius))
+    length, width = footprint.half_length - LAYER, footprint.half_width - LAYER
+    along = np.linspace(-length, length, math.ceil(length / LAYER) + 1)
+    across = np.linspace(-width, width, math.ceil(width / LAYER) + 1)[1:-1]
+    inner = np.linspace(-max(length - width, 0.0), max(length - width, 0.0), 3)
+    x = np.concatenate((along, along, np.full(len(across), length), np.full(len(across), -length), inner))
+    sides = (np.full(len(along), width), np.full(len(along), -width))
+    y = np.concatenate((*sides, across, across, np.zeros(len(inner))))
+    radius = np.full(len(x), LAYER * math.sqrt(2.0))
+    radius[-len(inner) :] = width
+    return _cover(x + footprint.offset, y, radius)
+
+
+def _cover(x: Array, y: Array, radius: Array) -> Cover:
+    return Cover(x, y, radius, float(np.hypot(x, y).max()))
+
+
+def rules_of(config: BandConfig, cover: Cover) -> Rules:
+    """The corrected rules."""
+    return Rules(
+        config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
+        config.overshoot, config.significant, config.tiny, config.largest,
+        1.0, 0.5 * cover.reach, SPACING, False,
+    )  # fmt: skip
+
+
+def stretch(guide: Guide, surroundings: DistanceField, cover: Cover, rules: Rules) -> Band:
+    """Let an elastic band go: first and last pose and cusps stay, what is between keeps clear of obstacles.
+
+    Args:
+        guide: poses of the reference point, fewer than ``MOST``.
+        surroundings: obstacles.
+        cover: footprint, see ``cover_of``.
+        rules: of the forces.
+    """
+    count = len(guide.poses)
+    band, fixed = np.zeros((MOST, 6)), np.zeros(MOST, np.bool_)
+    if count > MOST // 2:
+        keep = np.unique(np.concatenate((np.linspace(0, count - 1, MOST // 2).round().astype(int), _cusps(guide))))
+        guide = Guide(guide.poses[keep], guide.directions[keep])
+        count = len(keep)
+    band[:count, :3] = guide.poses
+    band[:count, 2] = np.unwrap(guide.poses[:, 2])
+    band[:count, 4] = guide.directions
+    band[:count, 5] = 0.0 if rules.published else _sideslips(guide)
+    fixed[[0, count - 1]] = True
+    fixed[_cusps(guide)] = True
+    field = surroundings.data()
+    broken = int(measure(field, cover, rules, band, count))
+    if broken < count:
+        return Band(None, broken, band[:count, 3].copy())
+    count, holds = refine(field, cover, rules, band, fixed, count)
+    if not holds:
+        return Band(None, broken, band[:count, 3].copy())
+    moved, pinned = band.copy(), fixed.copy()
+    more, settled = optimise(field, cover, rules, moved, pinned, count)
+    if settled:
+        band, count = moved, more
+    result = Guide(band[:count, :3].copy(), band[:count, 4].copy())
+    return Band(result, count, band[:count, 3].copy())
+
+
+def _cusps(guide: Guide) -> NDArray[np.int64]:
+    """Indices of the poses at which the direction changes."""
+    return np.asarray(np.flatnonzero(np.diff(guide.directions)))
+
+
+def _sideslips(guide: Guide) -> Array:
+    """From the heading to the way driven, rad, for every pose; small ones are corners of the guide, not crab."""
+    steps = np.diff(guide.poses[:, :2], axis=0)
+    if not len(steps):
+        return np.zeros(len(guide.poses))
+    course = np.arctan2(steps[:, 1], steps[:, 0]) + np.where(guide.directions[1:] > 0, 0.0, math.pi)
+    middle = 0.5 * (guide.poses[1:, 2] + guide.poses[:-1, 2])
+    slip = np.remainder(course - middle + math.pi, math.tau) - math.pi
+    slip[(np.hypot(*steps.T) < 1e-6) | (np.abs(slip) > 0.5) | (np.abs(slip) < 0.1)] = 0.0
+    return np.concatenate((slip[:1], slip))
