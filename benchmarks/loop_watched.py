@@ -22,7 +22,7 @@ import uvloop
 
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.schedule import Schedule
-from monstertruckd.gate.meter import TickMeter
+from monstertruckd.gate.service import TickMeter
 
 NOTABLE = 0.5
 RATE = 50.0

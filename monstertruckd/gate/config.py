@@ -9,19 +9,18 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.topics import Topic
-from monstertruckd.gate.steering_check import SteeringCheckConfig
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0)]
 
 
 class SensorLimit(Schema):
-    """What one sensor's silence means."""
+    """When one sensor is stale, and what that means."""
 
     stale_after: Positive
-    """Seconds after the daemon received the newest good sample at which it no longer counts."""
+    """Age of the newest valid sample, s since the daemon received it, from which on the sensor is stale."""
     critical: bool = True
-    """Silence stops the truck; otherwise the sensor's own limits merely lapse with it."""
+    """A stale sensor stops the truck; otherwise only the limits derived from it lapse."""
 
 
 def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
@@ -30,7 +29,7 @@ def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
 
 
 class Leases(Schema):
-    """Longest lease the gate grants each role, s, whatever the request asks for."""
+    """Longest lease granted to each role, s, whatever the request asks for."""
 
     gamepad: Annotated[float, Field(gt=0, le=1)] = 0.25
     keyboard: Annotated[float, Field(gt=0, le=1)] = 0.25
@@ -44,7 +43,7 @@ class Leases(Schema):
 
 
 class TiltLimits(Schema):
-    """Angle between the truck's z axis and the vertical, and what it allows."""
+    """Limits of the angle between the truck's z axis and the vertical."""
 
     slow: Annotated[float, Field(gt=0, lt=math.pi / 2)] = 0.21
     """From this tilt on the speed is limited to ``slow_speed``, rad."""
@@ -62,47 +61,60 @@ class TiltLimits(Schema):
         return self
 
 
+class SteeringCheckConfig(Schema):
+    """When the measured yaw contradicts the steering."""
+
+    window: Positive = 2.0
+    """Seconds over which turns are compared."""
+    tolerance: Positive = 0.14
+    """Tolerated difference: compass errors and the servos' lag, rad."""
+    speed: Positive = 0.03
+    """Below this speed nothing is compared: the truck may be turned by hand, m/s."""
+    share: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    """Tolerated difference as a share of the larger turn: tyre slip and calibration."""
+
+
 class ObstacleLimits(Schema):
-    """How much room the truck keeps along the way it is about to sweep."""
+    """Clearance kept along the swept path."""
 
     ahead: Share = 0.05
-    """Left between the footprint and the obstacle after the stop, m."""
+    """Distance between footprint and obstacle after the stop, m."""
     beside: Share = 0.02
-    """Kept to all sides while passing, m, on top of the footprint's padding."""
+    """Clearance to all sides while passing, m, added to the footprint's padding."""
     deceleration: Positive = 0.15
     """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""
     crawl: Positive = 0.02
-    """An allowed speed below this one is a stop; going on needs twice as much, m/s."""
+    """An allowed speed below this is a stop; driving on needs twice as much, m/s."""
 
 
 class GateConfig(Schema):
-    """Everything the safety gate may be told."""
+    """Settings of the safety gate."""
 
     rate: Annotated[float, Field(ge=10, le=200)] = 50.0
     """Control ticks per second."""
 
     speed: Positive = 0.21
-    """Greatest speed of the wheels over ground, forward, m/s."""
+    """Greatest wheel speed over ground, forward, m/s."""
     reverse_speed: Positive = 0.15
-    """The same backwards, where the lidar does not look, m/s."""
+    """Greatest wheel speed in reverse, where the lidar sees nothing, m/s."""
     angle: Annotated[float, Field(gt=0, lt=1.0)] = 0.436
     """Greatest axle angle, rad."""
     acceleration: Positive = 0.5
     """Growth of the commanded speed, m/s^2."""
     deceleration: Positive = 1.0
-    """Deceleration the drive controller's profile reaches at least, once it is told speed 0, m/s^2."""
+    """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
-    """The same for its quick stop, m/s^2."""
+    """Least deceleration of its quick stop, m/s^2."""
     steering_rate: Positive = 1.0
     """Greatest change of an axle angle, rad/s."""
     reaction: Share = 0.08
-    """Seconds from a command leaving the gate to the truck beginning to obey."""
+    """Seconds from a command leaving the gate to the truck's response."""
     standstill: Positive = 0.01
     """Measured speed below which the truck is at rest, m/s."""
 
     leases: Leases = Leases()
     max_request_age: Positive = 0.5
-    """A request that may set the truck in motion counts only if its sender knew a gate state not older than this, s."""
+    """A request that may set the truck in motion must carry the stamp of a gate state not older than this, s."""
     remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Sources outside the robot that may drive as trackers."""
     disarm_after: Positive = 1.5
@@ -110,14 +122,14 @@ class GateConfig(Schema):
 
     scan: SensorLimit = _limit(topics.SCAN)
     scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.35
-    """A scan whose plane was tilted more than this is no good sample: within the gate's reach of half a metre it looks
-    0.2 m over or under what it should see, rad."""
+    """A scan whose plane was tilted more than this is not valid, rad: half a metre ahead, as far as the gate checks, it
+    passes 0.2 m above or below an obstacle."""
     drive: SensorLimit = _limit(topics.DRIVE)
     steering: SensorLimit = _limit(topics.STEERING)
     attitude: SensorLimit = _limit(topics.COMPASS)
     battery: SensorLimit = _limit(topics.BATTERY, critical=False)
     max_latency: Positive = 0.4
-    """Greatest distance between a sample's stamp and its arrival, s; beyond it the sample is not a good one."""
+    """Greatest time between a sample's stamp and its arrival, s; a later sample is not valid."""
     tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = (
         "recorder",
         "camera",
@@ -131,13 +143,13 @@ class GateConfig(Schema):
     tick_stall: Positive = 0.15
     """A longer pause between two ticks stops the truck, s."""
     stall_dwell: Positive = 0.5
-    """Seconds of punctual ticks that end such a stop."""
+    """Seconds of punctual ticks after which such a stop ends."""
 
     tilt: TiltLimits = TiltLimits()
     turning: SteeringCheckConfig | None = SteeringCheckConfig()
-    """Compass against steering: servos without supply are found; null = off."""
+    """Compass against steering, finds servos without supply; null = off."""
     battery_low_speed: Positive = 0.1
-    """Speed limit with a low, or no longer measured, battery, m/s."""
+    """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
     event_interval: Share = 1.0
     """Least seconds between two equal events."""

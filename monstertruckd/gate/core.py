@@ -1,18 +1,17 @@
 """The safety gate as a pure state machine: requests and observations in, actuator commands out at every tick.
 
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
-A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so that it ends even if nothing
-is ever sent again. ``sources`` holds the rules of who drives, ``states`` the transitions, ``watch`` what stops or slows
-the truck, ``pursuit`` the way from a request to the commanded motion, ``evidence``, ``outages`` and ``stops`` the
-reasons told.
+A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so it completes even if nothing is
+sent afterwards. ``sources`` holds the rules of who drives, ``states`` the transitions, ``sensors`` what stops or slows
+the truck, ``limiter`` and ``obstacles`` the way from a request to the commanded motion, ``stops`` the causes reported.
 
-Whatever stops the truck ends with standstill confirmed by the drive. Short trouble (a late scan, a lapsed lease) then
-lets the same source go on; trouble longer than ``disarm_after`` and what a human should look at disarms.
+Every stop ends with standstill confirmed by the drive. After a short fault (a late scan, an expired lease) the same
+source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING``, disarms.
 """
 
 import math
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_planners.collision import Footprint, ScanPoints
@@ -29,26 +28,51 @@ from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.events import EventLog
-from monstertruckd.gate.evidence import Evidence, order_cause
-from monstertruckd.gate.motion import Motion
+from monstertruckd.gate.limiter import CommandLimiter, Motion
 from monstertruckd.gate.obstacles import ObstacleGuard
-from monstertruckd.gate.outages import Outages
-from monstertruckd.gate.output import GateOutput
-from monstertruckd.gate.pursuit import Pursuit
+from monstertruckd.gate.sensors import Assessment, SensorMonitor, SteeringCheck
 from monstertruckd.gate.sources import Source, Sources
-from monstertruckd.gate.states import States
-from monstertruckd.gate.steering_check import SteeringCheck
-from monstertruckd.gate.stops import StopBook
-from monstertruckd.gate.watch import Judgement, Watch
+from monstertruckd.gate.states import EventLog, GateEvent, States
+from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
 
 URGENT: Final = frozenset(
     {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
 )
-"""These stop by quick stop, which jumps every queue; the others by the drive's ordinary ramp."""
+"""These stop by quick stop, which overtakes queued commands; the others by the drive's ordinary ramp."""
 
 DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
-"""After these somebody has to arm again, however short they were."""
+"""After these the truck must be armed again, however short they were."""
+
+
+class GateOutput(NamedTuple):
+    """Result of one tick: the fields of DriveCommand, SteeringCommand and GateState; events and stops."""
+
+    action: DriveAction
+    speeds: tuple[float, ...]
+    """Wheel speed over ground of every driven shaft, m/s."""
+    motor_velocities: tuple[float, ...]
+    """Motor rate of every driven shaft, as in ``DriveCommand``."""
+    front: float
+    """Axle angle, rad."""
+    rear: float
+    """Axle angle, rad."""
+    front_servo: float
+    """Servo angle, rad."""
+    rear_servo: float
+    """Servo angle, rad."""
+    mode: GateMode
+    holder: str | None
+    role: Role | None
+    lease_left: float | None
+    """S."""
+    last_seq: int | None
+    speed_limit: float
+    """M/s."""
+    reasons: tuple[Reason, ...]
+    stopping_distance: float
+    """M."""
+    events: tuple[GateEvent, ...]
+    trips: tuple[Trip, ...]
 
 
 class Gate:
@@ -56,9 +80,9 @@ class Gate:
 
     Args:
         config: limits.
-        chassis: what the body can do, and how its motors and servos do it.
+        chassis: kinematics of the body, its motors and servos.
         footprint: the truck's outline.
-        points: of scans, in base.
+        points: converts scans to points in base.
         nonce: of this run; requests must carry it.
         latched: whether the emergency stop was latched when the daemon last ran.
 
@@ -85,30 +109,30 @@ class Gate:
         self._config = config
         self._chassis = chassis
         self._sources = Sources(nonce, config)
-        self._watch = Watch(config, chassis)
+        self._sensors = SensorMonitor(config, chassis)
         self._outages = Outages()
         self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, points)
         self._motion = Motion(config, chassis)
-        self._pursuit = Pursuit(config, self._motion, self._obstacles, self._watch)
-        # Other bodies are turned by their wheel speeds, or not at all, and have no lone servo supply to lose.
+        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
+        # Other bodies do not steer by servos with a supply of their own.
         self._steering_check = (
             SteeringCheck(config.turning, chassis.bicycle)
             if config.turning is not None and isinstance(chassis, TruckChassis)
             else None
         )
-        self._evidence = Evidence(config, self._watch, self._pursuit, self._steering_check)
+        self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check)
         self._events = EventLog(config.event_interval)
-        self._stops = StopBook(self._outages)
+        self._stops = StopLog(self._outages)
         self._states = States(self._events, latched=latched)
         self._known: dict[Reason, int] = {}
-        """What stops or slows the truck, and since when, ns."""
+        """What stops or slows the truck, and since when (ns)."""
         self._ticked: int | None = None
         self._stalled_until = 0
         self._shut_down = False
 
     @property
     def mode(self) -> GateMode:
-        """State now."""
+        """Present mode."""
         return self._states.mode
 
     @property
@@ -120,52 +144,52 @@ class Gate:
 
     def observe_scan(self, scan: LaserScan) -> None:
         """Take the newest scan."""
-        if self._watch.observe_scan(scan):
+        if self._sensors.observe_scan(scan):
             self._obstacles.observe(scan)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take the newest attitude."""
-        self._watch.observe_attitude(attitude)
+        self._sensors.observe_attitude(attitude)
         if self._steering_check is not None:
             now = attitude.received
-            trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._watch.steering_fresh(now)
+            trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._sensors.steering_fresh(now)
             heading = attitude.heading if trusted and self._states.active else None
-            self._steering_check.observe(attitude.stamp, heading, self._watch.speed(now), *self._watch.axles)
+            self._steering_check.observe(attitude.stamp, heading, self._sensors.speed(now), *self._sensors.axles)
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
-        self._watch.observe_drive(feedback, shaft)
+        self._sensors.observe_drive(feedback, shaft)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the newest steering feedback."""
-        self._watch.observe_steering(feedback)
+        self._sensors.observe_steering(feedback)
 
     def observe_battery(self, battery: Battery) -> None:
         """Take the newest battery reading."""
-        self._watch.observe_battery(battery)
+        self._sensors.observe_battery(battery)
 
     def observe_health(self, table: HealthTable) -> None:
         """Take the newest health table."""
-        self._watch.observe_health(table)
+        self._sensors.observe_health(table)
         self._outages.observe_health(table)
 
     def observe_event(self, event: Event) -> None:
-        """Take what happened elsewhere in the daemon: it may be what is behind a stop."""
+        """Take any service's event: it may explain a stop."""
         self._outages.observe_event(event)
 
     # Requests
 
     def request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request from outside; returns OK, or the reason why it does not move the truck now."""
-        return self._consider(request, now, self._sources.admit_request(request, now), inside=False)
+        """Take a drive request from outside; returns OK, or why it does not move the truck."""
+        return self._consider(request, now, self._sources.accept_request(request, now), inside=False)
 
     def planner_request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request of the robot's own planners; returns what ``request`` does."""
-        return self._consider(request, now, self._sources.admit_planner_request(request), inside=True)
+        """Take a drive request of the robot's own planners; returns as ``request`` does."""
+        return self._consider(request, now, self._sources.accept_planner_request(request), inside=True)
 
-    def _consider(self, request: DriveRequest, now: int, admission: Reason, *, inside: bool) -> Reason:
-        if admission is not Reason.OK:
-            return self._refuse(now, admission, request)
+    def _consider(self, request: DriveRequest, now: int, accepted: Reason, *, inside: bool) -> Reason:
+        if accepted is not Reason.OK:
+            return self._refuse(now, accepted, request)
         wrong = {n: v for n in ("speed", "front", "rear") if not math.isfinite(v := getattr(request, n))}
         if wrong:
             text = ", ".join(f"{name} is {value}" for name, value in wrong.items()) + ": expected finite numbers"
@@ -177,24 +201,24 @@ class Gate:
             return self._refuse(now, Reason.ESTOPPED, request)
         if self.mode is GateMode.DISARMED:
             return self._refuse(now, Reason.DISARMED, request)
-        reason = self._sources.standing(source, now, self._states.holder_key)
+        reason = self._sources.priority(source, now, self._states.holder_key)
         if reason is Reason.BUSY and inside and source.neutral:
-            return reason  # It keeps the truck standing when the planner that drives comes to its end.
+            return reason  # It holds the truck at rest once the driving planner ends.
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
-        return next(iter(self._blocks(self._watch.judge(now), now)), Reason.OK)
+        return next(iter(self._blocks(self._sensors.assess(now), now)), Reason.OK)
 
     def control(self, request: ControlRequest, now: int) -> Reason:
         """Carry out an order; returns OK, or why it was refused.
 
-        ESTOP and STOP are taken from anybody, authentic or not: stopping is always safe. ARM and RESET need an
-        operator's role, a truck at rest and no stick deflected.
+        ESTOP and STOP are accepted from every source, authenticated or not: stopping is always safe. ARM and RESET need
+        an operator's role, a truck at rest and no operator requesting motion.
         """
         if request.order is Order.ESTOP:
             return self._estop(request, now)
         if request.order is Order.STOP:
-            return self._give_up(request, now)
-        reason = self._sources.admit_order(request, now)
+            return self._stop_by(request, now)
+        reason = self._sources.accept_order(request, now)
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         if request.order is Order.DISARM:
@@ -206,28 +230,28 @@ class Gate:
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"
         values = {"role": request.role.value, "request": what}
-        self._events.tell(now, reason, Severity.WARNING, text, values, source=request.source)
+        self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source)
         return reason
 
     def _estop(self, request: ControlRequest, now: int) -> Reason:
         if self.mode is not GateMode.ESTOPPED:
-            why = order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
+            why = _order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
             self._trip(now, GateMode.ESTOPPED, [why])
             self._states.latch(now)
             values = {"role": request.role.value}
-            self._events.tell(
+            self._events.emit(
                 now, Reason.ESTOP_REQUESTED, Severity.ERROR, "", values, source=request.source, always=True
             )
         return Reason.OK
 
-    def _give_up(self, request: ControlRequest, now: int) -> Reason:
+    def _stop_by(self, request: ControlRequest, now: int) -> Reason:
         if request.role is not Role.TRACKER:
             self._sources.claim(request.role)
         self._sources.hold()
         if self.mode is GateMode.DRIVING:
             text = f"stop ordered by {request.source}"
-            self._stop(now, [order_cause(Reason.STOPPED, text, request, now)], ordered=True)
-            self._tell_transition(now, Reason.STOPPED, text)
+            self._stop(now, [_order_cause(Reason.STOPPED, text, request, now)], ordered=True)
+            self._emit_transition(now, Reason.STOPPED, text)
         return Reason.OK
 
     def _disarm_by(self, request: ControlRequest, now: int) -> Reason:
@@ -237,28 +261,28 @@ class Gate:
         elif self._states.active:
             self._states.disarm_at_rest = True
             if self.mode is GateMode.DRIVING:
-                self._stop(now, [order_cause(Reason.DISARMED, text, request, now)], ordered=True)
-                self._tell_transition(now, Reason.DISARMED, text)
+                self._stop(now, [_order_cause(Reason.DISARMED, text, request, now)], ordered=True)
+                self._emit_transition(now, Reason.DISARMED, text)
         return Reason.OK
 
     def _arm(self, request: ControlRequest, now: int) -> Reason:
         if self.mode is GateMode.ESTOPPED:
-            return self._refuse(now, Reason.ESTOPPED, request, self._stops.words(now))
-        blocks = self._blocks(self._watch.judge(now), now)
+            return self._refuse(now, Reason.ESTOPPED, request, self._stops.summary(now))
+        blocks = self._blocks(self._sensors.assess(now), now)
         if blocks:
-            causes = self._outages.explain(self._evidence.causes(blocks, now, self._known))
+            causes = self._outages.explain(self._causes.causes(blocks, now, self._known))
             return self._refuse(now, blocks[0], request, sentence(causes, now))
-        moving = self.mode is GateMode.STOPPING or not self._watch.at_rest(now)
-        if moving or self._sources.pushing(now, OPERATORS):
+        moving = self.mode is GateMode.STOPPING or not self._sensors.at_rest(now)
+        if moving or self._sources.motion_requested(now, OPERATORS):
             return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
-        self._sources.admit()
+        self._sources.release()
         self._states.arm(now, request.source)
         return Reason.OK
 
     def _reset(self, request: ControlRequest, now: int) -> Reason:
         if self.mode is not GateMode.ESTOPPED:
             return Reason.OK
-        if not self._watch.at_rest(now) or self._sources.pushing(now):
+        if not self._sensors.at_rest(now) or self._sources.motion_requested(now):
             return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
         self._disarm(now, f"emergency stop reset by {request.source}")
         return Reason.OK
@@ -272,41 +296,41 @@ class Gate:
         self._ticked = now
         if elapsed > self._config.tick_stall * SECOND:
             self._stalled_until = now + round(self._config.stall_dwell * SECOND)
-            self._evidence.pause = elapsed / SECOND
+            self._causes.pause = elapsed / SECOND
         dt = min(elapsed, 2 * period) / SECOND
 
-        judgement = self._watch.judge(now)
-        blocks = self._blocks(judgement, now)
-        self._report(now, blocks, judgement.values, always=self.mode is GateMode.DRIVING)
+        assessment = self._sensors.assess(now)
+        blocks = self._blocks(assessment, now)
+        self._report(now, blocks, assessment.values, always=self.mode is GateMode.DRIVING)
         self._advance(now, blocks)
-        limits = judgement.limits
+        limits = assessment.limits
         if self._states.holder is not None:
-            self._pursuit.follow(now, dt, self._states.holder.request, limits)
-            if self._pursuit.blocked and Reason.OBSTACLE_STOP not in self._known and not self._watch.at_rest(now):
-                self._trip(now, self.mode, self._evidence.causes([Reason.OBSTACLE_STOP], now, {}))
+            self._limiter.update(now, dt, self._states.holder.request, limits)
+            if self._limiter.blocked and Reason.OBSTACLE_STOP not in self._known and not self._sensors.at_rest(now):
+                self._trip(now, self.mode, self._causes.causes([Reason.OBSTACLE_STOP], now, {}))
         else:
-            self._pursuit.halt()
-        self._report(now, tuple(limits), judgement.values, always=False)
+            self._limiter.halt()
+        self._report(now, tuple(limits), assessment.values, always=False)
         self._known = {reason: self._known.get(reason, now) for reason in (*blocks, *limits)}
         return self._output(now, blocks, limits)
 
     def neutral(self, now: int) -> GateOutput:
-        """Last output before the daemon ends: quick stop. From here on the gate never drives again."""
+        """Last output before the daemon ends: quick stop. The gate never drives again after it."""
         self._shut_down = True
-        self._pursuit.halt()
+        self._limiter.halt()
         if self._states.active:
-            if self.mode is GateMode.DRIVING or not self._watch.at_rest(now):
-                self._trip(now, GateMode.DISARMED, self._evidence.causes([Reason.SHUTDOWN], now, {}))
+            if self.mode is GateMode.DRIVING or not self._sensors.at_rest(now):
+                self._trip(now, GateMode.DISARMED, self._causes.causes([Reason.SHUTDOWN], now, {}))
             self._disarm(now, Reason.SHUTDOWN.text)
         return self._output(now, (Reason.SHUTDOWN,), {})
 
-    def _blocks(self, judgement: Judgement, now: int) -> tuple[Reason, ...]:
+    def _blocks(self, assessment: Assessment, now: int) -> tuple[Reason, ...]:
         own = [Reason.SHUTDOWN] if self._shut_down else []
         if now < self._stalled_until:
             own.append(Reason.TICK_STALLED)
         if self._steering_check is not None and self._steering_check.dead:
             own.append(Reason.STEERING_DEAD)
-        return (*own, *judgement.blocks)
+        return (*own, *assessment.blocks)
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
         """At most one transition per tick."""
@@ -315,7 +339,7 @@ class Gate:
             return
         states.disarm_at_rest |= not DISARMING.isdisjoint(blocks)
         driver = None if blocks else self._sources.driver(now, states.holder_key)
-        if states.mode is GateMode.STOPPING and self._watch.at_rest(now, states.since):
+        if states.mode is GateMode.STOPPING and self._sensors.at_rest(now, states.since):
             states.rest(now)
         elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
@@ -323,26 +347,26 @@ class Gate:
             if driver.key != states.holder_key:
                 self._sources.claim(driver.request.role)
             states.drive(now, driver)
-        elif states.holder is not None and not blocks and self._let_go(states.holder, now):
+        elif states.holder is not None and not blocks and self._released(states.holder, now):
             states.release(now)
         elif states.holder is not None:
             if not blocks:
-                self._tell_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {states.holder_name}")
-            lapsed = [self._evidence.lease(states.holder, now)]
-            self._stop(now, self._evidence.causes(blocks, now, self._known) or lapsed)
+                self._emit_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {states.holder_name}")
+            lapsed = [self._causes.lease(states.holder, now)]
+            self._stop(now, self._causes.causes(blocks, now, self._known) or lapsed)
         elif now - states.driven > self._config.disarm_after * SECOND:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
-    def _let_go(self, holder: Source, now: int) -> bool:
-        """Whether the silent holder's last word was standstill, and the truck stands since."""
-        return holder.neutral and self._motion.speed == 0 and self._watch.at_rest(now, holder.arrived)
+    def _released(self, holder: Source, now: int) -> bool:
+        """Whether the holder's last request was standstill, and the truck has been at rest since."""
+        return holder.neutral and self._motion.speed == 0 and self._sensors.at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
         self._trip(now, GateMode.STOPPING, causes, ordered=ordered)
         self._states.stop(now, (cause.reason for cause in causes))
 
     def _trip(self, now: int, mode: GateMode, causes: list[Cause], *, ordered: bool = False) -> None:
-        """Note that the truck is stopped, before anything of the state changes."""
+        """Log a stop; to be called before the state changes."""
         holder = self._states.holder
         reasons = tuple(cause.reason for cause in causes)
         self._stops.add(
@@ -350,35 +374,35 @@ class Gate:
             mode,
             causes,
             ordered=ordered,
-            quick=mode is GateMode.ESTOPPED or self._pursuit.emergency or not URGENT.isdisjoint(reasons),
+            quick=mode is GateMode.ESTOPPED or self._limiter.emergency or not URGENT.isdisjoint(reasons),
             driver=None if holder is None else holder.request,
-            speed=self._watch.speed(now),
-            stopping_distance=self._pursuit.stopping_distance(now),
+            speed=self._sensors.speed(now),
+            stopping_distance=self._limiter.stopping_distance(now),
         )
 
-    def _tell_transition(self, now: int, reason: Reason, text: str) -> None:
-        self._events.tell(now, reason, Severity.WARNING, text, always=True)
+    def _emit_transition(self, now: int, reason: Reason, text: str) -> None:
+        self._events.emit(now, reason, Severity.WARNING, text, always=True)
 
     def _disarm(self, now: int, text: str) -> None:
         if self._steering_check is not None:
-            self._steering_check.reset()  # only driving shows whether it works again
+            self._steering_check.reset()  # only driving can show whether it works again
         self._states.disarm(now, text)
 
     def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:
-        """Tell about reasons that were not there at the last tick."""
+        """Emit an event for each reason that did not apply at the last tick."""
         if not self._states.active:
             return
         for reason in reasons:
             if reason not in self._known:
-                text = f"{reason.text}: {', '.join(self._watch.failed)}" if reason is Reason.SERVICE_FAILED else ""
-                self._events.tell(now, reason, Severity.WARNING, text, values, always=always)
+                text = f"{reason.text}: {', '.join(self._sensors.failed)}" if reason is Reason.SERVICE_FAILED else ""
+                self._events.emit(now, reason, Severity.WARNING, text, values, always=always)
 
     def _action(self, now: int, reasons: tuple[Reason, ...]) -> DriveAction:
-        if self.mode is GateMode.ESTOPPED or self._pursuit.emergency or not URGENT.isdisjoint(reasons):
+        if self.mode is GateMode.ESTOPPED or self._limiter.emergency or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
         if self.mode is GateMode.DISARMED:
-            # A motor that still turns (a drive that outlived its daemon) must not be left to coast.
-            return DriveAction.DISABLE if self._watch.at_rest(now) else DriveAction.QUICK_STOP
+            # A motor that still turns (a drive that outlived its daemon) must not coast.
+            return DriveAction.DISABLE if self._sensors.at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 
     def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:
@@ -402,7 +426,12 @@ class Gate:
             last_seq=None if holder is None else holder.request.seq,
             speed_limit=min(limits.values(), default=self._config.speed) if moving_allowed else 0.0,
             reasons=reasons,
-            stopping_distance=self._pursuit.stopping_distance(now),
+            stopping_distance=self._limiter.stopping_distance(now),
             events=self._events.drain(),
             trips=self._stops.drain(now),
         )
+
+
+def _order_cause(reason: Reason, text: str, request: ControlRequest, now: int) -> Cause:
+    """The cause of a stop by an order."""
+    return Cause(reason=reason, source=request.source, since=now, text=text)

@@ -1,4 +1,4 @@
-"""The emergency stop's memory: a file that exists while the stop is latched, whatever happens to the process."""
+"""Persistent latch of the emergency stop: a file that exists while the stop is latched."""
 
 import os
 import threading
@@ -7,14 +7,14 @@ from typing import Protocol
 
 
 class Latch(Protocol):
-    """Durable yes or no."""
+    """Persistent flag."""
 
     def engaged(self) -> bool:
         """Whether the emergency stop is latched."""
         ...
 
     def store(self, engaged: bool) -> None:
-        """Make it so, durably; may block for a file system's time.
+        """Set the flag and sync it to the disk; may block.
 
         Raises:
             OSError: it could not be stored.
@@ -23,7 +23,7 @@ class Latch(Protocol):
 
 
 class MemoryLatch:
-    """Latch that lives as long as the object: for runs that leave no trace."""
+    """Latch in memory, for runs that leave no files."""
 
     def __init__(self, engaged: bool = False) -> None:
         self._engaged = engaged
@@ -33,12 +33,12 @@ class MemoryLatch:
         return self._engaged
 
     def store(self, engaged: bool) -> None:
-        """Keep the value."""
+        """Set the flag."""
         self._engaged = engaged
 
 
 class EstopLatch:
-    """Latch in a file. Existing means latched, so a damaged or empty file stops rather than drives.
+    """Latch in a file. An existing file means latched, so a damaged or empty one counts as latched.
 
     Args:
         path: the file.
@@ -49,7 +49,7 @@ class EstopLatch:
         self._storing = threading.Lock()
 
     def engaged(self) -> bool:
-        """Whether the file is there; a directory that cannot be searched counts as latched."""
+        """Whether the file exists; a directory that cannot be searched counts as latched."""
         try:
             self._path.lstat()
         except FileNotFoundError:
@@ -59,10 +59,10 @@ class EstopLatch:
         return True
 
     def prepare(self) -> None:
-        """Make sure that it can be stored later.
+        """Check that the latch can be stored later.
 
         Raises:
-            OSError: its directory cannot be made or written.
+            OSError: its directory cannot be created or written.
         """
         self._path.parent.mkdir(parents=True, exist_ok=True)
         draft = self._path.with_name(self._path.name + ".new")

@@ -1,4 +1,4 @@
-"""The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule, and alone writes to the actuators."""
+"""The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule, writes its commands."""
 
 import asyncio
 import logging
@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, TypeVar
+
+import numpy as np
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -19,10 +21,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.gate.core import Gate
+from monstertruckd.gate.core import Gate, GateOutput
 from monstertruckd.gate.latch import Latch
-from monstertruckd.gate.meter import Lateness, TickMeter
-from monstertruckd.gate.output import GateOutput
 from monstertruckd.gate.stops import Trip
 
 log = logging.getLogger(__name__)
@@ -30,15 +30,53 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 STATE_PERIOD: Final = SECOND // 10
-"""``state/gate`` goes out on every change and at least this often, ns."""
+"""``state/gate`` is published on every change and at least this often, ns."""
 
 LATCH_RETRY: Final = 1.0
 """Seconds between two tries to store the latch."""
 
 
+METER_DEPTH: Final = 1 << 12
+"""Ticks kept by ``TickMeter``: 82 s at 50 Hz."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """Lateness of ticks against the schedule, s."""
+
+    ticks: int
+    p50: float
+    p99: float
+    max: float
+
+
+class TickMeter:
+    """Lateness of the newest ticks; the count and the maximum are over all ticks."""
+
+    def __init__(self, depth: int = METER_DEPTH) -> None:
+        self._ring = np.zeros(depth)
+        self.ticks = 0
+        self._max = 0.0
+
+    def record(self, lateness: float) -> None:
+        """Add one tick, seconds late."""
+        self._ring[self.ticks % len(self._ring)] = lateness
+        self.ticks += 1
+        self._max = max(self._max, lateness)
+
+    def lateness(self) -> Lateness:
+        """Percentiles over the newest ticks, maximum over all."""
+        if self.ticks == 0:
+            return Lateness(0, 0.0, 0.0, 0.0)
+        known = self._ring[: self.ticks]
+        middle, high = ((len(known) * percent + 99) // 100 - 1 for percent in (50, 99))
+        ordered = np.partition(known, (middle, high))
+        return Lateness(self.ticks, float(ordered[middle]), float(ordered[high]), self._max)
+
+
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """What the gate reads, by the newest message. Requests and orders are passed to it as they arrive."""
+    """Topics of which the gate reads the newest message. Requests and orders are passed to it as they arrive."""
 
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
@@ -51,7 +89,7 @@ class GateInputs:
 
 @dataclass(frozen=True, slots=True)
 class GateOutputs:
-    """What the gate writes; nobody else gets the first two."""
+    """Topics the gate writes; it holds the only write ends of the first two."""
 
     drives: tuple[Publisher[DriveCommand], ...]
     steering: Publisher[SteeringCommand]
@@ -60,7 +98,7 @@ class GateOutputs:
 
 
 class GateService:
-    """Thin shell around ``Gate``.
+    """Runs a ``Gate``.
 
     Args:
         gate: the state machine, built with ``latched=latch.engaged()``.
@@ -70,8 +108,8 @@ class GateService:
         outputs: publishers.
         events: where events go.
         latch: keeps the emergency stop over restarts.
-        black_box: told of every stop as it happens; names the file that will hold the minute before, if any.
-        offload: where the latch is stored: a disk's sync must not hold up the loop.
+        black_box: called with every stop as it happens; returns the file that will hold the minute before, if any.
+        offload: runs the storing of the latch, which blocks.
     """
 
     name = "gate"
@@ -94,18 +132,18 @@ class GateService:
         self._outputs = outputs
         self._events = events
         self._black_box = black_box
-        self._kept: tuple[int, str | None] = (0, None)
+        self._boxed: tuple[int, str | None] = (0, None)
         """Number of the newest stop, and its black box."""
         self._latch = latch
         self._offload = offload
         self._latched: bool | None = latch.engaged()
-        """What is on the disk; None while it is being written."""
+        """State on the disk; None while it is being written."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
         self._broken = asyncio.Event()
         self._bug: Exception | None = None
-        self._told: tuple[object, ...] = ()
-        self._told_at = 0
+        self._published: tuple[object, ...] = ()
+        self._published_at = 0
         self._feeds: list[_Feed] = [
             _Feed(inputs.scan, gate.observe_scan),
             _Feed(inputs.attitude, gate.observe_attitude),
@@ -117,11 +155,11 @@ class GateService:
 
     @property
     def mode(self) -> GateMode:
-        """State now."""
+        """Present mode."""
         return self._gate.mode
 
     def ticks(self) -> int:
-        """Ticks so far; advances with every one, for the watchdog."""
+        """Ticks so far, for the watchdog."""
         return self._meter.ticks
 
     def lateness(self) -> Lateness:
@@ -129,34 +167,34 @@ class GateService:
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Reason:
-        """Carry out an order at once, before any queue could lose it; see ``Gate.control``."""
-        return self._taken(Reason.INTERNAL, self._gate.control, order, self._clock.now())
+        """Carry out an order at once; see ``Gate.control``."""
+        return self._guarded(Reason.INTERNAL, self._gate.control, order, self._clock.now())
 
     def request(self, request: DriveRequest) -> Reason:
         """Take a drive request from outside, at once; see ``Gate.request``."""
-        return self._taken(Reason.INTERNAL, self._gate.request, request, self._clock.now())
+        return self._guarded(Reason.INTERNAL, self._gate.request, request, self._clock.now())
 
     def planner_request(self, request: DriveRequest) -> Reason:
-        """Take one of the robot's own planners, at once; see ``Gate.planner_request``."""
-        return self._taken(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
+        """Take a drive request of the robot's own planners, at once; see ``Gate.planner_request``."""
+        return self._guarded(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
-        """Take any service's event at once: it may be what is behind a stop."""
-        self._taken(None, self._gate.observe_event, event)
+        """Take any service's event at once; see ``Gate.observe_event``."""
+        self._guarded(None, self._gate.observe_event, event)
 
     def shut_down(self) -> None:
         """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
-    def _taken(self, otherwise: T, take: Callable[..., T], *arguments: object) -> T:
-        """What ``take`` returns; a bug in it ends this service, and not whoever sent the message."""
+    def _guarded(self, default: T, take: Callable[..., T], *arguments: object) -> T:
+        """The result of ``take``; a bug in it ends this service, not the sender of the message."""
         try:
             return take(*arguments)
         except Exception as bug:
             log.exception("a message could not be taken")
             self._bug = bug
             self._broken.set()
-            return otherwise
+            return default
 
     async def _fail(self) -> None:
         await self._broken.wait()
@@ -172,7 +210,7 @@ class GateService:
                 try:
                     await self._tick_for_ever(ready)
                 finally:
-                    self.shut_down()  # before anybody waits for a disk
+                    self.shut_down()  # before waiting for the disk
         finally:
             await self._store_latch()
 
@@ -218,16 +256,16 @@ class GateService:
             stop = self._stop(trip, now)
             self._outputs.stops.put(stop)
             log.log(logging.INFO if stop.ordered else logging.WARNING, "%s", stop.text)
-        news = (output.mode, output.holder, output.reasons)
-        if news != self._told or now - self._told_at >= STATE_PERIOD:
-            self._told, self._told_at = news, now
+        visible = (output.mode, output.holder, output.reasons)
+        if visible != self._published or now - self._published_at >= STATE_PERIOD:
+            self._published, self._published_at = visible, now
             self._outputs.state.put(self._state(output, now))
         if (output.mode is GateMode.ESTOPPED) != self._latched:
             self._latch_differs.set()
 
     def _stop(self, trip: Trip, now: int) -> Stop:
-        if trip.number != self._kept[0]:
-            self._kept = trip.number, self._black_box(trip)
+        if trip.number != self._boxed[0]:
+            self._boxed = trip.number, self._black_box(trip)
         return Stop(
             stamp=trip.at,
             received=now,
@@ -242,7 +280,7 @@ class GateService:
             speed=trip.speed,
             stopping_distance=trip.stopping_distance,
             causes=trip.causes,
-            black_box=self._kept[1],
+            black_box=self._boxed[1],
             text=f"stopped: {sentence(trip.causes, trip.at)}",
         )
 
@@ -271,7 +309,7 @@ class GateService:
                 self._latch_differs.set()
 
     async def _store_latch(self) -> bool:
-        """Store the latch if it differs from the gate's state, to the end even if cancelled; False if that failed."""
+        """Store the latch if it differs from the gate's mode; completes even if cancelled; False if that failed."""
         wanted = self._gate.mode is GateMode.ESTOPPED
         if wanted == self._latched:
             return True
@@ -280,18 +318,18 @@ class GateService:
             await self._offload(partial(self._latch.store, wanted))
         except OSError as error:
             self._latched = before
-            self._complain(error)
+            self._report(error)
             return False
         self._latched = wanted
         return True
 
-    def _complain(self, error: OSError) -> None:
+    def _report(self, error: OSError) -> None:
         text = f"the emergency stop's latch could not be stored: {error}"
         self._events(Reason.INTERNAL, Severity.ERROR, self.name, text)
 
 
 class _Feed:
-    """Hands each newest message of a subscription on once."""
+    """Passes each newest message of a subscription on once."""
 
     def __init__(self, subscription: Subscription[Any], observe: Callable[[Any], None]) -> None:
         self._subscription = subscription

@@ -1,17 +1,17 @@
-"""Who asks for what: authenticity of requests, leases and the choice of the driver.
+"""Sources of drive requests: authentication, leases and the choice of the driver.
 
 Rules:
 
-- A request counts only with this run's nonce and a sequence number above the newest one of its source and kind.
-- What may set the truck in motion must show that its sender knew the gate's state of a moment ago: then it cannot have
-  waited long in some queue. That is the robot's own clock, so no other one has to be trusted.
-- Operators ask from outside, the tracker from inside; a tracker off board only if the configuration names it.
-- The source of the highest role with a live lease drives; among equals the one that drives already, but of the robot's
-  own planners one that asks for motion before one that keeps the truck standing.
-- Control passes upwards at once, downwards only after a new ARM order: once a role has driven, or has ordered a
-  stop, lower roles are refused until somebody arms the truck again. So a tracker never goes on by itself after an
-  operator lets go.
-- After a STOP order every source must show a neutral request, or fall silent, before it may drive again.
+- A request is valid only with this run's nonce and a sequence number above the newest one of its source and kind.
+- A request that may set the truck in motion must carry the stamp of a recent gate state: it cannot have waited long in
+  a queue then. The stamp is of the robot's own clock, so no other clock has to be trusted.
+- Operators send from outside, the tracker from inside; a tracker on another machine only if the configuration names it.
+- The source of the highest role with a valid lease drives; among equal roles the one that drives already, but of the
+  robot's own planners one that requests motion before one that requests standstill.
+- Control passes to a higher role at once, to a lower one only after a new ARM order: once a role has driven, or has
+  ordered a stop, lower roles are refused until the truck is armed again. So a tracker never continues by itself after
+  an operator has released the stick.
+- After a STOP order every source must send a neutral request, or none for its lease, before it may drive again.
 """
 
 from dataclasses import dataclass
@@ -24,22 +24,22 @@ from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruckd.gate.config import GateConfig
 
 PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
-"""Greater wins."""
+"""The greater number wins."""
 
 DRIVERS: Final = OPERATORS | {Role.TRACKER}
 
-SETTING_OFF: Final = frozenset({Order.ARM, Order.RESET})
-"""Orders after which the truck may move: they must be recent."""
+STARTING: Final = frozenset({Order.ARM, Order.RESET})
+"""Orders after which the truck may move: they must carry a recent gate stamp."""
 
 Key = tuple[bool, str]
 
 NEUTRAL: Final = 1e-3
-"""Requested speeds below this one are a stick at rest, m/s."""
+"""Requested speeds below this are neutral, m/s."""
 
 
 @dataclass(slots=True)
 class Source:
-    """What one source asks for at present."""
+    """Newest request of one source."""
 
     request: DriveRequest
     deadline: int
@@ -47,23 +47,23 @@ class Source:
     arrived: int
     """When the request came, ns."""
     inside: bool = False
-    """It is one of the robot's own planners."""
+    """One of the robot's own planners."""
     held: bool = False
-    """Must show a neutral request before it may drive."""
+    """Must send a neutral request before it may drive."""
 
     @property
     def key(self) -> Key:
-        """What tells it from all others: nobody outside can speak for a planner by taking its name."""
+        """Unique key: a source outside cannot act for a planner by taking its name."""
         return self.inside, self.request.source
 
     @property
     def neutral(self) -> bool:
-        """Whether its stick is at rest."""
+        """Whether it requests standstill."""
         return abs(self.request.speed) < NEUTRAL
 
     @property
-    def setting_off(self) -> bool:
-        """Whether it is a planner that asks for motion."""
+    def requests_motion(self) -> bool:
+        """Whether it is a planner that requests motion."""
         return self.inside and not self.neutral
 
     @property
@@ -76,8 +76,8 @@ class Sources:
     """All requests of this run.
 
     Args:
-        nonce: what requests must carry.
-        config: leases, ages and the trackers off board.
+        nonce: of this run; requests must carry it.
+        config: leases, request age and remote trackers.
     """
 
     def __init__(self, nonce: str, config: GateConfig) -> None:
@@ -87,10 +87,10 @@ class Sources:
         self._requests = Sequences()
         self._orders = Sequences()
         self._drive: dict[Key, Source] = {}
-        self._floor = 0
+        self._min_rank = 0
 
-    def admit_request(self, request: DriveRequest, now: int) -> Reason:
-        """OK, or why a drive request from outside does not count."""
+    def accept_request(self, request: DriveRequest, now: int) -> Reason:
+        """OK, or why a drive request from outside is refused."""
         if request.role not in OPERATORS and not (
             request.role is Role.TRACKER and request.source in self._config.remote_trackers
         ):
@@ -99,21 +99,21 @@ class Sources:
         reason = self._requests.accept(request, self.nonce, alive)
         return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
-    def admit_planner_request(self, request: DriveRequest) -> Reason:
-        """OK, or why a drive request of the robot's own planners does not count."""
+    def accept_planner_request(self, request: DriveRequest) -> Reason:
+        """OK, or why a drive request of the robot's own planners is refused."""
         if request.role is not Role.TRACKER:
             return Reason.BAD_ROLE
         return self._planner_requests.accept(request, self.nonce)
 
-    def admit_order(self, request: ControlRequest, now: int) -> Reason:
-        """OK, or why an order does not count."""
+    def accept_order(self, request: ControlRequest, now: int) -> Reason:
+        """OK, or why an order is refused."""
         reason = self._orders.accept(request, self.nonce)
-        if reason is Reason.OK and request.order in SETTING_OFF:
+        if reason is Reason.OK and request.order in STARTING:
             reason = freshness(request, now, self._config.max_request_age)
         return reason
 
     def add(self, request: DriveRequest, now: int, *, inside: bool) -> Source:
-        """Start or renew the lease of an admitted request."""
+        """Start or renew the lease of an accepted request."""
         lease = min(request.lease, self._config.leases.of(request.role))
         key = (inside, request.source)
         before = self._drive.get(key)
@@ -124,7 +124,7 @@ class Sources:
         return source
 
     def live(self, now: int) -> list[Source]:
-        """Sources whose lease runs."""
+        """Sources whose lease has not expired."""
         return [source for source in self._drive.values() if now <= source.deadline]
 
     def driver(self, now: int, holder: Key | None) -> Source | None:
@@ -132,15 +132,15 @@ class Sources:
 
         Args:
             now: ns.
-            holder: key of the one driving already.
+            holder: key of the driving source.
         """
-        able = [source for source in self.live(now) if not source.held and source.rank >= self._floor]
+        able = [source for source in self.live(now) if not source.held and source.rank >= self._min_rank]
         if len(able) == 1:
             return able[0]
-        return max(able, key=lambda source: (source.rank, source.setting_off, source.key == holder), default=None)
+        return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
 
-    def standing(self, source: Source, now: int, holder: Key | None) -> Reason:
-        """OK if this source drives or would drive, else why not."""
+    def priority(self, source: Source, now: int, holder: Key | None) -> Reason:
+        """OK if this source drives or would drive, or why not."""
         if source.held:
             return Reason.NOT_ARMED_SPEED
         driver = self.driver(now, holder)
@@ -150,21 +150,21 @@ class Sources:
             return Reason.BUSY
         return Reason.LOWER_PRIORITY
 
-    def pushing(self, now: int, roles: frozenset[Role] = DRIVERS) -> bool:
-        """Whether any live source of ``roles`` asks for motion."""
+    def motion_requested(self, now: int, roles: frozenset[Role] = DRIVERS) -> bool:
+        """Whether any source of ``roles`` with a valid lease requests motion."""
         return any(source.request.role in roles and not source.neutral for source in self.live(now))
 
     def claim(self, role: Role) -> None:
-        """This role has driven or stopped the truck: lower ones wait for the next ARM order."""
-        self._floor = max(self._floor, PRIORITY[role])
+        """``role`` has driven or stopped the truck: lower roles wait for the next ARM order."""
+        self._min_rank = max(self._min_rank, PRIORITY[role])
 
     def hold(self) -> None:
-        """Everybody has to show a neutral request first."""
+        """Every source must send a neutral request before it may drive."""
         for source in self._drive.values():
             source.held = True
 
-    def admit(self) -> None:
-        """The truck was armed anew: everybody may ask again."""
-        self._floor = 0
+    def release(self) -> None:
+        """End ``claim`` and ``hold``: the truck was armed again."""
+        self._min_rank = 0
         for source in self._drive.values():
             source.held = False

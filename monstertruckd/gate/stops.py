@@ -1,19 +1,235 @@
-"""The gate's stops, numbered, each with the chain of causes as far as it is known."""
+"""Why the truck was stopped: causes with measurements, lost devices behind them, and the numbered log of stops."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.stops import sentence, span
-from monstertruck_schemas.event import Cause
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Cause, Event, Measurement, Severity
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.outages import Outages
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.limiter import CommandLimiter
+from monstertruckd.gate.sensors import SENSOR_SERVICES, STALE_SENSORS, SensorMonitor, SteeringCheck
+from monstertruckd.gate.sources import Source
+
+GATE: Final = "gate"
+"""Source of causes that only the gate itself knows."""
+
+HUB_WINDOW: Final = SECOND
+"""A hub's loss is reported once all its devices are gone, at most this long before or after theirs, ns."""
+
+HUB_EVENTS: Final = frozenset({Reason.HUB_LOST, Reason.OVER_CURRENT})
+"""Events that explain the loss of every device they name in ``roles``."""
 
 EXPLAINED_WITHIN: Final = 3 * SECOND
-"""So long after a stop news may still show what was behind it, ns."""
+"""So long after a stop later reports may still extend its causes, ns."""
+
+
+class CauseBuilder:
+    """Turns reasons into causes with measurements; used only when the truck is stopped or an order is refused.
+
+    Args:
+        config: limits.
+        sensors: newest samples.
+        limiter: obstacle state.
+        check: compass against steering; None = not checked.
+    """
+
+    def __init__(
+        self, config: GateConfig, sensors: SensorMonitor, limiter: CommandLimiter, check: SteeringCheck | None
+    ) -> None:
+        self._config = config
+        self._sensors = sensors
+        self._limiter = limiter
+        self._check = check
+        self.pause = 0.0
+        """Newest excessive pause between two ticks, s."""
+        self._measurements: Mapping[Reason, Callable[[int], Iterator[Measurement]]] = {
+            Reason.DRIVE_FAULT: self._fault,
+            Reason.TILT_STOP: self._tilt,
+            Reason.BATTERY_CRITICAL: self._voltage,
+            Reason.TICK_STALLED: self._stall,
+            Reason.STEERING_DEAD: self._turn,
+            Reason.OBSTACLE_STOP: self._obstacle,
+        }
+
+    def causes(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
+        """One cause per reason, and one per failed service.
+
+        Args:
+            reasons: worst first.
+            now: ns.
+            since: when the gate first saw each of them, ns.
+        """
+        causes = []
+        for reason in reasons:
+            began = since.get(reason, now)
+            if reason is Reason.SERVICE_FAILED:
+                causes += [
+                    Cause(reason=reason, source=name, since=began, text=f"{reason.text}: {name}")
+                    for name in self._sensors.failed
+                ]
+            elif reason in STALE_SENSORS:
+                causes.append(self._staleness(reason, now, began))
+            else:
+                figures = tuple(self._measurements.get(reason, _none)(now))
+                causes.append(Cause(reason=reason, source=GATE, since=began, text=reason.text, measurements=figures))
+        return causes
+
+    def lease(self, source: Source, now: int) -> Cause:
+        """The cause of a stop for an expired lease."""
+        request = source.request
+        figures = [
+            Measurement(
+                name="silence",
+                value=(now - source.arrived) / SECOND,
+                unit="s",
+                limit=(source.deadline - source.arrived) / SECOND,
+            )
+        ]
+        if not source.inside and request.gate_stamp is not None:
+            # From the gate state its sender had to the request's arrival: both directions and the sender's own delay.
+            figures.append(
+                Measurement(name="last round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s")
+            )
+        return Cause(
+            reason=Reason.LEASE_EXPIRED,
+            source=request.source,
+            since=min(source.deadline, now),
+            text=f"lease of {request.source} expired",
+            measurements=tuple(figures),
+        )
+
+    def _staleness(self, reason: Reason, now: int, began: int) -> Cause:
+        staleness = self._sensors.staleness(reason, now)
+        figures = [Measurement(name="age", value=staleness.age, unit="s", limit=staleness.limit)]
+        if staleness.refused is not None:
+            figures.append(staleness.refused)
+        return Cause(
+            reason=reason,
+            source=STALE_SENSORS[reason].value,
+            since=began if staleness.since is None else staleness.since,
+            text=reason.text,
+            measurements=tuple(figures),
+        )
+
+    def _fault(self, now: int) -> Iterator[Measurement]:
+        for drive in self._sensors.drives:
+            if drive is not None and drive.mode is DriveMode.FAULT:
+                code = drive.fault_code
+                yield Measurement(name="fault code", value=None if code is None else float(code), age=_age(drive, now))
+
+    def _tilt(self, now: int) -> Iterator[Measurement]:
+        attitude, limit = self._sensors.attitude, self._config.tilt.stop
+        yield Measurement(name="tilt", value=self._sensors.tilt, unit="rad", limit=limit, age=_age(attitude, now))
+
+    def _voltage(self, now: int) -> Iterator[Measurement]:
+        battery = self._sensors.battery
+        if battery is not None:
+            yield Measurement(name="voltage", value=battery.voltage, unit="V", age=_age(battery, now))
+
+    def _stall(self, _now: int) -> Iterator[Measurement]:
+        yield Measurement(name="pause", value=self.pause, unit="s", limit=self._config.tick_stall)
+
+    def _turn(self, _now: int) -> Iterator[Measurement]:
+        if self._check is not None and self._config.turning is not None:
+            limit = self._config.turning.tolerance
+            yield Measurement(name="turned otherwise by", value=self._check.difference, unit="rad", limit=limit)
+
+    def _obstacle(self, now: int) -> Iterator[Measurement]:
+        age = _age(self._sensors.scan, now)
+        keep = self._config.obstacle.ahead
+        yield Measurement(name="free way", value=self._limiter.free, unit="m", limit=keep, age=age)
+
+
+def _age(message: Message | None, now: int) -> float | None:
+    return None if message is None else (now - message.received) / SECOND
+
+
+def _none(_now: int) -> Iterator[Measurement]:
+    return iter(())
+
+
+@dataclass(slots=True)
+class _Outage:
+    """A service's newest outage."""
+
+    first: ServiceHealth
+    """Its first failure: later ones only repeat that the device is still absent."""
+    end: int | None = None
+    """When the service was ready again, ns."""
+
+
+class Outages:
+    """Newest outage of each service, and the events that explain outages: lost devices, hubs and links."""
+
+    def __init__(self) -> None:
+        self._outages: dict[str, _Outage] = {}
+        self._hubs: dict[str, Event] = {}
+        self._link: Event | None = None
+
+    def observe_health(self, table: HealthTable) -> None:
+        """Take the services' health."""
+        for service in table.services:
+            outage = self._outages.get(service.name)
+            if service.state in (ServiceState.BACKOFF, ServiceState.FAILED):
+                if outage is None or outage.end is not None:
+                    self._outages[service.name] = _Outage(service)
+            elif service.state is ServiceState.READY and outage is not None and outage.end is None:
+                outage.end = service.since
+
+    def observe_event(self, event: Event) -> None:
+        """Take any service's event."""
+        if event.source == DeviceRole.LINK:
+            self._link = event if event.severity is not Severity.INFO else None
+        if event.reason in HUB_EVENTS:
+            for role in str(event.values.get("roles") or "").split(","):
+                self._hubs[role] = event
+
+    def explain(self, causes: Sequence[Cause]) -> tuple[Cause, ...]:
+        """The given causes, each linked to what was behind it; a cause shared by several comes once."""
+        chain = list(causes)
+        found: dict[tuple[Reason, str, int], int] = {}
+        for index, cause in enumerate(causes):
+            effect = index
+            for deeper in self._behind(cause):
+                key = (deeper.reason, deeper.source, deeper.since)
+                known = key in found
+                if not known:
+                    found[key] = len(chain)
+                    chain.append(deeper)
+                chain[effect] = chain[effect].model_copy(update={"because": found[key]})
+                if known:
+                    break
+                effect = found[key]
+        return tuple(chain)
+
+    def _behind(self, cause: Cause) -> Iterator[Cause]:
+        """Causes behind ``cause``, each behind the one before it."""
+        services = [name for name, stale in SENSOR_SERVICES.items() if stale is cause.reason] or [cause.source]
+        outages = (outage for name in services if (outage := self._outages.get(name)) is not None)
+        outage = next((outage for outage in outages if outage.end is None or cause.since <= outage.end), None)
+        if outage is not None:
+            service = outage.first
+            detail = service.detail or service.reason.text
+            text = detail if service.name in detail else f"{service.name}: {detail}"
+            yield Cause(reason=service.reason, source=service.name, since=service.since, text=text)
+            hub = self._hubs.get(service.name)
+            if hub is not None and hub.stamp >= service.since - HUB_WINDOW:
+                yield _cause_of(hub)
+        elif cause.reason is Reason.LEASE_EXPIRED and self._link is not None:
+            yield _cause_of(self._link)
+
+
+def _cause_of(event: Event) -> Cause:
+    return Cause(reason=event.reason, source=event.source, since=event.stamp, text=event.text or event.reason.text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,25 +253,26 @@ class Trip:
         return self.causes[0].reason
 
 
-class StopBook:
-    """Collects stops between two ticks, and what is found out about the newest one afterwards.
+class StopLog:
+    """Collects stops between two ticks, and causes of the newest one that become known afterwards.
 
     Args:
-        outages: what is behind causes.
+        outages: explain causes.
     """
 
     def __init__(self, outages: Outages) -> None:
         self._outages = outages
         self._count = 0
-        self._heads: tuple[Cause, ...] = ()
+        self._causes: tuple[Cause, ...] = ()
+        """Of the newest stop, before ``Outages.explain``."""
         self._newest: Trip | None = None
-        self._untold: list[Trip] = []
+        self._pending: list[Trip] = []
 
     def add(
         self,
         now: int,
         mode: GateMode,
-        heads: Sequence[Cause],
+        causes: Sequence[Cause],
         *,
         ordered: bool,
         quick: bool,
@@ -63,25 +280,25 @@ class StopBook:
         speed: float | None,
         stopping_distance: float,
     ) -> None:
-        """Note a stop.
+        """Add a stop.
 
         Args:
             now: ns.
-            mode: the gate's state from now on.
-            heads: what tripped it, worst first.
+            mode: the gate's next mode.
+            causes: what tripped the gate, worst first.
             ordered: it was an ordinary order.
             quick: by quick stop.
-            driver: newest request of whoever drove.
+            driver: newest request of the driving source.
             speed: measured, m/s; None = not known.
-            stopping_distance: still to be expected, m.
+            stopping_distance: expected, m.
         """
         self._count += 1
-        self._heads = tuple(heads)
+        self._causes = tuple(causes)
         self._newest = Trip(
             number=self._count,
             at=now,
             mode=mode,
-            causes=self._outages.explain(heads),
+            causes=self._outages.explain(causes),
             ordered=ordered,
             quick=quick,
             holder=None if driver is None else driver.source,
@@ -89,9 +306,9 @@ class StopBook:
             speed=speed,
             stopping_distance=stopping_distance,
         )
-        self._untold.append(self._newest)
+        self._pending.append(self._newest)
 
-    def words(self, now: int) -> str:
+    def summary(self, now: int) -> str:
         """The newest stop in one line; empty before the first one."""
         newest = self._newest
         if newest is None:
@@ -99,13 +316,13 @@ class StopBook:
         return f"stopped {span((now - newest.at) / SECOND)} ago: {sentence(newest.causes, newest.at)}"
 
     def drain(self, now: int) -> tuple[Trip, ...]:
-        """Stops since the last call, and the newest one again if more is known of it by now."""
+        """Stops since the last call, or the newest one again if more of its causes are known."""
         newest = self._newest
-        if newest is not None and not self._untold and now - newest.at <= EXPLAINED_WITHIN:
-            causes = self._outages.explain(self._heads)
+        if newest is not None and not self._pending and now - newest.at <= EXPLAINED_WITHIN:
+            causes = self._outages.explain(self._causes)
             if causes != newest.causes:
                 self._newest = replace(newest, causes=causes)
                 return (self._newest,)
-        told = tuple(self._untold)
-        self._untold.clear()
-        return told
+        trips = tuple(self._pending)
+        self._pending.clear()
+        return trips

@@ -13,8 +13,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.latch import EstopLatch, MemoryLatch
-from monstertruckd.gate.meter import TickMeter
-from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.gate.service import GateInputs, GateOutputs, GateService, TickMeter
 from tests.unit.gate.rig import NONCE, attitude, battery, feedback, header, health, make_gate, scan, servos
 
 
@@ -422,7 +421,7 @@ def test_an_unreadable_latch_counts_as_engaged(tmp_path):
 
 
 def test_meter_forgets_percentiles_but_not_the_maximum():
-    meter = TickMeter(kept=4)
+    meter = TickMeter(depth=4)
     assert meter.lateness().ticks == 0
     for lateness in (9.0, 1.0, 2.0, 3.0, 4.0):
         meter.record(lateness)

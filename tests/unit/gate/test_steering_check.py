@@ -10,7 +10,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.steering_check import SteeringCheck, SteeringCheckConfig
+from monstertruckd.gate.config import SteeringCheckConfig
+from monstertruckd.gate.sensors import SteeringCheck
 from tests.unit.gate.rig import Rig, header, servos
 
 STEERING = FourWheelSteering()

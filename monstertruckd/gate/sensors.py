@@ -1,16 +1,25 @@
-"""What the sensors and services say about driving: things that stop the truck, and things that slow it down."""
+"""Sensor monitoring: freshness and plausibility of every sensor, judged at each tick.
+
+``SteeringCheck`` finds servos without supply. Hobby servos report nothing, and a servo controller on USB power keeps
+answering when the servos' own supply is lost; but then the compass heading departs from the one that follows from
+speed and commanded axle angles.
+"""
 
 import math
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
@@ -20,60 +29,66 @@ from monstertruck_schemas.sensor import (
     LaserScan,
     SteeringFeedback,
 )
-from monstertruckd.gate.config import GateConfig, SensorLimit, TiltLimits
+from monstertruckd.gate.config import GateConfig, SensorLimit, SteeringCheckConfig, TiltLimits
 
-SENSOR_SERVICES: Final = {
-    "lidar": Reason.SCAN_STALE,
-    "compass": Reason.ATTITUDE_STALE,
-    "drive": Reason.DRIVE_STALE,
-    "drive_2": Reason.DRIVE_STALE,
-    "drive_3": Reason.DRIVE_STALE,
-    "drive_4": Reason.DRIVE_STALE,
-    "steering": Reason.STEERING_STALE,
+SENSOR_SERVICES: Final[Mapping[str, Reason]] = {
+    DeviceRole.LIDAR: Reason.SCAN_STALE,
+    DeviceRole.COMPASS: Reason.ATTITUDE_STALE,
+    **dict.fromkeys(SHAFTS, Reason.DRIVE_STALE),
+    DeviceRole.STEERING: Reason.STEERING_STALE,
 }
-"""Services whose reported loss ends the worth of their samples at once."""
+"""Services whose reported loss invalidates their samples at once."""
 
 STALE_SENSORS: Final = {
-    Reason.SCAN_STALE: "lidar",
-    Reason.ATTITUDE_STALE: "compass",
-    Reason.DRIVE_STALE: "drive",
-    Reason.STEERING_STALE: "steering",
-    Reason.BATTERY_STALE: "battery",
+    Reason.SCAN_STALE: DeviceRole.LIDAR,
+    Reason.ATTITUDE_STALE: DeviceRole.COMPASS,
+    Reason.DRIVE_STALE: DeviceRole.DRIVE,
+    Reason.STEERING_STALE: DeviceRole.STEERING,
+    Reason.BATTERY_STALE: DeviceRole.BATTERY,
 }
-"""Who is silent, by the reason its silence gives."""
+"""Which sensor is stale, by reason."""
 
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
-class Judgement(NamedTuple):
-    """Verdict of one tick."""
+JUMP: Final = 1.5
+"""A heading that changes faster than this, rad/s, is a disturbed compass, not a turn."""
+
+GAP: Final = SECOND // 2
+"""Headings further apart than this are not compared, ns."""
+
+
+class Assessment(NamedTuple):
+    """What the sensors allow at one tick."""
 
     blocks: tuple[Reason, ...]
     """Reasons to stand still, worst first."""
     limits: dict[Reason, float]
     """Reasons to go slowly, with the speed each allows, m/s."""
     values: dict[str, Value]
-    """Measurements behind the verdict, for the event."""
+    """Measurements behind it, for the event."""
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
-    """A sensor without a good sample. Seconds."""
+class Staleness:
+    """A sensor without a valid sample."""
 
     since: int | None
-    """When its newest sample stopped counting, ns; None = there never was one."""
+    """When its newest valid sample became stale, ns; None = there never was one."""
     age: float | None
+    """Of its newest valid sample, s."""
     limit: float
+    """S."""
     refused: Measurement | None
-    """Why its newest sample since was no good one."""
+    """Why its newest sample since was not valid."""
 
 
-class Watch:
-    """Newest good sample of every sensor, judged at each tick.
+class SensorMonitor:
+    """Newest valid sample of every sensor, assessed at each tick.
 
     Args:
         config: limits.
-        chassis: what moves.
+        chassis: kinematics of the body.
     """
 
     def __init__(self, config: GateConfig, chassis: Chassis) -> None:
@@ -90,58 +105,58 @@ class Watch:
         self._critical = _critical(config, steered=chassis.linkage is not None)
         self._tilt = _Tilt(config.tilt)
         self._speed: tuple[int, float | None] | None = None
-        """Instant (ns) and speed of the newest look, while the samples are those of then."""
+        """Time (ns) and result of the newest ``speed``, until the next sample."""
         self.axles = (0.0, 0.0)
         """Axle angles by the newest steering feedback, rad."""
 
     def observe_scan(self, scan: LaserScan) -> bool:
-        """Take a scan; False if it is not a good sample, by its age or by the tilt of its plane."""
-        good = self._good(scan, Reason.SCAN_STALE)
-        if good and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
-            good = False
+        """Take a scan; False if it is not valid, by its age or by the tilt of its plane."""
+        valid = self._valid(scan, Reason.SCAN_STALE)
+        if valid and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
+            valid = False
             self._refused[Reason.SCAN_STALE] = Measurement(
                 name="tilt of its plane", value=scan.tilt, unit="rad", limit=self._config.scan_tilt
             )
-        if good:
+        if valid:
             self.scan = scan
-        return good
+        return valid
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take feedback of a driven shaft."""
-        if self._good(feedback, Reason.DRIVE_STALE):
+        if self._valid(feedback, Reason.DRIVE_STALE):
             self.drives[shaft] = feedback
             self._speed = None
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take steering feedback; what the servo controller does not vouch for is no good sample."""
-        if self._good(feedback, Reason.STEERING_STALE) and feedback.trusted:
+        """Take steering feedback; not valid unless the servo controller trusts it."""
+        if self._valid(feedback, Reason.STEERING_STALE) and feedback.trusted:
             self.steering = feedback
             self.axles = self._chassis.axles(feedback.front, feedback.rear)
 
     def observe_attitude(self, attitude: Attitude) -> None:
-        """Take an attitude; without a valid tilt it is no good sample."""
-        if self._good(attitude, Reason.ATTITUDE_STALE) and attitude.tilt_valid:
+        """Take an attitude; not valid without a valid tilt."""
+        if self._valid(attitude, Reason.ATTITUDE_STALE) and attitude.tilt_valid:
             self.attitude = attitude
             self._tilt.update(math.acos(math.cos(attitude.roll) * math.cos(attitude.pitch)))
 
     def observe_battery(self, battery: Battery) -> None:
-        """Take a battery reading; without a judged voltage it is no good sample."""
-        if self._good(battery, Reason.BATTERY_STALE) and battery.level in MEASURED:
+        """Take a battery reading; not valid without a level."""
+        if self._valid(battery, Reason.BATTERY_STALE) and battery.level in MEASURED:
             self.battery = battery
 
     def observe_health(self, table: HealthTable) -> None:
-        """Take the services' health: samples from before a service was lost no longer count."""
-        for row in table.services:
-            if row.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(row.name)) is not None:
-                self._lost[stale] = max(row.since, self._lost.get(stale, -1))
+        """Take the services' health: samples from before the loss of a service become stale."""
+        for service in table.services:
+            if service.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(service.name)) is not None:
+                self._lost[stale] = max(service.since, self._lost.get(stale, -1))
                 self._speed = None
         self._failed = tuple(
-            row.name
-            for row in table.services
-            if row.state is ServiceState.FAILED and row.name not in self._config.tolerated_failures
+            service.name
+            for service in table.services
+            if service.state is ServiceState.FAILED and service.name not in self._config.tolerated_failures
         )
 
-    def _good(self, message: Message, stale: Reason) -> bool:
+    def _valid(self, message: Message, stale: Reason) -> bool:
         latency = abs(message.received - message.stamp) / SECOND
         if latency <= self._config.max_latency:
             self._refused.pop(stale, None)
@@ -155,11 +170,11 @@ class Watch:
         return now - message.received <= limit.stale_after * SECOND
 
     def scan_fresh(self, now: int) -> bool:
-        """Whether the scan still counts."""
+        """Whether the scan is fresh."""
         return self._fresh(self.scan, self._config.scan, now, Reason.SCAN_STALE)
 
     def steering_fresh(self, now: int) -> bool:
-        """Whether the steering feedback still counts."""
+        """Whether the steering feedback is fresh."""
         return self._fresh(self.steering, self._config.steering, now, Reason.STEERING_STALE)
 
     def speed(self, now: int) -> float | None:
@@ -171,13 +186,13 @@ class Watch:
         return self._speed[1]
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
-        """Feedback of all shafts; none of it unless all of it counts."""
+        """Feedback of all shafts; empty unless all of it is fresh."""
         limit = self._config.drive
         drives = [d for d in self.drives if d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE)]
         return drives if len(drives) == len(self.drives) else []
 
     def _all_fresh(self, now: int) -> dict[Reason, bool]:
-        """Which sensors still count, by the reason their silence gives."""
+        """Which sensors are fresh, by the reason of the stale ones."""
         config = self._config
         return {
             Reason.DRIVE_STALE: bool(self._fresh_drives(now)),
@@ -188,9 +203,9 @@ class Watch:
         }
 
     def at_rest(self, now: int, since: int = 0) -> bool:
-        """Whether the truck is known to stand still, by a sample not older than ``since``.
+        """Whether the truck is known to be at rest, by a sample not older than ``since``, ns.
 
-        A truck without a critical drive counts as standing.
+        A truck without a critical drive counts as at rest.
         """
         speed = self.speed(now)
         if speed is None:
@@ -198,8 +213,8 @@ class Watch:
         sampled = min(drive.stamp for drive in self._fresh_drives(now))
         return sampled >= since and abs(speed) < self._config.standstill
 
-    def judge(self, now: int) -> Judgement:
-        """Verdict at ``now``."""
+    def assess(self, now: int) -> Assessment:
+        """What stops or slows the truck at ``now``, ns."""
         config = self._config
         blocks: list[Reason] = []
         limits: dict[Reason, float] = {}
@@ -219,17 +234,17 @@ class Watch:
                 blocks.append(Reason.TILT_STOP)
             elif self._tilt.slow:
                 limits[Reason.TILT_SLOW] = config.tilt.slow_speed
-        self._judge_battery(fresh[Reason.BATTERY_STALE], blocks, limits, values)
-        return Judgement(tuple(blocks), limits, values)
+        self._assess_battery(fresh[Reason.BATTERY_STALE], blocks, limits, values)
+        return Assessment(tuple(blocks), limits, values)
 
-    def _judge_battery(
+    def _assess_battery(
         self, fresh: bool, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
     ) -> None:
         battery = self.battery
         if battery is None:
             return
         values["battery_voltage"] = battery.voltage
-        # A pack that was critical stays so when its sensor falls silent.
+        # A pack that was critical stays so when its sensor becomes stale.
         if battery.level is BatteryLevel.CRITICAL:
             blocks.append(Reason.BATTERY_CRITICAL)
         elif battery.level is BatteryLevel.LOW:
@@ -237,8 +252,8 @@ class Watch:
         if not fresh and not self._config.battery.critical:
             limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
 
-    def silence(self, stale: Reason, now: int) -> Silence:
-        """What is known of a sensor whose silence gives the reason ``stale``; of several shafts of the worst one."""
+    def staleness(self, stale: Reason, now: int) -> Staleness:
+        """Details of the stale sensor behind the reason ``stale``; with several shafts, of the oldest sample."""
         samples: tuple[Message | None, ...]
         samples, limit = {
             Reason.SCAN_STALE: ((self.scan,), self._config.scan),
@@ -251,16 +266,16 @@ class Watch:
         lost = self._lost.get(stale)
         refused = self._refused.get(stale)
         if len(received) < len(samples):
-            return Silence(lost, None, limit.stale_after, refused)
+            return Staleness(lost, None, limit.stale_after, refused)
         oldest = min(received)
         since = min(now, oldest + round(limit.stale_after * SECOND))
         if lost is not None and lost >= oldest:
             since = min(since, lost)
-        return Silence(since, (now - oldest) / SECOND, limit.stale_after, refused)
+        return Staleness(since, (now - oldest) / SECOND, limit.stale_after, refused)
 
     @property
     def tilt(self) -> float:
-        """Angle between the truck's z axis and the vertical, rad, by the newest good attitude."""
+        """Angle between the truck's z axis and the vertical, rad, by the newest valid attitude."""
         return self._tilt.angle
 
     @property
@@ -270,7 +285,7 @@ class Watch:
 
 
 def _critical(config: GateConfig, *, steered: bool) -> tuple[Reason, ...]:
-    """Whose silence stops the truck, worst first."""
+    """Sensors whose staleness stops the truck, worst first."""
     limits = {
         Reason.DRIVE_STALE: config.drive,
         Reason.STEERING_STALE: config.steering,
@@ -291,8 +306,77 @@ class _Tilt:
         self.stop = False
 
     def update(self, angle: float) -> None:
-        """Judge a tilt angle, rad."""
+        """Take a tilt angle, rad."""
         self.angle = angle
         limits = self._limits
         self.slow = angle >= limits.slow - (limits.hysteresis if self.slow else 0.0)
         self.stop = angle >= limits.stop - (limits.hysteresis if self.stop else 0.0)
+
+
+class SteeringCheck:
+    """Compares the turn commanded with the turn measured over a sliding window; ``dead`` stays until ``reset``.
+
+    Args:
+        config: window and tolerance.
+        steering: the truck's geometry.
+    """
+
+    def __init__(self, config: SteeringCheckConfig, steering: FourWheelSteering) -> None:
+        self._config = config
+        self._steering = steering
+        self._window: deque[tuple[int, float, float]] = deque()
+        """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
+        self._heading = 0.0
+        self.dead = False
+        """The steering does not follow its commands."""
+        self.difference = 0.0
+        """Turn measured less turn commanded over the window, rad."""
+
+    def reset(self) -> None:
+        """Start over."""
+        self._window.clear()
+        self.dead = False
+        self.difference = 0.0
+
+    def observe(self, stamp: int, heading: float | None, speed: float | None, front: float, rear: float) -> None:
+        """Take a heading, and speed and steering at that time.
+
+        Args:
+            stamp: of the measurement, ns.
+            heading: clockwise, rad; None = the compass is disturbed.
+            speed: of the wheels over ground, m/s; None = not known.
+            front: front axle angle, rad, left positive.
+            rear: rear axle angle, rad, left positive.
+        """
+        if heading is None or speed is None or abs(speed) < self._config.speed:
+            self._window.clear()
+            return
+        if not self._window or not 0 < stamp - self._window[-1][0] <= GAP:
+            self._begin(stamp, heading)
+            return
+        before, commanded, measured = self._window[-1]
+        dt = (stamp - before) / SECOND
+        turned = -math.remainder(heading - self._heading, 2 * math.pi)
+        if abs(turned) > JUMP * dt:
+            self._begin(stamp, heading)
+            return
+        body_speed = speed / self._steering.drive_speed(1.0, front, rear)
+        commanded += self._steering.body_twist(body_speed, front, rear)[2] * dt
+        self._window.append((stamp, commanded, measured + turned))
+        self._heading = heading
+        while self._window[-1][0] - self._window[0][0] > self._config.window * SECOND:
+            self._window.popleft()
+        self._compare()
+
+    def _begin(self, stamp: int, heading: float) -> None:
+        self._window.clear()
+        self._window.append((stamp, 0.0, 0.0))
+        self._heading = heading
+
+    def _compare(self) -> None:
+        _, commanded_then, measured_then = self._window[0]
+        _, commanded_now, measured_now = self._window[-1]
+        commanded, measured = commanded_now - commanded_then, measured_now - measured_then
+        self.difference = measured - commanded
+        allowed = self._config.tolerance + self._config.share * max(abs(commanded), abs(measured))
+        self.dead |= abs(self.difference) > allowed
