@@ -21,7 +21,7 @@ from time import process_time
 import numpy as np
 
 from monstertruck_runtime.errors import TruckError
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
 from monstertruckd.tools.calibrate.drive import DriveWizard
 from monstertruckd.tools.calibrate.steering import SteeringWizard

@@ -16,7 +16,6 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from monstertruck_drivers.webcam.jpeg import complete
@@ -26,6 +25,7 @@ from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import CompressedImage
 from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
@@ -43,9 +43,9 @@ async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) 
     endpoint = free_endpoint()
     config = write_overlay(FULL, folder, endpoint)
     if not camera:
-        data = yaml.safe_load(config.read_text())
+        data = read_yaml(config)
         data["devices"]["camera"] = None
-        config.write_text(yaml.safe_dump(data))
+        config.write_text(yaml_text(data))
     async with (
         program(folder / "simulate.txt", "simulate", "--config", str(config)),
         program(folder / "daemon.txt", "run", "--config", str(config)),

@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.drill import Drill, Outcome, Report
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from monstertruck_runtime.clock import run_virtual
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.goal_scenarios import COLUMNS, GOALS, cells, shortcomings
 from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario
 from monstertruckd.tools.drill.scenarios import SCENARIOS

@@ -21,7 +21,7 @@ import numpy as np
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas.req import Order
 from monstertruck_sim.faults import hubs_of
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator

@@ -40,10 +40,9 @@ from monstertruckd.assembly.devices import build_drivers, build_monitors
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.config.calibration import rpc as calibration_rpc
+from monstertruckd.config import calibration_rpc
+from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.config.validate import resolved
-from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService

@@ -13,7 +13,7 @@ from monstertruck_runtime.errors import PortBusyError
 from monstertruck_runtime.memory import settle
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.config.calibration.apply import store_of
+from monstertruckd.config.calibration import store_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.host.logging_queue import start_logging

@@ -12,8 +12,7 @@ from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
-from monstertruckd.config.calibration.apply import store_of, with_values
-from monstertruckd.config.calibration.record import Result, Value, WizardName
+from monstertruckd.config.calibration import Result, Value, WizardName, store_of, with_values
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.calibrate.guide import Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Confirm, Number

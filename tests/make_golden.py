@@ -9,10 +9,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruckd import __version__
-from monstertruckd.config.yaml_tree import load_tree
+from monstertruckd.config.load import load_tree
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.logs.info import info
 from monstertruckd.tools.logs.report.collect import collect
@@ -28,16 +28,16 @@ def write_config(source: Path, target: Path, **changes: object) -> None:
     config = load_tree(source).data | {"version": 1} | changes
     config.pop("include", None)
     config["path"] = {"file": "path.csv"}
-    target.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    target.write_text(yaml_text(config), encoding="utf-8")
     rows = [f"{x:.4f},-1.7000,0.00000,1" for x in np.arange(0.0, LENGTH + 1e-9, 0.05)]
     (target.parent / "path.csv").write_text("\n".join(["x,y,yaw,direction", *rows]) + "\n")
 
 
 def _coarser_lidar(config: Path) -> None:
     """Every third beam: scans are most of a log."""
-    values = yaml.safe_load(config.read_text())
+    values = read_yaml(config)
     values["devices"]["lidar"]["driver"]["cluster"] = 3
-    config.write_text(yaml.safe_dump(values, sort_keys=False))
+    config.write_text(yaml_text(values))
 
 
 def main() -> None:

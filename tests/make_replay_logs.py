@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Order, Role
-from monstertruckd.config.validate import load_config
-from monstertruckd.config.yaml_tree import load_tree
+from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.wall import write_overlay
 from monstertruckd.tools.logs.info import info
@@ -51,7 +50,7 @@ def short_config(source: Path, folder: Path, **changes: Any) -> Path:
     config["devices"]["camera"] = None
     config["devices"]["lidar"].setdefault("driver", {})["cluster"] = 3
     target = folder / "truck.yaml"
-    target.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+    target.write_text(yaml_text(config), encoding="utf-8")
     return target
 
 

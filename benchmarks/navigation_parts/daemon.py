@@ -28,7 +28,7 @@ from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_sim.world.obstacles import Disc
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator

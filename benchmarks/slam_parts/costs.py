@@ -11,7 +11,7 @@ from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.mapping import MappingEstimator
 from monstertruck_estimation.slam.scans import prepared
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.logs.scans import read_scans
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -29,8 +29,8 @@ from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.assembly.goals import build_goals
 from monstertruckd.bus.local import Bus
+from monstertruckd.config.load import Tree
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.config.yaml_tree import Tree
 from monstertruckd.recorder.picture import MapService
 
 SCANS: Final = 16

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import yaml
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode
 
-from monstertruck_runtime.errors import ConfigError
+from monstertruckd.config.load import compose, reader
 
 
 class YamlText:
@@ -23,17 +23,10 @@ class YamlText:
         self._path = path
         self._root()
 
-    def _root(self) -> yaml.Node | None:
-        try:
-            node = yaml.compose(self.text, Loader=yaml.SafeLoader)
-        except yaml.MarkedYAMLError as error:
-            line = error.problem_mark.line + 1 if error.problem_mark else 1
-            raise ConfigError(f"{self._path}:{line}: not valid YAML: {error.problem}") from error
-        if node is not None and not isinstance(node, yaml.MappingNode):
-            raise ConfigError(f"{self._path}:1: expected a mapping of sections")
-        return node
+    def _root(self) -> MappingNode | None:
+        return compose(reader(), self.text, self._path)
 
-    def node(self, *key: str) -> yaml.Node | None:
+    def node(self, *key: str) -> Node | None:
         """What stands at ``key``; None if nothing does."""
         pair = self._pair(key)
         return None if pair is None else pair[1]
@@ -41,12 +34,12 @@ class YamlText:
     def value(self, *key: str) -> str | None:
         """The plain value at ``key`` as it is written, without quotes; None for anything else."""
         node = self.node(*key)
-        return node.value if isinstance(node, yaml.ScalarNode) else None
+        return node.value if isinstance(node, ScalarNode) else None
 
     def names(self, *key: str) -> list[str]:
         """Keys of the mapping at ``key``; none if there is no mapping."""
         node = self.node(*key) if key else self._root()
-        return [name.value for name, _ in node.value] if isinstance(node, yaml.MappingNode) else []
+        return [name.value for name, _ in node.value] if isinstance(node, MappingNode) else []
 
     def replace(self, key: tuple[str, ...], text: str) -> bool:
         """Write ``text`` where the value at ``key`` stands; False if there is none."""
@@ -65,11 +58,11 @@ class YamlText:
         self.text = self.text[:start] + name + self.text[end:]
         return True
 
-    def _pair(self, key: tuple[str, ...]) -> tuple[yaml.Node, yaml.Node] | None:
+    def _pair(self, key: tuple[str, ...]) -> tuple[Node, Node] | None:
         node = self._root()
         pair = None
         for part in key:
-            if not isinstance(node, yaml.MappingNode):
+            if not isinstance(node, MappingNode):
                 return None
             pair = next(((name, value) for name, value in node.value if name.value == part), None)
             if pair is None:
@@ -78,9 +71,9 @@ class YamlText:
         return pair
 
 
-def _end(node: yaml.Node) -> int:
+def _end(node: Node) -> int:
     """Index behind the node's last character; a block's own mark lies behind the blanks and comments after it."""
-    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+    if isinstance(node, CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
     end: int = node.end_mark.index

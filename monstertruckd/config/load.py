@@ -1,11 +1,67 @@
-"""Loads a robot's configuration file, with the robot's calibration over it."""
+"""Loads a robot's configuration: YAML merged along ``include:``, validated, with the robot's calibration on top.
 
+Every value remembers its file and line; every complaint is one line with file, line, key and what was expected.
+YAML is read as version 1.2: ``true`` and ``false`` are the only booleans, ``1e-3`` is a number, ``0o17`` is octal.
+"""
+
+import difflib
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar, cast, get_args
 
-from monstertruckd.config.calibration.apply import calibrated
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_schemas.base import Schema
+from monstertruckd.config.calibration import store_of, with_values
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.config.validate import load_config
-from monstertruckd.config.yaml_tree import Tree
+
+Key = tuple[str | int, ...]
+Scalar = Callable[[Node], Any]
+"""Gives the value of a scalar node."""
+S = TypeVar("S", bound=Schema)
+T = TypeVar("T", bound=TruckConfig)
+
+VERSION = 1
+YAML_1_1 = ("yes", "no", "on", "off")
+"""Booleans of YAML 1.1 in lower case: text since 1.2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Place of a value in a file."""
+
+    file: Path
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}"
+
+
+@dataclass(slots=True)
+class Tree:
+    """Merged data and the origin of every key in it."""
+
+    data: dict[str, Any]
+    origins: dict[Key, Origin] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    """The file itself, then every file it depends on by relative names; resolved."""
+    calibration: Path | None = None
+    """Calibration file whose values replace those of the configuration, if there is one."""
+
+    def origin(self, key: Key) -> Origin | None:
+        """Origin of ``key``, or of its nearest parent that has one."""
+        for length in range(len(key), -1, -1):
+            if key[:length] in self.origins:
+                return self.origins[key[:length]]
+        return None
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
@@ -14,13 +70,293 @@ def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
     Raises:
         ConfigError: one line per mistake, in the file or in its calibration.
     """
-    return calibrated(*load_uncalibrated(path))
+    return calibrated(*load_config(path, TruckConfig))
 
 
-def load_uncalibrated(path: Path) -> tuple[TruckConfig, Tree]:
-    """The configuration as written.
+def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
+    """Read, merge and validate ``path``, without calibration.
+
+    Returns:
+        The frozen configuration, and the tree with every value's origin.
 
     Raises:
-        ConfigError: one line per mistake.
+        ConfigError: one line per mistake, each naming file, line, key and expectation.
     """
-    return load_config(path, TruckConfig)
+    return validated(load_tree(path), path, model)
+
+
+def resolved(config: Schema) -> dict[str, Any]:
+    """The whole configuration as plain data, defaults included."""
+    dumped: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
+    return dumped
+
+
+def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
+    """The configuration with the values of the newest calibration, and the tree with each value's origin.
+
+    Raises:
+        ConfigError: the file is damaged, of another truck, or its values do not fit the configuration.
+    """
+    store = store_of(config)
+    path = store.newest()
+    if path is None:
+        return config, tree
+    file = store.load(path)
+    lines = load_tree(path).origins
+    origins = dict(tree.origins)
+    for wizard, result in file.results.items():
+        for index, estimate in enumerate(result.estimates):
+            if estimate.key is not None:
+                origins[tuple(estimate.key.split("."))] = lines["results", wizard, "estimates", index, "value"]
+    return with_values(config, file.results.values(), path), Tree(tree.data, origins, tree.files, calibration=path)
+
+
+# YAML
+
+
+def reader() -> YAML:
+    """Reads one document of plain data."""
+    return YAML(typ="safe", pure=True)
+
+
+def compose(yaml: YAML, text: str, path: Path) -> MappingNode | None:
+    """The root mapping of a YAML text as nodes with positions; None if the text is empty.
+
+    Args:
+        yaml: reads it.
+        text: content.
+        path: its file, for complaints.
+
+    Raises:
+        ConfigError: it is not YAML, or not a mapping.
+    """
+    try:
+        node = yaml.compose(text)
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise ConfigError(f"{path}:{line}: not valid YAML: {error.problem}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{path}:1: not valid YAML: {error}") from error
+    if node is not None and not isinstance(node, MappingNode):
+        raise ConfigError(f"{path}:1: expected a mapping of sections, found {_kind(node)}")
+    return node
+
+
+def load_tree(path: Path) -> Tree:
+    """Read ``path`` and everything it includes; later values win over included ones, mappings merge.
+
+    ``include`` is a file name or a list of them, relative to the including file.
+
+    Raises:
+        ConfigError: a file is missing, is not YAML, repeats a key or includes itself.
+    """
+    return _load(path, ())
+
+
+def _load(path: Path, including: tuple[Path, ...]) -> Tree:
+    if path.resolve() in including:
+        raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(f"{path}: cannot be read: {reason}") from error
+    own, yaml = Tree({}), reader()
+    node = compose(yaml, text, path)
+    if node is not None:
+        own.data = _build(node, path, (), own.origins, yaml.constructor.construct_object)
+    return _with_includes(own, path, including)
+
+
+def _with_includes(own: Tree, path: Path, including: tuple[Path, ...]) -> Tree:
+    included = own.data.pop("include", [])
+    where = own.origins.get(("include",))
+    names = [included] if isinstance(included, str) else included
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"{where}: include: expected a file name or a list of file names")
+    merged = Tree({}, files=[path.resolve()])
+    for name in names:
+        target = Path(os.path.normpath(path.parent / name))
+        if not target.is_file():
+            raise ConfigError(f"{where}: include: no such file: {target}")
+        tree = _load(target, (*including, path.resolve()))
+        _merge(merged, tree, ())
+        merged.files += [] if Path(name).is_absolute() else tree.files
+    _merge(merged, own, ())
+    merged.origins = {key: origin for key, origin in merged.origins.items() if key[:1] != ("include",)}
+    return merged
+
+
+def _merge(base: Tree, top: Tree, prefix: Key) -> None:
+    below, above = _at(base.data, prefix), _at(top.data, prefix)
+    for name, value in above.items():
+        key = (*prefix, name)
+        if isinstance(value, dict) and isinstance(below.get(name), dict):
+            _merge(base, top, key)
+        else:
+            below[name] = value
+            base.origins = {k: o for k, o in base.origins.items() if k[: len(key)] != key}
+            base.origins |= {k: o for k, o in top.origins.items() if k[: len(key)] == key}
+        base.origins[key] = top.origins[key]
+
+
+def _at(data: Any, key: Key) -> dict[str, Any]:
+    for part in key:
+        data = data[part]
+    return cast("dict[str, Any]", data)
+
+
+def _build(node: Node, path: Path, key: Key, origins: dict[Key, Origin], scalar: Scalar) -> Any:
+    line = node.start_mark.line + 1
+    origins.setdefault(key, Origin(path, line))
+    if isinstance(node, MappingNode):
+        return _build_mapping(node, path, key, origins, scalar)
+    if isinstance(node, SequenceNode):
+        return [_build(item, path, (*key, index), origins, scalar) for index, item in enumerate(node.value)]
+    try:
+        return scalar(node)
+    except (YAMLError, ValueError) as error:
+        raise ConfigError(f"{path}:{line}: cannot read the value: {error}") from error
+
+
+def _build_mapping(
+    node: MappingNode, path: Path, key: Key, origins: dict[Key, Origin], scalar: Scalar
+) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for name_node, value_node in node.value:
+        line = name_node.start_mark.line + 1
+        name = name_node.value
+        if not isinstance(name_node, ScalarNode):
+            raise ConfigError(f"{path}:{line}: a key must be plain text, found {_kind(name_node)}")
+        if name in result:
+            raise ConfigError(f"{path}:{line}: {name}: given twice in one section")
+        origins[*key, name] = Origin(path, line)
+        result[name] = _build(value_node, path, (*key, name), origins, scalar)
+    return result
+
+
+def _kind(node: Node) -> str:
+    kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
+    return next((name for kind, name in kinds if isinstance(node, kind)), "a plain value")
+
+
+# Validation
+
+
+def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
+    """Validate what was read and merged from ``path``; see ``load_config``."""
+    version = tree.data.get("version")
+    if version != VERSION:
+        origin = tree.origin(("version",)) or f"{path}:1"
+        older = isinstance(version, int) and 0 <= version < VERSION
+        advice = f"; `monstertruckd config migrate {path}` brings it up to date" if older else ""
+        raise ConfigError(f"{origin}: version: expected {VERSION}, found {version!r}{advice}")
+    _locate_files(tree, getattr(model, "FILE_KEYS", ()))
+    try:
+        text = json.dumps(tree.data)
+    except TypeError as error:
+        raise ConfigError(f"{path}: holds a value that is neither text, number, list nor mapping: {error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    try:
+        return model.model_validate_json(text), tree
+    except ValidationError as error:
+        raise ConfigError("\n".join(_explain(tree, path, model, error))) from error
+
+
+def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
+    """Make the values at ``keys`` absolute, relative to the file that says them."""
+    for key in keys:
+        section: Any = tree.data
+        for part in key[:-1]:
+            section = section.get(part) if isinstance(section, dict) else None
+        name = section.get(key[-1]) if isinstance(section, dict) else None
+        if not isinstance(name, str):
+            continue
+        origin = tree.origins[key]
+        file = (origin.file.parent / name).resolve()
+        if not file.is_file():
+            raise ConfigError(f"{origin}: {'.'.join(key)}: no such file: {file}")
+        section[key[-1]] = str(file)
+        if origin.file.resolve() in tree.files and not Path(name).is_absolute():
+            tree.files.append(file)
+
+
+def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:
+    for detail in error.errors(include_url=False):
+        key = _data_key(tree.data, detail["loc"])
+        origin = tree.origin(key) or f"{path}:1"
+        dotted = ".".join(map(str, key)) or "configuration"
+        yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
+
+
+def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
+    if detail["type"] == "extra_forbidden":
+        known = _field_names(model, key[:-1], detail)
+        close = difflib.get_close_matches(str(key[-1]), known, 1)
+        return f"unknown key (did you mean {close[0]}?)" if close else f"unknown key; known here: {', '.join(known)}"
+    if detail["type"] == "missing":
+        return "missing; it has no default"
+    message = detail["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    if detail["type"] == "value_error":
+        return message
+    found = detail["input"]
+    text = f"{message}, found {found!r}" if not isinstance(found, dict | list) else message
+    if detail["type"] == "bool_type" and found in YAML_1_1:
+        text += ": write true or false"
+    meaning = _description(model, key)
+    return f"{text} ({meaning})" if meaning else text
+
+
+def _data_key(data: Any, loc: tuple[int | str, ...]) -> Key:
+    """Pydantic's location without the parts that name union members instead of keys of the data."""
+    key: list[str | int] = []
+    for index, part in enumerate(loc):
+        last = index == len(loc) - 1
+        if isinstance(data, dict) and (part in data or last):
+            key.append(part)
+            data = data.get(part)
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            key.append(part)
+            data = data[part]
+    return tuple(key)
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models(argument)
+
+
+def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
+    """All models that may describe the mapping at ``key``."""
+    here: list[type[BaseModel]] = [model]
+    for part in key:
+        if isinstance(part, int):
+            continue
+        here = [
+            inner
+            for outer in here
+            if part in outer.model_fields
+            for inner in _models(outer.model_fields[part].annotation)
+        ] or here
+    return here
+
+
+def _field_names(model: type[BaseModel], key: Key, detail: ErrorDetails) -> list[str]:
+    kinds = [part for part in detail["loc"] if isinstance(part, str)]
+    candidates = _reach(model, key)
+    chosen = [m for m in candidates if getattr(m.model_fields.get("kind"), "default", None) in kinds] or candidates
+    return sorted({name for candidate in chosen for name in candidate.model_fields})
+
+
+def _description(model: type[BaseModel], key: Key) -> str | None:
+    if not key or isinstance(key[-1], int):
+        return None
+    for candidate in _reach(model, key[:-1]):
+        info = candidate.model_fields.get(key[-1])
+        if info is not None and info.description:
+            return info.description.split("\n")[0].rstrip(".")
+    return None

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import yaml
+from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.edit import YamlText
-from monstertruckd.config.validate import VERSION
+from monstertruckd.config.load import VERSION
 
 Step = Callable[[YamlText], None]
 """Edits one file from its version to the next; must do nothing to what is already so."""
@@ -99,8 +99,8 @@ def _version(text: YamlText, path: Path, inherited: int | None, target: int) -> 
 
 def _includes(text: YamlText) -> list[str]:
     node = text.node("include")
-    nodes: Sequence[yaml.Node] = node.value if isinstance(node, yaml.SequenceNode) else [node] if node else []
-    return [inner.value for inner in nodes if isinstance(inner, yaml.ScalarNode)]
+    nodes: Sequence[Node] = node.value if isinstance(node, SequenceNode) else [node] if node else []
+    return [inner.value for inner in nodes if isinstance(inner, ScalarNode)]
 
 
 def carry_out(upgrades: Sequence[Upgrade]) -> None:

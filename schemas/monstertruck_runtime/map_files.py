@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
@@ -60,7 +60,7 @@ def load_map(path: Path) -> WorldMap:
     Raises:
         InputError: file, key and expectation of whatever is wrong.
     """
-    keys = _read_yaml(path)
+    keys = _read_keys(path)
     values, opaque = _read_image(path, path.parent / str(keys["image"]))
     mode, negate = keys["mode"], bool(keys["negate"])
     if mode == "raw":
@@ -97,16 +97,11 @@ def save_map(world: WorldMap, path: Path) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
-    replace_file(path, yaml.safe_dump(keys, sort_keys=False))
+    replace_file(path, yaml_text(keys))
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        keys = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read the map: {error}") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML: {error}") from error
+def _read_keys(path: Path) -> dict[str, Any]:
+    keys = read_yaml(path)
     if not isinstance(keys, dict):
         raise InputError(f"{path}: expected a mapping with the keys {', '.join(_REQUIRED)}")
     if unknown := sorted(str(key) for key in keys.keys() - {*_REQUIRED, "mode"}):

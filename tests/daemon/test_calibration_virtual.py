@@ -17,9 +17,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruck_sim.world.obstacles import Box
-from monstertruckd.config.calibration.apply import store_of
-from monstertruckd.config.calibration.record import Estimate, Result, WizardName
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.calibration import Estimate, Result, WizardName, store_of
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
 from monstertruckd.tools.calibrate.drive import DriveWizard
 from monstertruckd.tools.calibrate.guide import calibrate

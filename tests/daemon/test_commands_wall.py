@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
 from monstertruckd.tools.demo.wall import free_endpoint
 from tests.daemon.wall_kit import DEMO, ROOT, Robot, command, end
@@ -60,7 +60,7 @@ def short_lap(folder: Path) -> Path:
         csv.writer(short).writerows(row for row, _ in zip(csv.reader(lap), range(32), strict=False))
     config = folder / "short.yaml"
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(folder / "short.csv"), "closed": False}}
-    config.write_text(yaml.safe_dump(overlay))
+    config.write_text(yaml_text(overlay))
     return config
 
 

@@ -20,7 +20,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.faults import Kind, Menu
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.drill import Drill, Outcome, Report
 from monstertruckd.tools.drill.observer import Observer, Violation
 from monstertruckd.tools.drill.stages import with_overlay

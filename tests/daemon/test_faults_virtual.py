@@ -4,11 +4,11 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import yaml
 
 from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.summary import GOAL_CLOSING
 from monstertruckd.tools.drill.goal_scenarios import shortcomings
@@ -74,7 +74,7 @@ def short_demo(folder: Path, seed: int) -> str:
     path.write_text("\n".join(whole[:41]) + "\n")
     file = folder / "short.yaml"
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(path), "closed": False}}
-    file.write_text(yaml.safe_dump(overlay))
+    file.write_text(yaml_text(overlay))
     summary = run_fast_demo(file, folder / "run", seed)
     assert summary.lap.outcome is Reason.GOAL_REACHED
     assert summary.digest is not None

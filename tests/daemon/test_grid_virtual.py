@@ -8,7 +8,7 @@ from monstertruck_runtime.clock import MILLISECOND, VirtualClock, run_virtual
 from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTIONS
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -14,7 +14,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.body import BodyConfig
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, load_robot
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -14,7 +14,7 @@ from monstertruck_schemas.health import Standing
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_sim.world.built_in import BUILT_IN
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -14,7 +14,7 @@ from monstertruck_schemas.event import Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.recorder import black_boxes
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.drill.stages import with_overlay

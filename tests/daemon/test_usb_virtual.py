@@ -17,7 +17,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruck_schemas.usb import UsbState
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
@@ -130,7 +130,7 @@ async def robot(folder: Path, overlay: dict[str, Any] | None = None, base: Path 
     endpoint = free_endpoint()
     file = write_overlay(base, folder, endpoint)
     if overlay is not None:
-        file.write_text(yaml.safe_dump(merged(yaml.safe_load(file.read_text()), overlay)))
+        file.write_text(yaml_text(merged(read_yaml(file), overlay)))
     made = Robot(folder, endpoint, file)
     try:
         yield made

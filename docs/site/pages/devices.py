@@ -5,11 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-import yaml
-
 from monstertruck_drivers.catalog import KINDS, Kind
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.config.yaml_tree import load_tree
+from monstertruckd.config.load import load_tree
 from pages.markdown import Page, join, prose, raised, section, table
 from pages.models import Definitions, label, plain
 from pages.topics import anchor
@@ -96,7 +95,7 @@ def _example(kind: Kind) -> str:
     said = load_tree(CONFIG).data.get(group, {}).get(kind.role)
     if said is None:
         return ""
-    text = yaml.safe_dump({group: {kind.role: said}}, sort_keys=False, default_flow_style=False)
+    text = yaml_text({group: {kind.role: said}})
     return f"In [truck.yaml](../../configs/truck.yaml):\n\n```yaml\n{text}```"
 
 

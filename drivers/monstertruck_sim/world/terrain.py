@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_sim.world.config import SinusoidTilt
 
 
@@ -52,10 +52,7 @@ def load_profile(path: Path) -> Profile:
     Raises:
         InputError: naming file and key.
     """
-    try:
-        keys = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot read the ground profile: {error}") from error
+    keys = read_yaml(path)
     points: Any = keys.get("points") if isinstance(keys, dict) else None
     try:
         pairs = tuple((float(x), float(z)) for x, z in points)
@@ -68,4 +65,4 @@ def load_profile(path: Path) -> Profile:
 
 def save_profile(profile: Profile, path: Path) -> None:
     """Write what ``load_profile`` reads."""
-    path.write_text(yaml.safe_dump({"points": [list(p) for p in profile.points]}), encoding="utf-8")
+    path.write_text(yaml_text({"points": [list(p) for p in profile.points]}), encoding="utf-8")

@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
-from monstertruckd.config.calibration.record import STEERING, Estimate, Result
+from monstertruckd.config.calibration import STEERING, Estimate, Result
 from monstertruckd.tools.calibrate.guide import Guide
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number

@@ -16,7 +16,7 @@ from monstertruck_drivers.os4000.config import IronConfig
 from monstertruck_drivers.os4000.iron import level_field
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.calibration.record import COMPASS, Estimate, Result
+from monstertruckd.config.calibration import COMPASS, Estimate, Result
 from monstertruckd.tools.calibrate.guide import CLEAR, Guide
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
 from monstertruckd.tools.calibrate.steps import Move

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.calibration.record import Estimate, Result
+from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.tools.calibrate.guide import CLEAR, Guide
 from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, Move, Number

@@ -17,9 +17,8 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefuse
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration.apply import value_at
-from monstertruckd.config.calibration.record import Result, Value, WizardName
-from monstertruckd.config.calibration.rpc import SAVE
+from monstertruckd.config.calibration import Result, Value, WizardName, value_at
+from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.motion import Mover, Truck
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Move, Number, Panel

@@ -14,7 +14,7 @@ import numpy as np
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration.record import STEERING, Estimate, Result
+from monstertruckd.config.calibration import STEERING, Estimate, Result
 from monstertruckd.tools.calibrate.guide import CLEAR, Guide
 from monstertruckd.tools.calibrate.statistics import NORMAL
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Leg, Maps, SteeringModel, half_widths

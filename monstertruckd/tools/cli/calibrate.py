@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
-    from monstertruckd.config.calibration.record import Estimate, Result, WizardName
+    from monstertruckd.config.calibration import Estimate, Result, WizardName
     from monstertruckd.tools.calibrate.guide import Wizard
 
 app = command_group(
@@ -146,8 +146,8 @@ def show(
 ) -> None:
     """Print what was calibrated, when, how well, and which file the daemon runs on."""
     from monstertruck_runtime.clock import run_wall
-    from monstertruckd.config.calibration.record import CalibrationFile
-    from monstertruckd.config.calibration.rpc import SHOW
+    from monstertruckd.config.calibration import CalibrationFile
+    from monstertruckd.config.calibration_rpc import SHOW
 
     if config is not None:
         store = _store(config)
@@ -192,8 +192,8 @@ def _run(wizard: "Wizard", call: _Call) -> None:
 
 
 async def _guide(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
-    from monstertruckd.config.calibration.record import CalibrationFile
-    from monstertruckd.config.calibration.rpc import SHOW
+    from monstertruckd.config.calibration import CalibrationFile
+    from monstertruckd.config.calibration_rpc import SHOW
     from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.calibrate.guide import calibrate
     from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
@@ -210,7 +210,7 @@ async def _guide(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result
 
 def _undo(name: "WizardName", call: _Call) -> None:
     from monstertruck_runtime.clock import WallClock, run_wall
-    from monstertruckd.config.calibration.rpc import UNDO
+    from monstertruckd.config.calibration_rpc import UNDO
 
     if call.config is not None:
         clock = WallClock()
@@ -234,10 +234,11 @@ def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
 
 
 def _store(config: Path) -> Any:
-    from monstertruckd.config.calibration.apply import store_of
-    from monstertruckd.config.load import load_uncalibrated
+    from monstertruckd.config.calibration import store_of
+    from monstertruckd.config.load import load_config
+    from monstertruckd.config.truck import TruckConfig
 
-    return store_of(load_uncalibrated(config)[0])
+    return store_of(load_config(config, TruckConfig)[0])
 
 
 def _json(value: Any) -> str:

@@ -32,7 +32,7 @@ def show(
     Exit code 2 if it is refused, with one line for each mistake.
     """
     from monstertruck_runtime.errors import NotFoundError
-    from monstertruckd.config.validate import resolved
+    from monstertruckd.config.load import resolved
     from monstertruckd.tools.simulation.config import load_robot
 
     loaded, tree = load_robot(config)
@@ -88,8 +88,8 @@ def migrate(
 
     Comments stay, and so does the previous file, beside the new one as NAME.vN.
     """
+    from monstertruckd.config.load import VERSION
     from monstertruckd.config.migrate import carry_out, plan
-    from monstertruckd.config.validate import VERSION
 
     upgrades = plan(config)
     if not dry_run:

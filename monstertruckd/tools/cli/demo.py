@@ -3,7 +3,7 @@
 import itertools
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,9 +18,6 @@ from monstertruckd.tools.cli.output import (
     remark,
     until_stopped,
 )
-
-if TYPE_CHECKING:
-    from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 DEMO_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
 
@@ -39,6 +36,7 @@ def demo(
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.demo.fast import run_fast_demo
     from monstertruckd.tools.demo.wall import run_wall_demo
+    from monstertruckd.tools.simulation.config import load_simulated
 
     load_simulated(config)
     folder = _fresh(output)
@@ -58,22 +56,6 @@ def demo(
     if summary.lap.outcome is not Reason.GOAL_REACHED:
         finish(summary.lap.outcome)
         finish(Reason.INTERNAL)
-
-
-def load_simulated(config: Path) -> "SimulatedTruckConfig":
-    """A configuration with a world in it.
-
-    Raises:
-        ConfigError: it is refused, or describes a real truck.
-    """
-    from monstertruck_runtime.errors import ConfigError
-    from monstertruckd.config.validate import load_config
-    from monstertruckd.config.yaml_tree import load_tree
-    from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-
-    if "sim" not in load_tree(config).data:
-        raise ConfigError(f"{config}: describes a real truck: it has no section `sim`, as configs/full.yaml has")
-    return load_config(config, SimulatedTruckConfig)[0]
 
 
 def _fresh(folder: Path) -> Path:
@@ -98,7 +80,8 @@ def simulate(
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows).
     """
+    from monstertruckd.tools.simulation.config import load_simulated
     from monstertruckd.tools.simulation.host import serve
 
-    load_simulated(config)
-    until_stopped(lambda clock: serve(clock, config, truth))
+    simulated = load_simulated(config)
+    until_stopped(lambda clock: serve(clock, simulated, truth))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.tools.cli.demo import load_simulated
 from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
 
@@ -30,6 +29,7 @@ def drill(
     did not come back.
     """
     from monstertruckd.tools.drill.drill import Drill
+    from monstertruckd.tools.simulation.config import load_simulated
 
     report = _run(Drill(seed, count, load_simulated(config)), jobs or os.cpu_count() or 1)
     if json_output:

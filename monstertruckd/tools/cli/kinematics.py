@@ -228,10 +228,9 @@ def _parsed(settings: list[str] | None) -> dict[str, float | str]:
 
 def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
     """Wheels from YAML: a list of mappings with `kind` (fixed, steered, caster, swedish) and the wheel's fields."""
-    import yaml
-
     from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SteeredWheel, SwedishWheel, checked
     from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.yaml_files import read_yaml
 
     kinds: dict[str, type[Wheel]] = {
         "fixed": FixedWheel,
@@ -239,10 +238,7 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
         "caster": CasterWheel,
         "swedish": SwedishWheel,
     }
-    try:
-        rows = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: {error}") from error
+    rows = read_yaml(path)
     if not isinstance(rows, list):
         raise InputError(f"{path}: expected a list of wheels")
     wheels = []

@@ -117,10 +117,9 @@ def load_command(
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
     """A configuration with which the robot localises in a saved map."""
-    import yaml
-
     from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.small_files import replace_file
+    from monstertruck_runtime.yaml_files import yaml_text
     from monstertruckd.config.load import load_truck
 
     load(place)
@@ -129,7 +128,7 @@ def load_command(
         "version": 1,
         "slam": {"mode": "localisation", "map": str(place.resolve())},
     }
-    replace_file(output, yaml.safe_dump(values, sort_keys=False))
+    replace_file(output, yaml_text(values))
     load_truck(output)
     remark(f"wrote {output}: `monstertruckd run --config {output}` localises in {place}")
 

@@ -4,7 +4,7 @@ import gc
 from pathlib import Path
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.demo.wall import write_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig

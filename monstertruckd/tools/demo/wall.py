@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.live import Live
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
-from monstertruckd.config.yaml_tree import load_tree
+from monstertruck_runtime.yaml_files import yaml_text
+from monstertruckd.config.load import load_tree
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.operator import drive_lap
 from monstertruckd.tools.status.screen import draw
@@ -43,6 +43,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         NoAnswerError: a process did not come up, or the lap was not finished.
     """
     endpoint = free_endpoint()
+    given = load_tree(config).data
     overlay = write_overlay(config, folder, endpoint, seed)
     truth = folder / "truth.npz"
     simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
@@ -50,14 +51,14 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         program(folder / "simulate.txt", *simulate),
         _ready((folder / "simulate.txt").read_bytes, clock),
         program(folder / "daemon.txt", "run", "--config", str(overlay)),
-        await connect(clock, load_tree(config).data.get("robot", "truck"), endpoint) as client,
+        await connect(clock, given.get("robot", "truck"), endpoint) as client,
     ):
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
         try:
             lap = await drive_lap(client, clock, patience=PATIENCE)
             await clock.sleep(1.0)
-            if "map" in load_tree(overlay).data:
+            if given.get("map"):
                 await _appear((folder / "map.png").exists, clock)
         finally:
             watching.cancel()
@@ -71,7 +72,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         loop.lateness_p99 if loop else 0.0,
         loop.lateness_max if loop else 0.0,
         *log_figures(folder),
-        closed=load_tree(overlay).data.get("path", {}).get("closed", False),
+        closed=(given.get("path") or {}).get("closed", False),
     )
 
 
@@ -110,7 +111,7 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
         overlay["sim"] = {"seed": seed}
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "config.yaml"
-    file.write_text(yaml.safe_dump(overlay, sort_keys=False), encoding="utf-8")
+    file.write_text(yaml_text(overlay), encoding="utf-8")
     return file
 
 

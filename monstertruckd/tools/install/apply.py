@@ -12,12 +12,12 @@ from typing import Final
 
 from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotPermittedError
 from monstertruck_runtime.small_files import replace_file
-from monstertruckd.tools.install.configuration import FOLDER
 from monstertruckd.tools.install.plan import (
     AFTER_INSTALL,
     AFTER_REMOVAL,
     BEFORE_REMOVAL,
     ENABLED,
+    FOLDER,
     MODULES,
     RULES,
     SERVICE,

@@ -1,19 +1,22 @@
 """What an installation consists of: files, and programs to tell about them."""
 
+import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_runtime.small_files import text_of
+from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.install.configuration import FOLDER, files_of, load_real
 from monstertruckd.tools.install.rules import rules_text
 from monstertruckd.tools.install.shipped import filled
 from monstertruckd.tools.install.unit import LINKS, Program, temporary, unit_text, user_name
 
+FOLDER: Final = Path("/etc/monstertruckd")
 USER: Final = "monstertruckd"
 SERVICE: Final = "monstertruckd.service"
 UNIT: Final = Path("/etc/systemd/system") / SERVICE
@@ -85,8 +88,10 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
     source = config_file or installed_config(root) or below(root, CONFIG)
     if config_file is None and not source.is_file():
         raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")
-    config = load_real(source)
-    installed, copies = _placed(source, below(root, FOLDER))
+    config, tree = load_truck(source)
+    if "sim" in tree.data:
+        raise ConfigError(f"{source}: sim: is a simulated truck; a service drives a real one")
+    installed, copies = _placed(tree.files, below(root, FOLDER))
     return Plan(
         (
             *copies,
@@ -123,13 +128,20 @@ def below(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-def _placed(source: Path, folder: Path) -> tuple[Path, tuple[Planned, ...]]:
-    """Where the configuration will be, and what must be copied for that."""
-    if source.resolve().is_relative_to(folder.resolve()):
-        return FOLDER / source.resolve().relative_to(folder.resolve()), ()
-    files = files_of(source)
+def _placed(files: Sequence[Path], folder: Path) -> tuple[Path, tuple[Planned, ...]]:
+    """Where the configuration will be, and what must be copied for that; all files keep their place to each other.
+
+    Args:
+        files: of the configuration, its own first; what it names absolutely stays where it is.
+        folder: of installed configurations.
+    """
+    source = files[0]
+    if source.is_relative_to(folder.resolve()):
+        return FOLDER / source.relative_to(folder.resolve()), ()
+    common = Path(os.path.commonpath([file.parent for file in files]))
     copies = [
-        Planned(FOLDER / place, file.read_text(encoding="utf-8"), keep_previous=True) for place, file in files.items()
+        Planned(FOLDER / file.relative_to(common), file.read_text(encoding="utf-8"), keep_previous=True)
+        for file in dict.fromkeys(files)
     ]
     return copies[0].path, tuple(copies)
 

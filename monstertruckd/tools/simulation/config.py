@@ -5,11 +5,10 @@ from typing import ClassVar, Self
 
 from pydantic import model_validator
 
+from monstertruck_runtime.errors import ConfigError
 from monstertruck_sim.config import SimConfig
-from monstertruckd.config.calibration.apply import calibrated
+from monstertruckd.config.load import Tree, calibrated, load_tree, validated
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.config.validate import validated
-from monstertruckd.config.yaml_tree import Tree, load_tree
 
 
 class SimulatedTruckConfig(TruckConfig):
@@ -24,6 +23,18 @@ class SimulatedTruckConfig(TruckConfig):
         if self.sim.world.truck.body.kind != self.body.kind:
             raise ValueError(f"sim.world.truck.body is {self.sim.world.truck.body.kind}, body is {self.body.kind}")
         return self
+
+
+def load_simulated(path: Path) -> SimulatedTruckConfig:
+    """The configuration of a simulated robot, without calibration.
+
+    Raises:
+        ConfigError: one line per mistake; or it describes a real robot.
+    """
+    tree = load_tree(path)
+    if tree.data.get("sim") is None:
+        raise ConfigError(f"{path}: describes a real truck: it has no section `sim`, as configs/full.yaml has")
+    return validated(tree, path, SimulatedTruckConfig)[0]
 
 
 def load_robot(path: Path) -> tuple[TruckConfig, Tree]:

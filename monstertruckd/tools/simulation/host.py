@@ -24,7 +24,6 @@ from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultCo
 from monstertruck_sim.faults import Mishaps, Site
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.world import World
-from monstertruckd.config.validate import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD = SECOND // 20
@@ -55,15 +54,14 @@ class TruthLog:
         return np.array(self._rows).reshape(-1, len(self.COLUMNS))
 
 
-async def serve(clock: Clock, config_file: Path, truth: Path | None) -> None:
-    """Serve the devices of ``config_file`` behind ptys at their configured ports until SIGTERM or SIGINT.
+async def serve(clock: Clock, config: SimulatedTruckConfig, truth: Path | None) -> None:
+    """Serve the devices of ``config`` behind ptys at their configured ports until SIGTERM or SIGINT.
 
     Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
 
     Raises:
         InputError: the configuration has hubs or monitors, but names no place for the emulated computer.
     """
-    config, _ = load_config(config_file, SimulatedTruckConfig)
     with TemporaryDirectory(prefix="monstertruck-") as folder, _shown(config, Path(folder)):
         await _serve(clock, config, Path(folder), truth)
 

@@ -14,7 +14,7 @@ from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.console import Emulated
 from monstertruck_sim.faults import Mishaps, Site
 from monstertruck_sim.robot import SimulatedRobot
-from monstertruckd.config.yaml_tree import Tree
+from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.host import TruthLog

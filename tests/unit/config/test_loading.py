@@ -8,8 +8,7 @@ from pydantic import Field
 
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_schemas.base import Schema
-from monstertruckd.config.validate import load_config, resolved
-from monstertruckd.config.yaml_tree import load_tree
+from monstertruckd.config.load import load_config, load_tree, resolved
 
 
 class Wheel(Schema):
@@ -35,6 +34,7 @@ class Root(Schema):
     wheel: Wheel = Wheel()
     sensors: tuple[Annotated[Lidar | Sonar, Field(discriminator="kind")], ...] = ()
     map: Path | None = None
+    spare: bool = False
 
 
 def write(folder: Path, text: str, name: str = "truck.yaml") -> Path:
@@ -87,6 +87,8 @@ def test_a_good_file(tmp_path: Path):
         ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "sensors.0.beems: unknown key"),
         ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "known here: cone, kind"),
         ("version: 1\nname: 2026-11-21\n", 1, "neither text, number, list nor mapping"),
+        ("version: 1\nname: a\x01\n", 1, "not valid YAML"),
+        ("version: 1\nname: t\nspare: yes\n", 3, "found 'yes': write true or false"),
         ("version: 1\nname: .nan\nwheel:\n  radius: .nan\n", 2, "name: "),
     ],
 )
@@ -94,6 +96,11 @@ def test_every_mistake_names_file_line_and_expectation(tmp_path: Path, text: str
     said = complaint(tmp_path, text)
     assert f"{tmp_path / 'truck.yaml'}:{line}" in said or "neither text" in expected
     assert expected in said
+
+
+def test_numbers_are_those_of_yaml_1_2(tmp_path: Path):
+    config, _ = load_config(write(tmp_path, "version: 1\nname: t\nwheel: {radius: 1e-1, count: 0o17}\n"), Root)
+    assert config.wheel == Wheel(radius=0.1, count=15)
 
 
 def test_several_mistakes_are_several_lines(tmp_path: Path):

@@ -7,9 +7,8 @@ import pytest
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruckd.config.edit import YamlText
+from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.config.migrate import Step, carry_out, plan
-from monstertruckd.config.validate import load_config
-from monstertruckd.config.yaml_tree import load_tree
 from tests.unit.config.test_loading import Root
 
 OLD = """# my robot

@@ -7,8 +7,8 @@ import pytest
 from monstertruck_drivers.config import PortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.errors import ConfigError
+from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.config.validate import load_config
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
+from monstertruck_runtime.yaml_files import yaml_text
 
 KEYS = {
     "image": "m.png",
@@ -22,7 +22,7 @@ def write(folder, shades, **changes):
     Image.fromarray(np.array(shades, dtype=np.uint8)).save(folder / "m.png")
     keys = {key: value for key, value in (KEYS | changes).items() if value is not None}
     path = folder / "m.yaml"
-    path.write_text(yaml.safe_dump(keys))
+    path.write_text(yaml_text(keys))
     return path
 
 

@@ -91,7 +91,7 @@ def test_ramp_world_tilts_the_truck():
         ("points: [[0, 1]]", "two points"),
         ("points: [[1, 0], [0, 0]]", "rising"),
         ("point: 3", "list of"),
-        ("a: [", "read"),
+        ("a: [", ":1: not valid YAML"),
     ],
 )
 def test_bad_profiles_are_refused(tmp_path, text, match):

@@ -12,12 +12,13 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel
-from monstertruckd.config.calibration.record import Estimate, Result
-from monstertruckd.config.load import load_uncalibrated
+from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.guide import Guide, Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
 
-CONFIG = load_uncalibrated(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml")[0]
+CONFIG = load_config(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml", TruckConfig)[0]
 RESULT = Result(
     wizard="battery", measured="test", estimates=(Estimate(name="gain", value=1.1, samples=1, meaning="test"),)
 )

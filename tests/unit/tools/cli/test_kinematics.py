@@ -61,7 +61,7 @@ def test_mobility_of_a_family_and_of_any_wheels(tmp_path):
         ("- {kind: fixed, x: 0, y: 0, radius: 1, colour: red}", "wheel 1: .*colour"),
         ("- {kind: fixed, x: 0, y: 0, radius: big}", "wheel 1: .*radius is 'big': expected a number"),
         ("- {kind: fixed, x: 0, y: 0, radius: -1}", "wheel 1: radius is -1"),
-        ("[", "while parsing"),
+        ("[", ":1: not valid YAML"),
         ("[]", "wheels is empty"),
     ],
 )

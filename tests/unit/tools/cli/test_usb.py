@@ -7,13 +7,13 @@ from typing import Any, Self
 
 import pytest
 import typer
-import yaml
 from typer.testing import CliRunner
 
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
+from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree
 from monstertruckd.tools.cli import usb as commands
 from monstertruckd.tools.cli.find_port import config_line, find_cable, write_port
@@ -200,13 +200,13 @@ def test_writing_changes_the_port_only(tmp_path: Path):
     assert text == CONFIG.replace("{ path: /dev/truck/lidar }", '{ hub: "1-1", port: 1, usb_id: "15d1:0000" }')
     write_port(file, "drive", PORTS["drive"].model_copy(update={"interface": 2}))
     text = file.read_text()
-    drive = yaml.safe_load(text)["devices"]["drive"]
+    drive = read_yaml(file)["devices"]["drive"]
     assert drive == {"port": {"hub": "1-1", "port": 3, "interface": 2, "baud": 57600}, "driver": {"kind": "epos"}}
     assert UsbPortConfig.model_validate(drive["port"]).device == "1-1.3"
     for comment in ("# the truck", "# in front", "# by udev", "# node 1"):
         assert comment in text
     write_port(file, "drive", PORTS["compass"])
-    assert yaml.safe_load(file.read_text())["devices"]["drive"]["port"]["hub"] == "1-2", "once more"
+    assert read_yaml(file)["devices"]["drive"]["port"]["hub"] == "1-2", "once more"
     assert file.stat().st_mode & 0o777 == 0o640
     assert list(tmp_path.iterdir()) == [file]
 

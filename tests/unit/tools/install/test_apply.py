@@ -11,7 +11,6 @@ import pytest
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, NotFoundError, NotPermittedError
 from monstertruckd.tools.install import apply
 from monstertruckd.tools.install.apply import Change, Report, install, run_command, uninstall
-from monstertruckd.tools.install.configuration import files_of
 from monstertruckd.tools.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
 from tests.unit.tools.install.kit import ROOT, TRUCK, settings, truck_plan
 
@@ -191,11 +190,13 @@ def test_without_any_configuration_it_asks_for_one(tmp_path: Path):
 def test_files_of_a_configuration_keep_their_places(tmp_path: Path):
     (tmp_path / "robots").mkdir()
     main = tmp_path / "robots" / "mine.yaml"
-    main.write_text("include: [../parts/a.yaml, /elsewhere.yaml]\npath: {file: ../lap.csv}\n")
+    main.write_text(f"include: [{TRUCK}, ../parts/a.yaml]\npath: {{file: ../lap.csv}}\n")
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "a.yaml").write_text("version: 1\npath: {file: /absolute.csv}\n")
-    (tmp_path / "lap.csv").touch()
-    assert [str(place) for place in files_of(main)] == ["robots/mine.yaml", "parts/a.yaml", "lap.csv"]
+    (tmp_path / "parts" / "a.yaml").write_text("version: 1\nplanner: null\n")
+    (tmp_path / "lap.csv").write_text("x,y,yaw,direction\n")
+    copied = [planned.path for planned in truck_plan(tmp_path / "root", main).files if planned.keep_previous]
+    places = [str(path.relative_to("/etc/monstertruckd")) for path in copied]
+    assert places == ["robots/mine.yaml", "parts/a.yaml", "lap.csv"]
 
 
 @pytest.mark.skipif(shutil.which("systemd-sysusers") is None or os.geteuid() != 0, reason="needs systemd and root")

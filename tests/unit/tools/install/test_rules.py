@@ -6,8 +6,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import yaml
 
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.config.load import load_truck
 from monstertruckd.tools.install.rules import rules_text
 from tests.unit.tools.install.kit import TRUCK
@@ -66,7 +66,7 @@ def test_what_switches_a_port_is_writable_where_configured(
     file = tmp_path / "truck.yaml"
     lidar = {"port": {"hub": hub, "port": 1}, "driver": {"kind": "hokuyo_urg"}}
     power = {"power": {"method": method}}
-    file.write_text(yaml.safe_dump({"version": 1, "usb": power, "devices": {"lidar": lidar}}))
+    file.write_text(yaml_text({"version": 1, "usb": power, "devices": {"lidar": lidar}}))
     rules = rules_of(file)
     assert expected in rules if expected is not None else "authorized" not in rules and "disable" not in rules
 

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.config.load import load_truck
 from monstertruckd.tools.install.plan import plan
 from monstertruckd.tools.install.shipped import filled
@@ -26,7 +26,7 @@ def unit_of(config: Path = TRUCK, program: Program = PROGRAM, user: str = "monst
 
 def overlay(folder: Path, **values: object) -> Path:
     file = folder / "truck.yaml"
-    file.write_text(yaml.safe_dump({"include": str(TRUCK), "version": 1, **values}))
+    file.write_text(yaml_text({"include": str(TRUCK), "version": 1, **values}))
     return file
 
 

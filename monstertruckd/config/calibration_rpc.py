@@ -15,8 +15,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.config.calibration.apply import store_of, with_values
-from monstertruckd.config.calibration.record import Result, WizardName
+from monstertruckd.config.calibration import Result, WizardName, store_of, with_values
 from monstertruckd.config.truck import TruckConfig
 
 SHOW: Final = "calibration"

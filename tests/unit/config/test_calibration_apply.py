@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.errors import ConfigError
-from monstertruckd.config.calibration.apply import store_of, value_at
-from monstertruckd.config.calibration.record import Estimate, Result, WizardName
-from monstertruckd.config.load import load_truck
-from monstertruckd.config.validate import resolved
+from monstertruckd.config.calibration import Estimate, Result, WizardName, store_of, value_at
+from monstertruckd.config.load import load_truck, resolved
 from monstertruckd.tools.cli.main import main
 
-ROOT = Path(__file__).resolve().parents[4]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def result(wizard: WizardName, **values: bool | float) -> Result:

@@ -7,8 +7,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
-from monstertruckd.config.calibration.record import Estimate, Result
-from monstertruckd.config.calibration.store import CalibrationStore
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 
 NOON = 1_795_262_400 * SECOND
 

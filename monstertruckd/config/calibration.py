@@ -1,0 +1,307 @@
+"""Calibration of a truck: measured values with their uncertainty, the folder that keeps them, and how they apply.
+
+Files are numbered and dated, ``0003-2026-11-21T160102Z.json``; the newest counts. A file is written under another name,
+synced and then renamed, so that after any crash the newest one is whole. No file is ever changed or removed: undoing
+writes a newer file with the older value.
+"""
+
+import os
+import re
+import threading
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruck_schemas.base import Schema
+from monstertruckd.config.truck import TruckConfig
+
+C = TypeVar("C", bound=TruckConfig)
+
+CONFIDENCE: Final = 0.95
+"""Of every interval: of a hundred trucks measured like this, so many have their true value inside."""
+
+Value = bool | int | float
+WizardName = Literal["battery", "compass", "drive", "steering"]
+
+STEERING: Final = "devices.steering.driver"
+COMPASS: Final = "devices.compass.driver.iron"
+
+KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
+    "battery": (
+        f"{STEERING}.battery.gain",
+        f"{STEERING}.battery.offset",
+        "monitors.battery.divider",
+        "monitors.battery.offset",
+    ),
+    "compass": tuple(f"{COMPASS}.{name}" for name in ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")),
+    "drive": ("geometry.drive_ratio", "devices.drive.driver.inverted"),
+    "steering": tuple(
+        f"{STEERING}.{axle}.{name}"
+        for axle in ("front", "rear")
+        for name in ("centre_us", "scale_us_per_deg", "direction", "min_us", "max_us")
+    ),
+}
+"""Values of the configuration that each wizard may set; a calibration never touches any other."""
+
+
+class Estimate(Schema):
+    """One measured value."""
+
+    name: str
+    value: Value
+    unit: str = ""
+    low: float | None = None
+    """Lower end of the interval; None: the value is a choice (a sign), not a number"""
+    high: float | None = None
+    samples: Annotated[int, Field(ge=1)]
+    """Measurements it rests on"""
+    meaning: str
+    """What the value is, and what its interval covers"""
+    key: str | None = None
+    """Place in the configuration that it sets; None: for information only"""
+    date: str = ""
+    """When it was measured, UTC by the robot's clock; set when it is saved"""
+
+
+class Result(Schema):
+    """What one run of a wizard measured."""
+
+    wizard: WizardName
+    date: str = ""
+    """Of the newest estimate; set when it is saved"""
+    measured: str
+    """What was done, in a sentence"""
+    confidence: float = CONFIDENCE
+    """Of the intervals"""
+    estimates: Annotated[tuple[Estimate, ...], Field(min_length=1)]
+    unobserved: tuple[str, ...] = ()
+    """What this measurement cannot tell"""
+    readings: tuple[tuple[float, ...], ...] = ()
+    """Raw readings that a later run may use again; their meaning is the wizard's"""
+    partial: bool = False
+    """Only these were measured: what the run before found beside them stays"""
+    again: str | None = None
+    """What has to be done before the calibration is complete"""
+
+    def over(self, before: "Result | None", date: str) -> "Result":
+        """This result as it is saved on ``date``, with what it keeps of the one ``before``."""
+        fresh = tuple(e if e.date else e.model_copy(update={"date": date}) for e in self.estimates)
+        names = {estimate.name for estimate in fresh}
+        old = before.estimates if self.partial and before is not None else ()
+        kept = tuple(estimate for estimate in old if estimate.name not in names)
+        return self.model_copy(update={"date": date, "estimates": fresh + kept})
+
+    def estimate(self, name: str) -> Estimate | None:
+        """The estimate of that name."""
+        return next((estimate for estimate in self.estimates if estimate.name == name), None)
+
+
+class CalibrationFile(Schema):
+    """Everything known of one truck; replaced as a whole, never changed."""
+
+    version: Literal[1] = 1
+    number: Annotated[int, Field(ge=1)]
+    """Counts the files of this truck"""
+    robot: str
+    written: str
+    """UTC, by the robot's clock"""
+    change: str
+    """What it differs in from the one before"""
+    results: dict[WizardName, Result]
+
+
+def utc(real_ns: int) -> str:
+    """A real (UNIX) time, ns, as ``YYYY-MM-DDThh:mm:ssZ``."""
+    return f"{np.datetime64(real_ns // SECOND, 's')}Z"
+
+
+_FILE_NAME: Final = re.compile(r"(\d{4,})-[0-9TZ-]+\.json")
+
+
+class CalibrationStore:
+    """Reads and writes the files of one truck; every method may block for a file system's time.
+
+    Args:
+        folder: made when the first file is written.
+        robot: name of the truck.
+    """
+
+    def __init__(self, folder: Path, robot: str) -> None:
+        self.folder = folder
+        self._robot = robot
+        self._writing = threading.Lock()
+
+    def files(self) -> list[Path]:
+        """All files, oldest first.
+
+        Raises:
+            ConfigError: the folder cannot be read.
+        """
+        try:
+            names = [path for path in self.folder.iterdir() if _FILE_NAME.fullmatch(path.name)]
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise ConfigError(f"{self.folder}: calibration cannot be read: {error.strerror}") from error
+        return sorted(names, key=_number)
+
+    def newest(self) -> Path | None:
+        """The file that counts."""
+        return next(reversed(self.files()), None)
+
+    def load(self, path: Path) -> CalibrationFile:
+        """Read one file.
+
+        Raises:
+            ConfigError: it is damaged, or of another truck; names the file and what to do.
+        """
+        try:
+            file = CalibrationFile.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
+            what = error.strerror if isinstance(error, OSError) else _first_mistake(error)
+            msg = f"{path}: no usable calibration: {what}; move it away to go back to the one before"
+            raise ConfigError(msg) from error
+        if file.robot != self._robot:
+            raise ConfigError(f"{path}: robot: is the calibration of {file.robot!r}, this is {self._robot!r}")
+        return file
+
+    def current(self) -> CalibrationFile | None:
+        """Content of the newest file; None before the first calibration.
+
+        Raises:
+            ConfigError: see ``load``.
+        """
+        path = self.newest()
+        return None if path is None else self.load(path)
+
+    def save(self, result: Result, real_ns: int) -> Path:
+        """Write a new file in which ``result`` replaces the wizard's last one; returns its path.
+
+        Args:
+            result: what was measured.
+            real_ns: real time now.
+
+        Raises:
+            ConfigError: the newest file is damaged, or the new one cannot be written; nothing has changed then.
+        """
+        with self._writing:
+            current = self.current()
+            before = current.results.get(result.wizard) if current is not None else None
+            saved = result.over(before, utc(real_ns))
+            return self._write({result.wizard: saved}, f"{result.wizard} calibrated", real_ns)
+
+    def undo(self, wizard: WizardName, real_ns: int) -> Path:
+        """Write a new file with the wizard's result as it was before its last change; returns its path.
+
+        Undoing twice is doing it again.
+
+        Raises:
+            NotFoundError: this wizard has never changed anything.
+            ConfigError: see ``save``.
+        """
+        with self._writing:
+            history = [self.load(path).results.get(wizard) for path in reversed(self.files())]
+            if all(result is None for result in history):
+                raise NotFoundError(f"{self.folder}: {wizard} was never calibrated, there is nothing to undo")
+            before = next((result for result in history if result != history[0]), None)
+            change = f"{wizard} as it was " + ("before any calibration" if before is None else f"on {before.date}")
+            return self._write({wizard: before}, change, real_ns)
+
+    def _write(self, changed: dict[WizardName, Result | None], change: str, real_ns: int) -> Path:
+        current = self.current()
+        results = {**(current.results if current is not None else {}), **changed}
+        number = 1 if current is None else current.number + 1
+        file = CalibrationFile(
+            number=number,
+            robot=self._robot,
+            written=utc(real_ns),
+            change=change,
+            results={name: result for name, result in results.items() if result is not None},
+        )
+        path = self.folder / f"{number:04d}-{utc(real_ns).replace(':', '')}.json"
+        try:
+            self._put(path, file.model_dump_json(indent=1).encode() + b"\n")
+        except OSError as error:
+            raise ConfigError(f"{path}: calibration cannot be written: {error.strerror}") from error
+        return path
+
+    def _put(self, path: Path, data: bytes) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        draft = path.with_suffix(".new")
+        with draft.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+        directory = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+
+
+def _number(path: Path) -> int:
+    return int(path.name.partition("-")[0])
+
+
+def _first_mistake(error: ValidationError) -> str:
+    detail = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, detail['loc'])) or 'file'}: {detail['msg'][:1].lower()}{detail['msg'][1:]}"
+
+
+def store_of(config: TruckConfig) -> CalibrationStore:
+    """Where the calibration of a configured truck is kept."""
+    return CalibrationStore(config.calibration or config.state_directory / "calibration", config.robot)
+
+
+def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
+    """``config`` with the values of ``results``; values of devices that this truck has not are left out.
+
+    Args:
+        config: as configured, or calibrated before.
+        results: of the wizards.
+        source: named in complaints.
+
+    Raises:
+        ConfigError: a value that no wizard may set, or one that the configuration refuses.
+    """
+    data = config.model_dump()
+    for result in results:
+        for estimate in result.estimates:
+            if estimate.key is not None:
+                _set(data, estimate, result, source)
+    try:
+        return type(config).model_validate(data)
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in detail["loc"])
+        msg = f"{source}: {where}: {detail['msg'].removeprefix('Value error, ')}"
+        raise ConfigError(msg) from error
+
+
+def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:
+    assert estimate.key is not None
+    if estimate.key not in KEYS[result.wizard]:
+        raise ConfigError(f"{source}: {estimate.key}: the wizard {result.wizard} has no business there")
+    *way, last = estimate.key.split(".")
+    section: Any = data
+    for part in way:
+        section = section.get(part)
+        if not isinstance(section, dict):
+            return
+    section[last] = estimate.value
+
+
+def value_at(config: Mapping[str, Any], key: str) -> Value | None:
+    """A value of a resolved configuration; None where there is no such section."""
+    section: Any = config
+    for part in key.split("."):
+        if not isinstance(section, Mapping):
+            return None
+        section = section.get(part)
+    return section if isinstance(section, bool | int | float) else None

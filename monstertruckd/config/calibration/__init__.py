@@ -1,1 +1,0 @@
-"""Calibration files: written by the calibration commands, laid over the configuration."""
