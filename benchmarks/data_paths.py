@@ -34,8 +34,7 @@ from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
-from monstertruckd.config.load import load_truck
-from monstertruckd.config.validate import load_config
+from monstertruckd.config.load import load_config, load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
