@@ -4,8 +4,7 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 (map > odom > base > sensors). A value that is absent is ``None``, never NaN.
 """
 
-from functools import cache
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,43 +31,6 @@ class Schema(BaseModel):
         return all(_equal(a, b) for a, b in zip(self.__dict__.values(), other.__dict__.values(), strict=True))
 
     __hash__ = None  # type: ignore[assignment]  # messages carry arrays
-
-
-S = TypeVar("S", bound=Schema)
-
-
-def assembled(model: type[S], values: dict[str, Any]) -> S:
-    """A record of values known to be valid, which are not looked at again; ``values`` is then the record's own.
-
-    Args:
-        model: what it is.
-        values: of every field, in their order; arrays read-only.
-    """
-    record = object.__new__(model)
-    _set_values(record, values)
-    _set_given(record, _all_given(model))
-    _set_extra(record, None)
-    _set_private(record, None)
-    return record
-
-
-@cache
-def _all_given(model: type[Schema]) -> set[str]:
-    """Names of all fields; one set serves all records, for a frozen one's never changes."""
-    return set(model.model_fields)
-
-
-# A record refuses to be written to; its own descriptors are the shortest way round that.
-_set_values, _set_given, _set_extra, _set_private = (
-    vars(BaseModel)[slot].__set__
-    for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")
-)
-
-
-def array_bytes(array: NDArray[Any]) -> bytes:
-    """Bytes of a message's array; those it was made from, where they are the same."""
-    base: object = array.base
-    return base if type(base) is bytes and len(base) == array.nbytes else array.tobytes()
 
 
 def _equal(a: object, b: object) -> bool:

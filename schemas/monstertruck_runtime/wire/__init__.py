@@ -12,8 +12,7 @@ from typing import Any, Final, TypeVar
 from pydantic import ValidationError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.wire.foxglove import BINDINGS
-from monstertruck_runtime.wire.schema import descriptor_set
+from monstertruck_runtime.wire import foxglove
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
@@ -45,8 +44,8 @@ def encode(topic: Topic[M], message: M) -> bytes:
         msg = f"{topic.name}: expected {topic.model.__name__}, got {type(message).__name__}"
         raise InputError(msg)
     if topic.foxglove is None:
-        return message.__pydantic_serializer__.to_json(message, exclude_none=True)
-    return BINDINGS[topic.model].encode(message)
+        return message.model_dump_json(exclude_none=True).encode()
+    return foxglove.encode(message)
 
 
 def decode(topic: Topic[M], data: bytes) -> M:
@@ -58,7 +57,7 @@ def decode(topic: Topic[M], data: bytes) -> M:
     try:
         if topic.foxglove is None:
             return topic.model.model_validate_json(data, extra="ignore")
-        message = BINDINGS[topic.model].decode(data)
+        message = foxglove.decode(topic.model, data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -84,7 +83,7 @@ def schema(topic: Topic[Any]) -> WireSchema:
     if topic.foxglove is None:
         text = json.dumps(_flat(topic.model.model_json_schema()), separators=(",", ":"))
         return WireSchema(topic.schema_name, "jsonschema", text.encode(), "json")
-    return WireSchema(topic.schema_name, "protobuf", descriptor_set(BINDINGS[topic.model].layout), "protobuf")
+    return WireSchema(topic.schema_name, "protobuf", foxglove.descriptor_set(topic.foxglove), "protobuf")
 
 
 def _flat(root: dict[str, Any]) -> dict[str, Any]:
