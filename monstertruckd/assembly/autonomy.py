@@ -16,7 +16,6 @@ from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.steps import STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
-from monstertruck_planners.track.placed import PlacedTracker
 from monstertruck_planners.track.service import TrackerService
 from monstertruck_planners.track.step import TrackSetup
 from monstertruck_runtime.actors.placement import Places
@@ -178,32 +177,18 @@ def _build_tracker(
         inputs["scan"] = bus.subscribe(topics.SCAN, latest())
     if config.devices.compass is not None:
         inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
-    told, events = bus.publisher(topics.TRACKER, Writer.PLANNER), bus.event_sink()
+    actor = None
     if placement != "loop":
-        setup = TrackSetup(
-            tracker,
-            body.chassis.bicycle,
-            body.footprint,
-            body.points.mount,
-            scan="scan" in inputs,
-            attitude="attitude" in inputs,
-        )
         actor = places.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
-        return PlacedTracker(setup, clock, actor, inputs=inputs, drive=requests, tracker=told, events=events)
     return TrackerService(
-        tracker,
+        TrackSetup(tracker, body.chassis.bicycle, body.footprint, body.points.mount),
         clock,
-        steering=body.chassis.bicycle,
-        footprint=body.footprint,
-        points=body.points,
-        pose=inputs["pose"],
-        path=inputs["path"],
-        gate=inputs["gate"],
-        scan=inputs.get("scan"),
-        attitude=inputs.get("attitude"),
+        inputs=inputs,
         drive=requests,
-        tracker=told,
-        events=events,
+        tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
+        events=bus.event_sink(),
+        actor=actor,
+        points=body.points,
     )
 
 

@@ -1,6 +1,7 @@
 """What goes into a tracker and what comes out."""
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from monstertruck_planners.track.line import Line, Progress
@@ -22,7 +23,8 @@ class TruckState(NamedTuple):
     """Standard deviation of the tilt over the last seconds, rad."""
 
 
-class Command(NamedTuple):
+@dataclass(slots=True)
+class Command:
     """What to do now, and how the tracking goes."""
 
     speed: float

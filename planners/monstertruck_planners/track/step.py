@@ -1,40 +1,253 @@
-"""The tracker as a step: what came in since the last one, what goes out; for a worker or another machine.
+"""The tracking step: the newest messages in, a command and the tracking's state out.
 
-Inside is the very service that runs in the loop, with its mailboxes filled by hand.
+The same step is taken in the loop, in a worker process and on another machine.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, NamedTuple
 
+import numpy as np
+
+from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, ScanPoints
-from monstertruck_planners.goals.exchange import Pose
+from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
+from monstertruck_planners.track.actuator import Pose
+from monstertruck_planners.track.api import Command, TruckState
+from monstertruck_planners.track.catalog import build_tracker
 from monstertruck_planners.track.config import TrackerConfig
-from monstertruck_planners.track.service import TrackerService
+from monstertruck_planners.track.ground import Ground
+from monstertruck_planners.track.line import Line, Progress
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import Value
-from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import TrackerState
+from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.sensor import Attitude, LaserScan
+from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
-M = TypeVar("M", bound=Message)
+LOOKS: Final = 8
+"""Poses ahead whose clearance counts."""
 
-INPUTS = ("pose", "path", "gate", "scan", "attitude")
+LONG: Final = 3 * 500
+"""Numbers of a path (x, y, yaw) from which on it is prepared within several turns of the loop."""
+
+AT_REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+
+MOVED: Final = 0.01
+"""A truck not armed and moved by more than this may begin its path elsewhere, m."""
+TURNED: Final = 0.02
+"""Or turned by more than this, rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackSetup:
-    """What the step is made for; comes first, and again after every restart."""
+    """What the step is made for."""
 
     config: TrackerConfig
     steering: FourWheelSteering
     footprint: Footprint
     lidar: Pose
-    scan: bool
-    attitude: bool
+    """In base."""
+
+
+class Newest(NamedTuple):
+    """The newest message of each input; None before the first, or where the robot has no such input."""
+
+    pose: Odometry | None = None
+    """Of base in the paths' frame."""
+    path: Path | None = None
+    gate: GateState | None = None
+    scan: LaserScan | None = None
+    """Slows the truck down in narrow places."""
+    attitude: Attitude | None = None
+    """Slows it down on slopes and rough ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepEvent:
+    """An event of the step."""
+
+    reason: Reason
+    severity: Severity
+    text: str
+    values: dict[str, Value]
+
+
+@dataclass(slots=True)
+class TrackOutput:
+    """What one step decided."""
+
+    command: Command | None = None
+    """None = the tracker is silent."""
+    drive: bool = False
+    """Whether the gate is asked for the command."""
+    frame: str = ""
+    path: str = ""
+    along: float = 0.0
+    """Metres of the path driven."""
+    length: float = 0.0
+    """Of the whole path, m."""
+    events: tuple[StepEvent, ...] = ()
+
+
+class TrackingStep:
+    """Follows the newest path by the configured tracker.
+
+    Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
+    Once the path has ended or is lost it asks for standstill, then falls silent.
+
+    Args:
+        setup: the tracker and the truck.
+        points: of scans, in base, if they are computed for others as well.
+
+    Raises:
+        InputError: the tracker cannot be built.
+    """
+
+    def __init__(self, setup: TrackSetup, points: ScanPoints | None = None) -> None:
+        self._config = setup.config
+        self._law = build_tracker(setup.config, setup.steering)
+        self._footprint = setup.footprint
+        self._points = points or ScanPoints(setup.lidar)
+        self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
+        self._ground = Ground()
+        self._seen: tuple[LaserScan, Line] | None = None
+        self._room = math.inf
+        """Clearance ahead on that line, in that scan."""
+        self._followed: Path | None = None
+        self._line: Line | None = None
+        self._progress = Progress()
+        self._begun: tuple[float, float, float] | None = None
+        """Pose the line was begun from; None for one that may have to be begun anew."""
+        self._outcome = Reason.DRIVING
+        self._reported = Reason.DRIVING
+        """Outcome of the newest event since the path came or the truck was armed."""
+        self._active = False
+        self._events: list[StepEvent] = []
+
+    def step(self, now: int, newest: Newest) -> TrackOutput:
+        """One control step at ``now``, ns."""
+        *_, output = self.parts(now, newest)
+        assert output is not None
+        return output
+
+    def parts(self, now: int, newest: Newest) -> Iterator[TrackOutput | None]:
+        """The same in parts, for a loop that has to turn in between: None after each but the last, the output then.
+
+        Only a long path, when it comes, makes more than one part.
+        """
+        pose, path, gate = newest.pose, newest.path, newest.gate
+        if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
+            yield TrackOutput()
+            return
+        long = len(path.poses) > LONG
+        if self._choose_line(path, pose, armed=gate.mode.active) and long:
+            yield None
+        if self._line is None:
+            yield TrackOutput(events=self._drain())
+            return
+        if self._law.prepare(self._line, self._progress) and long:
+            yield None
+        yield self._control(self._line, pose, path, gate, newest, now)
+
+    def _control(
+        self, line: Line, pose: Odometry, path: Path, gate: GateState, newest: Newest, now: int
+    ) -> TrackOutput:
+        at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        clearance = self._clearance(newest.scan, line, pose, now)
+        state = TruckState(at, pose.twist.vx, clearance, *self._feel(newest.attitude, now))
+        try:
+            command = self._law.control(state, line, self._progress, now / SECOND)
+        except KinematicsError as error:
+            self._line = None
+            text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
+            self._report(Reason.BAD_INPUT, Severity.WARNING, text)
+            return TrackOutput(events=self._drain())
+        if active := gate.mode.active:
+            self._progress = command.progress
+        self._outcome = command.outcome
+        if command.outcome is not self._reported and (self._active or command.outcome is not Reason.DRIVING):
+            self._reported = command.outcome
+            severity = Severity.WARNING if command.outcome is Reason.PATH_LOST else Severity.INFO
+            self._report(command.outcome, severity, path=line.name, cross_track=command.cross_track)
+        drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
+        along = line.along(command.progress)
+        return TrackOutput(command, drive, line.frame, line.name, along, line.length, self._drain())
+
+    def _choose_line(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
+        """Take a new path, or start the present one over: until armed it may still begin anywhere; whether it did."""
+        idle, self._active = not self._active, armed
+        if armed and idle:
+            self._law.reset()
+            self._reported = Reason.DRIVING
+        elif not armed and not idle:
+            self._begun = None
+        here = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        if path is self._followed:
+            again = idle and (armed or self._moved(here))
+            if self._line is None or not again or not self._to_begin():
+                return False
+        else:
+            self._reported = Reason.DRIVING
+        self._followed, self._line, self._outcome, self._begun = path, None, Reason.DRIVING, here
+        try:
+            if path.frame != pose.frame:
+                msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
+                raise InputError(msg)
+            self._line = Line(path, here, self._config.beyond)
+            self._progress = self._line.start
+        except InputError as error:
+            self._report(Reason.BAD_INPUT, Severity.WARNING, str(error))
+        return True
+
+    def _to_begin(self) -> bool:
+        """Whether the path has ended or not yet begun."""
+        return self._outcome is not Reason.DRIVING or (self._line is not None and self._progress == self._line.start)
+
+    def _moved(self, here: tuple[float, float, float]) -> bool:
+        """Whether the truck stands elsewhere than where the line was begun, so far as it matters."""
+        if self._begun is None:
+            return True
+        x, y, yaw = self._begun
+        return math.hypot(here[0] - x, here[1] - y) > MOVED or abs(math.remainder(here[2] - yaw, math.tau)) > TURNED
+
+    def _clearance(self, scan: LaserScan | None, line: Line, pose: Odometry, now: int) -> float:
+        """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
+        if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
+            return math.inf
+        if self._seen is None or self._seen[0] is not scan or self._seen[1] is not line:
+            self._seen, self._room = (scan, line), self._measure_room(scan, line, pose)
+        return self._room
+
+    def _measure_room(self, scan: LaserScan, line: Line, pose: Odometry) -> float:
+        ahead = line.ahead(self._progress, self._config.reach, LOOKS)
+        c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
+        dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
+        poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
+        near = points_near(self._points.of(scan), poses, self._near)
+        return float(clearance_to_points(self._footprint, poses, near).min())
+
+    def _feel(self, attitude: Attitude | None, now: int) -> tuple[float, float]:
+        """Tilt and roughness, rad; 0 if they are not measured."""
+        if attitude is None or now - attitude.received > COMPASS.fresh_for() * SECOND:
+            return 0.0, 0.0
+        if attitude.tilt_valid:
+            self._ground.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
+        return self._ground.tilt, self._ground.roughness
+
+    def _report(self, reason: Reason, severity: Severity, text: str = "", **values: Value) -> None:
+        self._events.append(StepEvent(reason, severity, text, values))
+
+    def _drain(self) -> tuple[StepEvent, ...]:
+        if not self._events:
+            return ()
+        events, self._events = tuple(self._events), []
+        return events
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,77 +257,15 @@ class TrackInput:
     now: int
     news: dict[str, Any]
     setup: TrackSetup | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Told:
-    """An event of the step."""
-
-    reason: Reason
-    severity: Severity
-    source: str
-    text: str
-    values: dict[str, Value]
-
-
-@dataclass(frozen=True, slots=True)
-class TrackOutput:
-    """What the step has to say."""
-
-    drive: tuple[DriveRequest, ...]
-    tracker: tuple[TrackerState, ...]
-    events: tuple[Told, ...]
-
-
-class _Slot(Generic[M]):
-    """A subscription that holds one message."""
-
-    def __init__(self) -> None:
-        self.latest: M | None = None
-        self.drops = 0
-
-    async def next(self) -> M:
-        raise RuntimeError("a step does not wait")
-
-    async def next_within(self, seconds: float, take: Callable[[M], bool] | None = None) -> M | None:
-        raise RuntimeError(f"a step does not wait {seconds} s")
-
-
-class _Out(Generic[M]):
-    """A publisher that keeps what it is given; sequence numbers are the caller's."""
-
-    def __init__(self) -> None:
-        self.messages: list[M] = []
-
-    def next_seq(self) -> int:
-        return 0
-
-    def put(self, message: M) -> None:
-        self.messages.append(message)
-
-    def taken(self) -> tuple[M, ...]:
-        messages, self.messages = tuple(self.messages), []
-        return messages
-
-
-class _Stepped(TrackerService):
-    """The service, driven by hand."""
-
-    def step(self, now: int) -> None:
-        """One control step."""
-        for _ in self._parts(now):
-            pass
+    """Comes first, and again after every restart."""
 
 
 class TrackingWorker:
-    """Keeps the tracker and the newest messages."""
+    """The tracking step behind an actor: keeps the messages that came before."""
 
     def __init__(self) -> None:
-        self._service: _Stepped | None = None
-        self._slots: dict[str, _Slot[Any]] = {}
-        self._drive: _Out[DriveRequest] = _Out()
-        self._tracker: _Out[TrackerState] = _Out()
-        self._events: list[Told] = []
+        self._step: TrackingStep | None = None
+        self._newest = Newest()
 
     def step(self, inputs: TrackInput) -> TrackOutput:
         """Do one control step.
@@ -123,42 +274,8 @@ class TrackingWorker:
             InputError: no setup came first, or the tracker cannot be built.
         """
         if inputs.setup is not None:
-            self._set_up(inputs.setup)
-        if self._service is None:
+            self._step, self._newest = TrackingStep(inputs.setup), Newest()
+        if self._step is None:
             raise InputError("tracking: expected a setup before anything else")
-        for name, message in inputs.news.items():
-            self._slots[name].latest = message
-        self._service.step(inputs.now)
-        events, self._events = tuple(self._events), []
-        return TrackOutput(self._drive.taken(), self._tracker.taken(), events)
-
-    def _set_up(self, setup: TrackSetup) -> None:
-        self._slots = {name: _Slot() for name in INPUTS}
-        self._service = _Stepped(
-            setup.config,
-            _NO_CLOCK,
-            steering=setup.steering,
-            footprint=setup.footprint,
-            points=ScanPoints(setup.lidar),
-            pose=self._slots["pose"],
-            path=self._slots["path"],
-            gate=self._slots["gate"],
-            scan=self._slots["scan"] if setup.scan else None,
-            attitude=self._slots["attitude"] if setup.attitude else None,
-            drive=self._drive,
-            tracker=self._tracker,
-            events=self._tell,
-        )
-
-    def _tell(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
-        self._events.append(Told(reason, severity, source, text, values))
-
-
-class _NoClock:
-    """The steps bring their own time."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"a step has no clock: {name}")
-
-
-_NO_CLOCK: Any = _NoClock()
+        self._newest = self._newest._replace(**inputs.news)
+        return self._step.step(inputs.now, self._newest)

@@ -6,11 +6,12 @@ import pytest
 
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.line import Line
 from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.service import TrackerService
+from monstertruck_planners.track.step import Newest, TrackingStep, TrackingWorker, TrackSetup
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
@@ -35,7 +36,7 @@ class Outbox(list):
 class Bench:
     """A tracker, a gate that lets it drive, and a truck that obeys at once."""
 
-    def __init__(self, clock, route, *, with_scan=False, **config):
+    def __init__(self, clock, route, *, with_scan=False, actor=None, **config):
         self.clock = clock
         self.pose_in, self.path_in, self.gate_in, self.scan_in = Inbox(), Inbox(), Inbox(), Inbox()
         self.path_in.latest = route
@@ -44,20 +45,22 @@ class Bench:
         self.silent = False
         self.heard = 0
         self.service = TrackerService(
-            PurePursuitConfig(**config),
+            TrackSetup(PurePursuitConfig(**config), FourWheelSteering(), Footprint(), (0.14, 0.0, 0.0)),
             clock,
-            steering=FourWheelSteering(),
-            footprint=Footprint(),
-            points=ScanPoints((0.14, 0.0, 0.0)),
-            pose=self.pose_in,
-            path=self.path_in,
-            gate=self.gate_in,
-            scan=self.scan_in if with_scan else None,
+            inputs=self._inputs(with_scan),
+            actor=actor,
             drive=self.asked,
             tracker=self.told,
             events=lambda reason, severity, source, text="", **values: self.events.append((reason, text)),
         )
         self.gate(GateMode.DISARMED)
+
+    def _inputs(self, with_scan):
+        inputs = {"pose": self.pose_in, "path": self.path_in, "gate": self.gate_in}
+        return inputs | ({"scan": self.scan_in} if with_scan else {})
+
+    def newest(self):
+        return Newest(self.pose_in.latest, self.path_in.latest, self.gate_in.latest)
 
     def gate(self, mode):
         now = self.clock.now()
@@ -124,15 +127,46 @@ async def until_ended(bench, seconds=60.0):
 def test_a_long_path_is_taken_in_within_several_turns_of_the_loop(step, turns):
     async def scenario(bench):
         bench.path_in.latest = path(circle(1.0, step=step), closed=True)
-        told = len(bench.told)
-        parts = bench.service._parts(bench.clock.now())
-        for _ in range(turns):
-            next(parts)
-            assert len(bench.told) == told
-        assert list(parts) == []
-        assert len(bench.told) == told + 1
+        tracking = TrackingStep(TrackSetup(PurePursuitConfig(), FourWheelSteering(), Footprint(), (0.14, 0.0, 0.0)))
+        *before, output = tracking.parts(bench.clock.now(), bench.newest())
+        assert before == [None] * turns
+        assert output.command is not None
 
     on_bench(scenario, path(circle(1.0)))
+
+
+class Elsewhere:
+    """An actor with the worker's end of the tracker; notes what was sent."""
+
+    def __init__(self):
+        self.worker, self.sent = TrackingWorker(), []
+
+    async def __aenter__(self):
+        return self
+
+    async def __aexit__(self, *_):
+        pass
+
+    async def start(self):
+        pass
+
+    async def step(self, inputs):
+        self.sent.append(inputs)
+        return self.worker.step(inputs)
+
+
+def test_a_worker_gives_what_the_loop_gives_and_is_sent_what_is_new():
+    async def scenario(bench):
+        bench.gate(GateMode.DRIVING)
+        await until_ended(bench)
+
+    actor, route = Elsewhere(), path(straight(0.5))
+    here, there = (on_bench(scenario, route, actor=where) for where in (None, actor))
+    assert here.asked == there.asked
+    assert here.told == there.told
+    assert here.events == there.events
+    assert [inputs.setup is not None for inputs in actor.sent] == [True] + [False] * (len(actor.sent) - 1)
+    assert sum("path" in inputs.news for inputs in actor.sent) == 1
 
 
 def test_a_lap_from_arming_to_the_goal():
@@ -212,7 +246,7 @@ def test_while_disarmed_a_path_is_prepared_anew_only_for_a_truck_that_moved(monk
         await bench.clock.sleep(2.0)
         assert len(prepared) == before + 1
 
-    monkeypatch.setattr("monstertruck_planners.track.service.Line", line)
+    monkeypatch.setattr("monstertruck_planners.track.step.Line", line)
     bench = on_bench(scenario, route)
     assert [reason for reason, _ in bench.events] == [Reason.GOAL_REACHED]
 

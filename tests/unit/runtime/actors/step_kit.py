@@ -57,7 +57,7 @@ def track_inputs() -> list[TrackInput]:
         **HEAD, frame="odom", poses=np.column_stack((xs, 0.1 * xs**2, 0.2 * xs)).ravel(), directions=np.ones(41)
     )
     gate = GateState(**HEAD, mode=GateMode.DRIVING, nonce="n", speed_limit=0.2)
-    setup = TrackSetup(LqrConfig(kind="lqr"), TRUCK, BODY, (0.0, 0.0, 0.0), scan=False, attitude=False)
+    setup = TrackSetup(LqrConfig(kind="lqr"), TRUCK, BODY, (0.0, 0.0, 0.0))
     inputs = []
     for i in range(5):
         odometry = Odometry(

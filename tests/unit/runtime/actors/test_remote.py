@@ -61,7 +61,7 @@ def test_planner_and_tracker_give_the_same_on_another_machine():
         assert len(a) == len(b) > 3
         assert np.abs(np.subtract(a, b)).max() < 1e-9
     assert plan.ok
-    assert tracked[-1].drive[0].speed > 0.0
+    assert tracked[-1].command.speed > 0.0
 
 
 def test_failures_reach_the_robot_as_worker_errors():
