@@ -196,6 +196,7 @@ def _write_path(path: Path) -> dict[str, Any]:
         "poses": [_planar_pose(*pose) for pose in path.poses.reshape(-1, 3).tolist()],
         "poses2d": path.poses.tolist(),
         "directions": path.directions.tolist(),
+        "steering": path.steering,
         "closed": path.closed,
         "name": path.name,
     }
@@ -207,6 +208,7 @@ def _read_path(proto: Any) -> Path:
         **_own_header(proto),
         poses=_array(poses),
         directions=_array(proto.directions),
+        steering=tuple(proto.steering),
         closed=proto.closed,
         name=proto.name,
     )

@@ -1,6 +1,6 @@
 """One strategy per model, so that every topic's round trip is tested with the same care."""
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from hypothesis import strategies as st
@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import Cause, LogLevel, LogRecord, Measurement
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import Path, Steering
 from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
 
@@ -85,6 +85,7 @@ paths = st.builds(
     **header,
     poses=hnp.arrays(np.float64, st.integers(0, 5).map(lambda n: 3 * n), elements=number),
     directions=doubles(st.integers(0, 5)),
+    steering=st.lists(st.sampled_from(get_args(Steering)), max_size=5).map(tuple),
     closed=st.booleans(),
     name=st.text(),
 )
