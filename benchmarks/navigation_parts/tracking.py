@@ -17,8 +17,7 @@ from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.api import TruckState
-from monstertruck_planners.track.catalog import build_tracker
-from monstertruck_planners.track.config import AnyTracker
+from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.line import Line
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason

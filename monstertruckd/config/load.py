@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args
+from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -19,6 +19,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
 from monstertruckd.config.calibration import store_of, with_values
 from monstertruckd.config.truck import TruckConfig
@@ -323,13 +324,6 @@ def _data_key(data: Any, loc: tuple[int | str, ...]) -> Key:
     return tuple(key)
 
 
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for argument in get_args(annotation):
-        yield from _models(argument)
-
-
 def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
     """All models that may describe the mapping at ``key``."""
     here: list[type[BaseModel]] = [model]
@@ -340,7 +334,7 @@ def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
             inner
             for outer in here
             if part in outer.model_fields
-            for inner in _models(outer.model_fields[part].annotation)
+            for inner in models_in(outer.model_fields[part])
         ] or here
     return here
 
@@ -348,7 +342,7 @@ def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
 def _field_names(model: type[BaseModel], key: Key, detail: ErrorDetails) -> list[str]:
     kinds = [part for part in detail["loc"] if isinstance(part, str)]
     candidates = _reach(model, key)
-    chosen = [m for m in candidates if getattr(m.model_fields.get("kind"), "default", None) in kinds] or candidates
+    chosen = [model for model in candidates if kind_of(model) in kinds] or candidates
     return sorted({name for candidate in chosen for name in candidate.model_fields})
 
 

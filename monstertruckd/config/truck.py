@@ -16,7 +16,8 @@ from monstertruck_kinematics.chassis import Chassis, build_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
-from monstertruck_planners.track.config import STEERING_MODES, AnyTracker
+from monstertruck_planners.track.catalog import AnyTracker
+from monstertruck_planners.track.config import STEERING_MODES
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import BodyConfig, TruckBody
 from monstertruck_schemas.roles import SHAFTS

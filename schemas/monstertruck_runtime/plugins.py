@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar, cast, get_args, get_origin
 
 from pydantic import BaseModel, GetCoreSchemaHandler
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
 from monstertruck_runtime.errors import InputError
@@ -76,10 +77,12 @@ class Catalog(Mapping[str, P], Generic[P]):
     Args:
         group: of the entry points.
         rows: ours; their class is what other distributions have to give.
+        base: of the settings models.
     """
 
-    def __init__(self, group: str, *rows: P) -> None:
+    def __init__(self, group: str, *rows: P, base: type[Schema] = Schema) -> None:
         self.group = group
+        self._base = base
         self._ours = {row.name: row for row in rows}
         self._row_class = type(rows[0])
 
@@ -94,8 +97,8 @@ class Catalog(Mapping[str, P], Generic[P]):
         if row.name != name:
             return f"the entry point is called {name}, its plug-in {row.name}"
         model: Any = row.settings_class()
-        if not (isinstance(model, type) and issubclass(model, Schema)):
-            return f"{row.settings}: expected a subclass of Schema"
+        if not (isinstance(model, type) and issubclass(model, self._base)):
+            return f"{row.settings}: expected a subclass of {self._base.__name__}"
         if kind_of(model) != name:
             return f'{row.settings}: expected a field `kind: Literal["{name}"]`'
         return None
@@ -184,11 +187,19 @@ def kind_of(model: type[BaseModel]) -> str | None:
     return str(kinds[0]) if len(kinds) == 1 else None
 
 
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """All models an annotation names, those of catalogs included."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    elif isinstance(annotation, KindSection):
+def classes_in(annotation: Any) -> Iterator[type[Any]]:
+    """All classes an annotation names, the settings models of catalogs included."""
+    if isinstance(annotation, KindSection):
         yield from annotation.models
+    elif isinstance(annotation, type):
+        yield annotation
     for argument in get_args(annotation):
-        yield from models_in(argument)
+        yield from classes_in(argument)
+
+
+def models_in(field: FieldInfo) -> Iterator[type[BaseModel]]:
+    """All models that a field of a model may hold."""
+    for annotation in (field.annotation, *field.metadata):
+        for cls in classes_in(annotation):
+            if issubclass(cls, BaseModel):
+                yield cls

@@ -27,6 +27,13 @@ def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
     return (word for word in words if word[0].startswith(incomplete))
 
 
+def complete_planner(incomplete: str) -> Iterator[tuple[str, str]]:
+    """Kinds of route planners."""
+    from monstertruck_planners.route.catalog import ROUTE_PLANNERS
+
+    return ((name, row.doc) for name, row in ROUTE_PLANNERS.items() if name.startswith(incomplete))
+
+
 def complete_role(incomplete: str) -> list[str]:
     """Places for devices in a configuration."""
     from monstertruck_drivers.config import Devices

@@ -8,20 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.cli.options import ViaOption, parse_pose
+from monstertruckd.tools.cli.options import ViaOption, complete_planner, parse_pose
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
     from monstertruck_planners.route.api import RouteMap, RoutePlanner, RouteResult, Vehicle
     from monstertruck_runtime.map_files import WorldMap
-
-
-class PlannerKind(StrEnum):
-    """Route planners."""
-
-    HYBRID = "hybrid"
-    LATTICE = "lattice"
-    GRID_ASTAR = "grid_astar"
 
 
 class SteeringChoice(StrEnum):
@@ -49,7 +41,9 @@ def plan(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="map_server YAML file.", show_default=False)],
     start: PoseArgument,
     goal: PoseArgument,
-    planner: Annotated[PlannerKind, typer.Option("--planner", "-p", help="Kind of planner.")] = PlannerKind.HYBRID,
+    planner: Annotated[
+        str, typer.Option("--planner", "-p", help="Kind of route planner.", autocompletion=complete_planner)
+    ] = "hybrid",
     steering: Annotated[
         SteeringChoice, typer.Option(help="Front axle alone, both axles opposite, or both in every way.")
     ] = SteeringChoice.BOTH,
@@ -67,15 +61,15 @@ def plan(
     The truck is the author's; poses are of its base. Exit code by reason when there is no route.
     """
     from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
-    from monstertruck_planners.route.catalog import CONFIGS, make_planner
+    from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
     from monstertruck_runtime.clock import SECOND, WallClock
     from monstertruck_runtime.map_files import load_map
 
     world = load_map(map_file)
     ground = RouteMap.from_cells(world.cells, world.resolution, (*world.origin, 0.0), unknown.value)
     vehicle = Vehicle.truck(steering.value)
-    config = CONFIGS[planner.value](budget=budget, unknown=unknown.value)
-    planning = make_planner(vehicle, config)
+    settings: Any = ROUTE_PLANNERS.find(planner).settings_class()
+    planning = make_planner(vehicle, settings(kind=planner, budget=budget, unknown=unknown.value))
     clock = WallClock()
     if not reproducible:
         warm_up(planning)

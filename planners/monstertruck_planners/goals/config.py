@@ -5,16 +5,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_planners.local.config import AnyDeformer
-from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_planners.local.catalog import AnyDeformer
+from monstertruck_planners.route.catalog import AnyRoutePlanner
+from monstertruck_planners.route.config import HybridConfig
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import Steering
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0)]
-
-RouteKind = Annotated[HybridConfig | LatticeConfig, Field(discriminator="kind")]
-"""The planners whose routes can be driven as they are."""
 
 Rung = Literal["clear", "back_out", "wait", "replan"]
 
@@ -63,7 +61,7 @@ class LocalConfig(Schema):
 class PlannerConfig(Schema):
     """How goals are reached."""
 
-    route: RouteKind = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
+    route: AnyRoutePlanner = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
     """Route planner; its margin has to exceed what the gate keeps beside the truck; backward the lidar sees nothing"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""

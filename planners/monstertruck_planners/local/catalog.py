@@ -1,32 +1,49 @@
-"""Deformers by kind; their modules are loaded on use, in workers."""
+"""The local planners, which deform a route, by ``kind``; they run in workers."""
 
-import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
-from monstertruck_planners.local.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_runtime.errors import InputError
+from monstertruck_planners.local.config import DeformConfig
+from monstertruck_runtime.plugins import Catalog, Plugin
 
 if TYPE_CHECKING:
     from monstertruck_planners.local.api import Deformer
     from monstertruck_planners.route.api import Vehicle
 
-KINDS: dict[str, tuple[type[DeformConfig], str]] = {
-    "rsband": (RsbandConfig, "monstertruck_planners.local.rsband:Rsband"),
-    "rsband-as-published": (PublishedConfig, "monstertruck_planners.local.published:Published"),
-    "teb": (TebConfig, "monstertruck_planners.local.teb:Teb"),
-}
-"""Settings and "module:class" of each."""
+LOCAL_PLANNERS: Final = Catalog(
+    "monstertruck.local_planners",
+    Plugin(
+        name="rsband",
+        settings="monstertruck_planners.local.config:RsbandConfig",
+        implementation="monstertruck_planners.local.rsband:Rsband",
+        doc="Elastic band joined by Reeds-Shepp motions",
+        extra="planning",
+    ),
+    Plugin(
+        name="rsband-as-published",
+        settings="monstertruck_planners.local.config:PublishedConfig",
+        implementation="monstertruck_planners.local.published:Published",
+        doc="rsband_local_planner as published, with its faults",
+        extra="planning",
+    ),
+    Plugin(
+        name="teb",
+        settings="monstertruck_planners.local.config:TebConfig",
+        implementation="monstertruck_planners.local.teb:Teb",
+        doc="Timed elastic band",
+        extra="planning",
+    ),
+    base=DeformConfig,
+)
+"""A local planner is made from the vehicle and its settings; it is a ``Deformer``."""
+
+AnyDeformer = Annotated[DeformConfig, LOCAL_PLANNERS.section()]
+"""The configuration's section `planner.deform`."""
 
 
 def make_deformer(vehicle: "Vehicle", config: DeformConfig) -> "Deformer":
-    """Deformer of a configuration.
+    """Local planner of a configuration.
 
     Raises:
-        InputError: settings without a kind of deformer.
+        InputError: settings without a kind of local planner, or what it needs is not installed.
     """
-    for model, place in KINDS.values():
-        if type(config) is model:
-            module, name = place.split(":")
-            deformer: Deformer = getattr(importlib.import_module(module), name)(vehicle, config)
-            return deformer
-    raise InputError(f"deformer of {type(config).__name__}: expected the settings of one of {', '.join(KINDS)}")
+    return cast("Deformer", LOCAL_PLANNERS.implementation(config)(vehicle, config))

@@ -118,6 +118,3 @@ class TebConfig(DeformConfig):
     """m/s^2."""
     steering_rate: Positive = 1.0
     """Of an axle, rad/s."""
-
-
-AnyDeformer = Annotated[RsbandConfig | PublishedConfig | TebConfig, Field(discriminator="kind")]

@@ -1,25 +1,48 @@
-"""The kinds of route planners: which class makes routes for which settings. Light: classes are loaded on use."""
+"""The route planners by ``kind``."""
 
-import importlib
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
-from pydantic import Field
-
-from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
+from monstertruck_planners.route.config import GoalConfig
+from monstertruck_runtime.plugins import Catalog, Plugin
 
 if TYPE_CHECKING:
     from monstertruck_planners.route.api import RoutePlanner, Vehicle
 
-RouteConfig = Annotated[HybridConfig | LatticeConfig | GridAstarConfig, Field(discriminator="kind")]
-"""Settings of any route planner."""
+ROUTE_PLANNERS: Final = Catalog(
+    "monstertruck.route_planners",
+    Plugin(
+        name="hybrid",
+        settings="monstertruck_planners.route.config:HybridConfig",
+        implementation="monstertruck_planners.route.hybrid:HybridPlanner",
+        doc="Hybrid-A* with improvement until the budget is used up",
+        extra="planning",
+    ),
+    Plugin(
+        name="lattice",
+        settings="monstertruck_planners.route.config:LatticeConfig",
+        implementation="monstertruck_planners.route.lattice:LatticePlanner",
+        doc="State lattice with moves of exact radius",
+        extra="planning",
+    ),
+    Plugin(
+        name="grid_astar",
+        settings="monstertruck_planners.route.config:GridAstarConfig",
+        implementation="monstertruck_planners.route.grid_astar:GridAstarPlanner",
+        doc="The author's first planner: A* over a grid with inflated obstacles",
+        extra="planning",
+    ),
+    base=GoalConfig,
+)
+"""A route planner is made from the vehicle and its settings; it is a ``RoutePlanner``."""
 
-CONFIGS = {"hybrid": HybridConfig, "lattice": LatticeConfig, "grid_astar": GridAstarConfig}
+AnyRoutePlanner = Annotated[GoalConfig, ROUTE_PLANNERS.section()]
+"""The configuration's section `planner.route`."""
 
-_CLASSES = {"hybrid": "HybridPlanner", "lattice": "LatticePlanner", "grid_astar": "GridAstarPlanner"}
 
+def make_planner(vehicle: "Vehicle", config: GoalConfig) -> "RoutePlanner":
+    """Route planner of a configuration; loads numba.
 
-def make_planner(vehicle: "Vehicle", config: HybridConfig | LatticeConfig | GridAstarConfig) -> "RoutePlanner":
-    """Planner of the config's kind; loads numba."""
-    module = importlib.import_module(f"monstertruck_planners.route.{config.kind}")
-    planner: RoutePlanner = getattr(module, _CLASSES[config.kind])(vehicle, config)
-    return planner
+    Raises:
+        InputError: settings without a kind of route planner, or what it needs is not installed.
+    """
+    return cast("RoutePlanner", ROUTE_PLANNERS.implementation(config)(vehicle, config))

@@ -1,24 +1,56 @@
-"""The table of trackers: which class is behind a ``kind``, loaded on use."""
+"""The path trackers by ``kind``."""
 
-import importlib
-from typing import Final, cast
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.api import Tracker
 from monstertruck_planners.track.config import TrackerConfig
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.plugins import Catalog, Plugin
 
-TRACKERS: Final = {
-    "pure_pursuit": "monstertruck_planners.track.pure_pursuit:PurePursuit",
-    "stanley": "monstertruck_planners.track.stanley:Stanley",
-    "fuzzy": "monstertruck_planners.track.fuzzy:Fuzzy",
-    "lqr": "monstertruck_planners.track.lqr:Lqr",
-    "mpc": "monstertruck_planners.track.mpc:Mpc",
-}
-"""Module and class by kind."""
+if TYPE_CHECKING:
+    from monstertruck_planners.track.api import Tracker
+
+TRACKERS: Final = Catalog(
+    "monstertruck.trackers",
+    Plugin(
+        name="pure_pursuit",
+        settings="monstertruck_planners.track.config:PurePursuitConfig",
+        implementation="monstertruck_planners.track.pure_pursuit:PurePursuit",
+        doc="Arc through a point ahead on the path",
+    ),
+    Plugin(
+        name="stanley",
+        settings="monstertruck_planners.track.config:StanleyConfig",
+        implementation="monstertruck_planners.track.stanley:Stanley",
+        doc="Feedback of the leading axle's distance from the path",
+    ),
+    Plugin(
+        name="fuzzy",
+        settings="monstertruck_planners.track.config:FuzzyConfig",
+        implementation="monstertruck_planners.track.fuzzy:Fuzzy",
+        doc="Fuzzy controller of rsband_local_planner",
+    ),
+    Plugin(
+        name="lqr",
+        settings="monstertruck_planners.track.config:LqrConfig",
+        implementation="monstertruck_planners.track.lqr:Lqr",
+        doc="Linear-quadratic regulator with preview of the path",
+    ),
+    Plugin(
+        name="mpc",
+        settings="monstertruck_planners.track.config:MpcConfig",
+        implementation="monstertruck_planners.track.mpc:Mpc",
+        doc="Model-predictive control with limits of angles and rates",
+        extra="planning",
+    ),
+    base=TrackerConfig,
+)
+"""A tracker is made from its settings and the truck's geometry; it is a ``Tracker``."""
+
+AnyTracker = Annotated[TrackerConfig, TRACKERS.section()]
+"""The configuration's section `tracker`."""
 
 
-def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> Tracker:
+def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "Tracker":
     """The tracker of a configuration.
 
     Args:
@@ -28,12 +60,4 @@ def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> Tracker
     Raises:
         InputError: no such kind, or what it needs is not installed.
     """
-    kind = str(vars(config).get("kind"))
-    if kind not in TRACKERS:
-        raise InputError(f"tracker.kind {kind!r}: expected one of {', '.join(TRACKERS)}")
-    module, name = TRACKERS[kind].split(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except ImportError as error:
-        raise InputError(f"tracker.kind {kind}: needs the extra [planning]: {error}") from error
-    return cast("Tracker", found(config, steering))
+    return cast("Tracker", TRACKERS.implementation(config)(config, steering))

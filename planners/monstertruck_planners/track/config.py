@@ -6,7 +6,7 @@ Light on purpose: reading a configuration loads no tracker. ``catalog`` names th
 import math
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Discriminator, Field, model_validator
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import Steering
@@ -161,6 +161,3 @@ class MpcConfig(LqrConfig):
     kind: Literal["mpc"]  # type: ignore[assignment]
     iterations: Annotated[int, Field(ge=10, le=2000)] = 200
     """Of the solver, at most."""
-
-
-AnyTracker = Annotated[PurePursuitConfig | StanleyConfig | FuzzyConfig | LqrConfig | MpcConfig, Discriminator("kind")]

@@ -15,8 +15,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
 from monstertruck_planners.track.actuator import Pose
 from monstertruck_planners.track.api import Command, TruckState
-from monstertruck_planners.track.catalog import build_tracker
-from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.ground import Ground
 from monstertruck_planners.track.line import Line, Progress
 from monstertruck_runtime.clock import SECOND
@@ -48,7 +47,7 @@ TURNED: Final = 0.02
 class TrackSetup:
     """What the step is made for."""
 
-    config: TrackerConfig
+    config: AnyTracker
     steering: FourWheelSteering
     footprint: Footprint
     lidar: Pose

@@ -1,39 +1,52 @@
-"""Inputs and outputs of steps as JSON, exactly, for another machine: only registered classes are ever built."""
+"""Inputs and outputs of steps as JSON, exactly, for another machine: only known classes are ever built."""
 
 import base64
 import dataclasses
-from collections.abc import Iterable
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import numpy as np
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.plugins import classes_in
 from monstertruck_schemas.base import Schema
 
 _DTYPES: Final = ("float64", "int8", "uint8", "int64")
 
 
 class StepCodec:
-    """Converts trees of registered classes, arrays, tuples, lists, dicts with text keys, paths and scalars.
+    """Converts trees of known classes, arrays, tuples, lists, dicts with text keys, paths and scalars.
 
     Args:
-        classes: dataclasses and ``Schema`` models that may travel; enums too.
+        roots: dataclasses and ``Schema`` models that may travel. Known are these and every dataclass, model and enum
+            that their fields hold, the settings of plug-ins included.
     """
 
-    def __init__(self, classes: Iterable[type[Any]]) -> None:
-        self._classes = {cls.__name__: cls for cls in classes}
+    def __init__(self, *roots: type[Any]) -> None:
+        self._roots = roots
+
+    @cached_property
+    def _classes(self) -> dict[str, type[Any]]:
+        found: dict[str, type[Any]] = {}
+        waiting = list(self._roots)
+        while waiting:
+            cls = waiting.pop()
+            if found.setdefault(_name(cls), cls) is cls and not issubclass(cls, Enum):
+                held = {inner for field in _annotations(cls) for inner in classes_in(field) if _travels(inner)}
+                waiting += held - set(found.values())
+        return found
 
     def to_json(self, value: Any) -> Any:
         """The value as what JSON can say.
 
         Raises:
-            InputError: a class that is not registered.
+            InputError: a class that is not known.
         """
         match value:
             case Enum() if self._knows(value):
-                return {"enum": type(value).__name__, "value": value.value}
+                return {"enum": _name(type(value)), "value": value.value}
             case None | bool() | int() | float() | str():
                 return value
             case np.ndarray() if str(value.dtype) in _DTYPES:
@@ -51,7 +64,7 @@ class StepCodec:
             raise InputError(f"step: no {type(value).__name__} travels to another machine")
         names = type(value).model_fields if isinstance(value, Schema) else [f.name for f in dataclasses.fields(value)]
         return {
-            "class": type(value).__name__,
+            "class": _name(type(value)),
             "fields": {field: self.to_json(getattr(value, field)) for field in names},
         }
 
@@ -67,7 +80,7 @@ class StepCodec:
             raise InputError(f"step: not readable: {type(error).__name__}: {error}") from error
 
     def _knows(self, value: Any) -> bool:
-        return self._classes.get(type(value).__name__) is type(value)
+        return self._classes.get(_name(type(value))) is type(value)
 
     def _back(self, value: Any) -> Any:
         match value:
@@ -94,3 +107,20 @@ class StepCodec:
         if not issubclass(found, base):
             raise TypeError(f"{name} is no {base.__name__}")
         return found
+
+
+def _name(cls: type[Any]) -> str:
+    """Plug-ins of two distributions may use one class name."""
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _travels(cls: type[Any]) -> bool:
+    return dataclasses.is_dataclass(cls) or issubclass(cls, Schema | Enum)
+
+
+def _annotations(cls: type[Any]) -> list[Any]:
+    """Of the fields of a dataclass or model."""
+    if issubclass(cls, Schema):
+        return [part for field in cls.model_fields.values() for part in (field.annotation, *field.metadata)]
+    hints = get_type_hints(cls, include_extras=True)
+    return [hints[field.name] for field in dataclasses.fields(cls)]

@@ -8,7 +8,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.plugins import Catalog, Plugin, kind_of, models_in
+from monstertruck_runtime.plugins import Catalog, Plugin, classes_in, kind_of
 from monstertruck_schemas import entry_points
 from monstertruck_schemas.base import Schema
 
@@ -88,7 +88,7 @@ def test_another_distribution_adds_a_kind(install):
     config = read.validate_json('{"kind": "top", "turns": 5}')
     assert config.turns == 5
     assert catalog.implementation(config) is type(config)
-    assert list(models_in(read._type))[1:] == [BallConfig, CubeConfig, type(config)]
+    assert list(classes_in(read._type))[1:] == [BallConfig, CubeConfig, type(config)]
 
 
 def test_what_is_broken_is_named_and_left_out(install):

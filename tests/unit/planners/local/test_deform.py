@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.local.api import Guide, Memory, Session
-from monstertruck_planners.local.catalog import KINDS, make_deformer
+from monstertruck_planners.local.catalog import LOCAL_PLANNERS, make_deformer
 from monstertruck_planners.local.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.local.core import Local, Surveyor, onward, passed, rest_of
 from monstertruck_planners.local.elastic_band import cover_of
@@ -212,7 +212,7 @@ def test_message_poses_are_those_of_the_base():
 
 
 def test_catalog_has_the_kinds_and_refuses_others():
-    for kind, (model, _) in KINDS.items():
+    for kind, model in LOCAL_PLANNERS.settings.items():
         assert model().kind == kind
         assert make_deformer(CARS["2ws"], model()).vehicle is CARS["2ws"]
     with pytest.raises(InputError, match="rsband, rsband-as-published, teb"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
-from monstertruck_planners.route.catalog import CONFIGS, make_planner
+from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_moves
@@ -75,9 +75,9 @@ def test_the_authors_grid_costs():
     assert result.poses[5:-5, 2] == pytest.approx(np.arctan2(step[5:-4, 1], step[5:-4, 0]))
 
 
-@pytest.mark.parametrize("kind", CONFIGS)
+@pytest.mark.parametrize("kind", ROUTE_PLANNERS)
 def test_every_kind_plans(kind):
-    planner = make_planner(CAR, CONFIGS[kind](effort=2000))
+    planner = make_planner(CAR, ROUTE_PLANNERS.settings[kind](effort=2000))
     warm_up(planner)
     result = planner.plan(RouteMap.from_cells(np.zeros((60, 60), np.int8), 0.1), (1, 1, 0), (4, 4, 0))
     assert result.ok

@@ -101,10 +101,10 @@ def test_calls_that_make_no_sense_are_refused():
     "value",
     [
         {"class": "Popen", "fields": {}},
-        {"class": "Footprint", "fields": {"length": -1.0}},
+        {"class": "monstertruck_planners.collision.Footprint", "fields": {"length": -1.0}},
         {"array": "object", "shape": [1], "data": ""},
         {"array": "float64", "shape": [3], "data": "AAAA"},
-        {"enum": "Reason", "value": "whatever"},
+        {"enum": "monstertruck_schemas.reasons.Reason", "value": "whatever"},
         {"unknown": 1},
     ],
 )
@@ -141,4 +141,4 @@ def test_whatever_the_travelling_classes_hold_travels_too():
         for part in parts(annotation)
         if isinstance(part, type) and (issubclass(part, Schema | Enum) or dataclasses.is_dataclass(part))
     }
-    assert {cls.__name__ for cls in held - known} == {"TrackerConfig"}, "the base of those that travel"
+    assert not held - known
