@@ -331,10 +331,7 @@ def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
         if isinstance(part, int):
             continue
         here = [
-            inner
-            for outer in here
-            if part in outer.model_fields
-            for inner in models_in(outer.model_fields[part])
+            inner for outer in here if part in outer.model_fields for inner in models_in(outer.model_fields[part])
         ] or here
     return here
 
