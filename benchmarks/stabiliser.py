@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from monstertruck_drivers.ax12.emulator import TrueJoints
 from monstertruck_estimation.scan_tilt import plane_tilt
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
-from monstertruck_sim.robot import TrueJoints
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig

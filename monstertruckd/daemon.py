@@ -6,13 +6,14 @@ order, so the gate commands neutral while actuators and recorder still listen.
 
 import asyncio
 import secrets
-from collections.abc import AsyncIterator, Collection, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from monstertruck_drivers.catalog import Duty
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link import Port
 from monstertruck_planners.goals import rpc as goal_rpc
@@ -32,11 +33,10 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
-from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners, calibration
 from monstertruckd.assembly.cabling import Cabling
-from monstertruckd.assembly.devices import build_drivers, build_monitors
+from monstertruckd.assembly.devices import build_drivers, of_duty
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
@@ -54,9 +54,6 @@ from monstertruckd.host.versions import running_versions
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.digest import LogDigest
 from monstertruckd.recorder.recorder import Recorder
-
-ACTUATORS = (*SHAFTS, "steering")
-SENSORS = ("lidar", "compass", "stabiliser", "camera")
 
 
 class Daemon:
@@ -102,7 +99,7 @@ class Daemon:
             self._cabling.waiting,
             self._cabling.on_hubs,
         )
-        self._drivers = build_drivers(config, self._cabling, clock, self.bus)
+        self._drivers = build_drivers(config, self._cabling, self._computer, clock, self.bus)
         self._body = Body.of(config)
         self.gate = self._build_gate()
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
@@ -137,14 +134,12 @@ class Daemon:
             scope("estimation") as estimation,
             scope("planners") as planners,
         ):
-            self._start_devices(actuators, ACTUATORS, OnBug.EXIT)
+            self._start_drivers(actuators, OnBug.EXIT, Duty.ACTUATOR)
             self._start(gate, self.gate, OnBug.EXIT)
             self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
-            self._start_devices(sensors, SENSORS, OnBug.FAIL)
-            for service in build_monitors(self.config, self._computer, self.clock, self.bus):
-                self._start(sensors, service)
+            self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._places):
@@ -240,10 +235,10 @@ class Daemon:
             supervise(service, policy or RestartPolicy(), self.clock, self._board.report, rng, on_bug),
         )
 
-    def _start_devices(self, where: Scope, roles: Collection[str], on_bug: OnBug) -> None:
-        for role, device in self.config.devices.present().items():
-            if role in roles:
-                self._start(where, self._drivers[role], on_bug, device.restart)
+    def _start_drivers(self, where: Scope, on_bug: OnBug, *duties: Duty) -> None:
+        devices = self.config.devices.present()
+        for role, driver in of_duty(self._drivers, *duties).items():
+            self._start(where, driver, on_bug, devices[role].restart if role in devices else None)
 
     def _build_rpc(self) -> Rpc:
         rpc = Rpc(self.clock)

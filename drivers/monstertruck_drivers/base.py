@@ -1,13 +1,16 @@
-"""What every device folder has in common: the emulator's frame and the physics it may ask for."""
+"""What every device folder has in common: the emulator's interface and the physics it may ask for."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol, SupportsIndex
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd, EmulatedPort, MemoryPort
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.threads import Offload, in_thread
 
 
 class Trail(bytearray):
@@ -40,6 +43,22 @@ class Emulator(Protocol):
 
         Raises:
             InputError: unknown fault or bad value; the text lists what is known.
+        """
+        ...
+
+
+class FileEmulator(Protocol):
+    """A part of the computer that shows in files below /proc and /sys."""
+
+    async def run(self) -> None:
+        """Bring them up to date until cancelled."""
+        ...
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
         """
         ...
 
@@ -149,3 +168,63 @@ class ViewSource(Protocol):
             (n,), float64.
         """
         ...
+
+
+class Physics(Protocol):
+    """The simulated world, as far as devices feel it."""
+
+    @property
+    def lidar(self) -> RangeSource:
+        """What the lidar sees."""
+        ...
+
+    @property
+    def view(self) -> ViewSource:
+        """What stands around the truck."""
+        ...
+
+    @property
+    def motors(self) -> tuple[MotorPlant, ...]:
+        """Of the driven shafts."""
+        ...
+
+    @property
+    def servos(self) -> ServoPlant:
+        """Of the axles, with the inputs of their controller."""
+        ...
+
+    @property
+    def compass(self) -> AttitudeSource:
+        """Magnetic heading and tilt."""
+        ...
+
+    def battery_volts(self, time_ns: int) -> float:
+        """Voltage behind the battery's divider."""
+        ...
+
+    def carry_lidar(self, joints: JointSource) -> None:
+        """Put the lidar onto a mount with joints."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatorSetup:
+    """What an emulated device is made from."""
+
+    role: str
+    settings: Any
+    """The driver's; None = defaults."""
+    clock: Clock
+    physics: Physics
+    seed: int = 0
+    """Of the device's noise."""
+    port: EmulatedPort = field(default_factory=lambda: MemoryPort(""))
+    """Where it is plugged in."""
+    root: Path = Path()
+    """Folder with proc and sys of the emulated computer."""
+    offload: Offload = in_thread
+    """Where what takes long is computed."""
+
+
+EmulatorFactory = Callable[[EmulatorSetup], Any]
+"""Makes an ``Emulator``; of a monitor, a ``FileEmulator``."""

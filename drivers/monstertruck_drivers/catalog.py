@@ -1,165 +1,333 @@
-"""The table of device kinds: what ``kind:`` means, which module implements it, and what it is for.
+"""The tables of device roles and of device kinds, from which everything that lists devices is derived.
 
-Modules are loaded on use, so that listing kinds, checking a configuration and ``--help`` cost nothing.
+A role is what a device is for: its key in the configuration, the topics it writes and reads, when it starts. A kind is
+a product with its driver: what ``kind:`` means. Both may come from other distributions: ``docs/writing-a-driver.md``.
+Modules of a kind are loaded on use, so that listing kinds, checking a configuration and ``--help`` cost nothing.
 """
 
-import importlib
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final, Literal, NamedTuple, cast
 
-from monstertruck_drivers.base import Emulator
+from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
+from monstertruck_drivers.base import EmulatorFactory
+from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
+from monstertruck_drivers.os4000.protocol import BAUD as OS4000_BAUD
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.base import Schema
+from monstertruck_runtime.plugins import Catalog, Plugin, load
+from monstertruck_schemas import topics
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
+from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
 
 Probe = Callable[..., Awaitable[dict[str, Any]]]
+"""Identifies a device; takes what the driver opens, the clock, and the driver's settings (None = defaults)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """One kind of device."""
+class Duty(StrEnum):
+    """What the truck needs a device for."""
+
+    ACTUATOR = "actuator"
+    """Carries out the gate's commands; outlives the gate, and a bug in its driver ends the daemon."""
+    SENSOR = "sensor"
+    MONITOR = "monitor"
+    """Reads the computer's own files; configured under ``monitors``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Role:
+    """What a device is for, whatever its kind."""
 
     name: str
-    role: str
-    """Place in the configuration's ``devices``, or ``monitors``."""
-    package: str
-    driver: str
-    emulator: str
-    config: str
-    baud: int
-    """Of its serial line; 0 = has none."""
+    """Key in the configuration, name of the service, frame of what it measures."""
+    duty: Duty
     doc: str
-    asked: Literal["port", "path", "machine"] = "port"
-    """What ``probe`` takes: an open port and the clock, the path of a node, or nothing."""
-
-    def driver_class(self) -> type[Any]:
-        """Class of the driver (a ``Service``)."""
-        return cast("type[Any]", self._load("driver", self.driver))
-
-    def emulator_class(self) -> Callable[..., Emulator]:
-        """Class of the emulator."""
-        return cast("Callable[..., Emulator]", self._load("emulator", self.emulator))
-
-    def config_class(self) -> type[Schema]:
-        """Class of the driver's settings."""
-        return cast("type[Schema]", self._load("config", self.config))
-
-    def probe(self) -> Probe:
-        """Coroutine function that identifies a device; its arguments depend on ``asked``."""
-        return cast("Probe", self._load("probe", "probe"))
-
-    def _load(self, module: str, attribute: str) -> Any:
-        return getattr(importlib.import_module(f"{self.package}.{module}"), attribute)
+    writes: Mapping[str, Topic[Any]]
+    """Topics by the driver's parameter. The first one is the role's own; another one is left out (the driver gets None)
+    where another device that is configured has it as its own."""
+    reads: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    """Topics of which the driver gets the newest message, by its parameter."""
+    frame: bool = False
+    """Its mount is in the tree of frames."""
+    start: int = 100
+    """Rank among the devices that start again behind a returned hub."""
 
 
-KINDS = (
-    Kind(
-        "hokuyo_urg",
-        "lidar",
-        "monstertruck_drivers.hokuyo_urg",
-        "HokuyoDriver",
-        "HokuyoEmulator",
-        "HokuyoConfig",
-        115200,
-        "Hokuyo URG-04LX laser scanner (SCIP 1.1 and 2.0)",
+def _shaft(index: int) -> Role:
+    ordinal = ("first", "second", "third", "fourth")[index]
+    return Role(
+        name=SHAFTS[index],
+        duty=Duty.ACTUATOR,
+        doc=f"Controller of the body's {ordinal} driven shaft{', if it has one' if index else ''}",
+        writes={"out": DRIVES[index]},
+        reads={"commands": CMD_DRIVES[index]},
+        start=index,
+    )
+
+
+LIDAR: Final = Role(
+    name=DeviceRole.LIDAR,
+    duty=Duty.SENSOR,
+    doc="Laser scanner",
+    writes={"out": topics.SCAN},
+    frame=True,
+    start=12,
+)
+DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
+STEERING: Final = Role(
+    name=DeviceRole.STEERING,
+    duty=Duty.ACTUATOR,
+    doc="Servo controller of the axles, which may measure the battery as well",
+    writes={"out": topics.STEERING, "battery": topics.BATTERY},
+    reads={"commands": topics.CMD_STEERING, "drive": topics.DRIVE},
+    start=10,
+)
+COMPASS: Final = Role(
+    name=DeviceRole.COMPASS,
+    duty=Duty.SENSOR,
+    doc="Heading and tilt",
+    writes={"out": topics.COMPASS},
+    frame=True,
+    start=11,
+)
+STABILISER: Final = Role(
+    name=DeviceRole.STABILISER,
+    duty=Duty.SENSOR,
+    doc=(
+        "Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"
     ),
-    Kind(
-        "epos",
-        "drive",
-        "monstertruck_drivers.epos",
-        "EposDriver",
-        "EposEmulator",
-        "EposConfig",
-        38400,
-        "maxon EPOS 24/1 motor controller (RS232)",
+    writes={"out": topics.STABILISER},
+    reads={"commands": topics.PLAN_STABILISER},
+    frame=True,
+    start=13,
+)
+CAMERA: Final = Role(
+    name=DeviceRole.CAMERA,
+    duty=Duty.SENSOR,
+    doc="Supervision camera",
+    writes={"out": topics.CAMERA},
+    frame=True,
+    start=14,
+)
+BATTERY: Final = Role(
+    name=DeviceRole.BATTERY,
+    duty=Duty.MONITOR,
+    doc="Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input",
+    writes={"out": topics.BATTERY},
+    reads={"drive": topics.DRIVE},
+)
+LINK: Final = Role(
+    name=DeviceRole.LINK, duty=Duty.MONITOR, doc="Wi-Fi or Ethernet of the computer", writes={"out": topics.LINK}
+)
+HOST: Final = Role(
+    name=DeviceRole.HOST, duty=Duty.MONITOR, doc="Load and heat of the computer", writes={"out": topics.HOST}
+)
+OUR_ROLES: Final = (
+    LIDAR,
+    DRIVE,
+    DRIVE_2,
+    DRIVE_3,
+    DRIVE_4,
+    STEERING,
+    COMPASS,
+    STABILISER,
+    CAMERA,
+    BATTERY,
+    LINK,
+    HOST,
+)
+"""In the order in which they are listed and started."""
+
+
+class UsbIdentity(NamedTuple):
+    """How a device shows on USB; the emulated computer shows it so."""
+
+    usb_id: str
+    """``vendor:product``."""
+    title: str
+    node: Literal["ttyACM", "ttyUSB", "video"]
+    """Kind of its device node."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceKind(Plugin):
+    """One kind of device; ``implementation`` is its driver.
+
+    A driver is a ``Service``, made with its settings, what it opens, the clock, and by name the ends of its role's
+    topics, ``events`` and ``name``.
+    """
+
+    roles: tuple[Role, ...]
+    """What it can be used for."""
+    emulator: str
+    """Place ``module:function`` of its ``EmulatorFactory``."""
+    probe: str
+    """Place ``module:function`` of its ``Probe``."""
+    opens: Literal["serial", "video", "computer"] = "serial"
+    """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
+    baud: int | None = None
+    """Of its serial line; None = USB from end to end, any will do."""
+    usb: UsbIdentity | None = None
+
+    @property
+    def role(self) -> Role:
+        """What it is used for first of all."""
+        return self.roles[0]
+
+    def emulator_factory(self) -> EmulatorFactory:
+        """Makes an emulated device; loads its module."""
+        return cast("EmulatorFactory", load(self.emulator))
+
+    def probe_function(self) -> Probe:
+        """Identifies a device; loads its module."""
+        return cast("Probe", load(self.probe))
+
+
+class DeviceCatalog(Catalog[DeviceKind]):
+    """All kinds of devices, and the roles they fill: ours, then those that kinds of other distributions bring."""
+
+    def __init__(self, *rows: DeviceKind) -> None:
+        super().__init__("monstertruck.devices", *rows)
+        self._roles = {role.name: role for role in OUR_ROLES}
+
+    def fault(self, name: str, row: Any) -> str | None:
+        """What is wrong with a kind of another distribution, or with a role it brings."""
+        if fault := super().fault(name, row):
+            return fault
+        for role in row.roles:
+            if not role.name.isidentifier() or not role.writes:
+                return f"role {role.name!r}: expected an identifier that writes a topic"
+            if self._roles.get(role.name, role) != role:
+                return f"role {role.name}: there is another one of that name"
+            if not_its := [t.name for t in role.writes.values() if t.writer is not Writer.DRIVER]:
+                return f"role {role.name}: drivers do not write {', '.join(not_its)}"
+            if unknown := [t.name for t in role.writes.values() if topics.BY_NAME.get(t.name) != t]:
+                return f"role {role.name}: {', '.join(unknown)} is no entry point of monstertruck.topics"
+        self._roles.update({role.name: role for role in row.roles})
+        return None
+
+    @property
+    def roles(self) -> Mapping[str, Role]:
+        """Roles by name, in the order in which they are listed and started."""
+        len(self)  # reads the entry points
+        return self._roles
+
+    def of_role(self, role: str) -> tuple[DeviceKind, ...]:
+        """Kinds that can fill a role."""
+        return tuple(kind for kind in self.values() if role in (known.name for known in kind.roles))
+
+    def named(self, name: str) -> DeviceKind:
+        """A kind by its name, or the first one of a role.
+
+        Raises:
+            InputError: there is none.
+        """
+        kinds = (self[name],) if name in self else self.of_role(name)
+        if not kinds:
+            known = ", ".join(f"{kind.name} ({kind.role.name})" for kind in self.values())
+            raise InputError(f"unknown device {name!r}; known: {known}")
+        return kinds[0]
+
+
+DEVICES: Final = DeviceCatalog(
+    DeviceKind(
+        name="hokuyo_urg",
+        doc="Hokuyo URG-04LX laser scanner (SCIP 1.1 and 2.0)",
+        roles=(LIDAR,),
+        settings="monstertruck_drivers.hokuyo_urg.config:HokuyoConfig",
+        implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
+        emulator="monstertruck_drivers.hokuyo_urg.emulator:emulated",
+        probe="monstertruck_drivers.hokuyo_urg.probe:probe",
+        usb=UsbIdentity("15d1:0000", "URG-Series USB Driver", "ttyACM"),
     ),
-    Kind(
-        "maestro",
-        "steering",
-        "monstertruck_drivers.maestro",
-        "MaestroDriver",
-        "MaestroEmulator",
-        "MaestroConfig",
-        115200,
-        "Pololu Micro Maestro 6 servo controller with battery input",
+    DeviceKind(
+        name="epos",
+        doc="maxon EPOS 24/1 motor controller (RS232)",
+        roles=(DRIVE, DRIVE_2, DRIVE_3, DRIVE_4),
+        settings="monstertruck_drivers.epos.config:EposConfig",
+        implementation="monstertruck_drivers.epos.driver:EposDriver",
+        emulator="monstertruck_drivers.epos.emulator:emulated",
+        probe="monstertruck_drivers.epos.probe:probe",
+        baud=EPOS_BAUD,
+        usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
     ),
-    Kind(
-        "ax12",
-        "stabiliser",
-        "monstertruck_drivers.ax12",
-        "Ax12Driver",
-        "Ax12Bus",
-        "Ax12Config",
-        1_000_000,
-        "Two Dynamixel AX-12A on a USB2Dynamixel",
+    DeviceKind(
+        name="maestro",
+        doc="Pololu Micro Maestro 6 servo controller with battery input",
+        roles=(STEERING,),
+        settings="monstertruck_drivers.maestro.config:MaestroConfig",
+        implementation="monstertruck_drivers.maestro.driver:MaestroDriver",
+        emulator="monstertruck_drivers.maestro.emulator:emulated",
+        probe="monstertruck_drivers.maestro.probe:probe",
+        usb=UsbIdentity("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
     ),
-    Kind(
-        "webcam",
-        "camera",
-        "monstertruck_drivers.webcam",
-        "WebcamDriver",
-        "WebcamEmulator",
-        "WebcamConfig",
-        115200,
-        "V4L2 camera with motion JPEG",
-        asked="path",
+    DeviceKind(
+        name="ax12",
+        doc="Two Dynamixel AX-12A on a USB2Dynamixel",
+        roles=(STABILISER,),
+        settings="monstertruck_drivers.ax12.config:Ax12Config",
+        implementation="monstertruck_drivers.ax12.driver:Ax12Driver",
+        emulator="monstertruck_drivers.ax12.emulator:emulated",
+        probe="monstertruck_drivers.ax12.probe:probe",
+        baud=AX12_BAUD,
+        usb=UsbIdentity("0403:6001", "USB2Dynamixel", "ttyUSB"),
     ),
-    Kind(
-        "iio",
-        "battery",
-        "monstertruck_drivers.battery",
-        "IioBatteryDriver",
-        "IioEmulator",
-        "IioConfig",
-        0,
-        "Battery voltage by a converter of Linux Industrial-IO",
-        asked="machine",
+    DeviceKind(
+        name="webcam",
+        doc="V4L2 camera with motion JPEG",
+        roles=(CAMERA,),
+        settings="monstertruck_drivers.webcam.config:WebcamConfig",
+        implementation="monstertruck_drivers.webcam.driver:WebcamDriver",
+        emulator="monstertruck_drivers.webcam.emulator:emulated",
+        probe="monstertruck_drivers.webcam.probe:probe",
+        opens="video",
+        usb=UsbIdentity("046d:080a", "Webcam C905", "video"),
     ),
-    Kind(
-        "link_quality",
-        "link",
-        "monstertruck_drivers.link_quality",
-        "LinkQualityDriver",
-        "NetworkEmulator",
-        "LinkQualityConfig",
-        0,
-        "Wi-Fi and Ethernet links of the computer",
-        asked="machine",
+    DeviceKind(
+        name="iio",
+        doc="Battery voltage by a converter of Linux Industrial-IO",
+        roles=(BATTERY,),
+        settings="monstertruck_drivers.battery.config:IioConfig",
+        implementation="monstertruck_drivers.battery.driver:IioBatteryDriver",
+        emulator="monstertruck_drivers.battery.emulator:emulated",
+        probe="monstertruck_drivers.battery.probe:probe",
+        opens="computer",
     ),
-    Kind(
-        "host_health",
-        "host",
-        "monstertruck_drivers.host_health",
-        "HostHealthDriver",
-        "HostEmulator",
-        "HostHealthConfig",
-        0,
-        "Load, heat, memory and disk of the computer",
-        asked="machine",
+    DeviceKind(
+        name="link_quality",
+        doc="Wi-Fi and Ethernet links of the computer",
+        roles=(LINK,),
+        settings="monstertruck_drivers.link_quality.config:LinkQualityConfig",
+        implementation="monstertruck_drivers.link_quality.driver:LinkQualityDriver",
+        emulator="monstertruck_drivers.link_quality.emulator:emulated",
+        probe="monstertruck_drivers.link_quality.probe:probe",
+        opens="computer",
     ),
-    Kind(
-        "os4000",
-        "compass",
-        "monstertruck_drivers.os4000",
-        "Os4000Driver",
-        "Os4000Emulator",
-        "Os4000Config",
-        19200,
-        "OceanServer OS4000 compass",
+    DeviceKind(
+        name="host_health",
+        doc="Load, heat, memory and disk of the computer",
+        roles=(HOST,),
+        settings="monstertruck_drivers.host_health.config:HostHealthConfig",
+        implementation="monstertruck_drivers.host_health.driver:HostHealthDriver",
+        emulator="monstertruck_drivers.host_health.emulator:emulated",
+        probe="monstertruck_drivers.host_health.probe:probe",
+        opens="computer",
+    ),
+    DeviceKind(
+        name="os4000",
+        doc="OceanServer OS4000 compass",
+        roles=(COMPASS,),
+        settings="monstertruck_drivers.os4000.config:Os4000Config",
+        implementation="monstertruck_drivers.os4000.driver:Os4000Driver",
+        emulator="monstertruck_drivers.os4000.emulator:emulated",
+        probe="monstertruck_drivers.os4000.probe:probe",
+        baud=OS4000_BAUD,
+        usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
 )
-BY_NAME = {kind.name: kind for kind in KINDS}
-BY_ROLE = {kind.role: kind for kind in KINDS}
 
 
-def find_kind(name: str) -> Kind:
-    """A kind by its name or by its role.
-
-    Raises:
-        InputError: there is none.
-    """
-    kind = BY_NAME.get(name) or BY_ROLE.get(name)
-    if kind is None:
-        known = ", ".join(f"{k.name} ({k.role})" for k in KINDS)
-        raise InputError(f"unknown device {name!r}; known: {known}")
-    return kind
+def start_order() -> tuple[str, ...]:
+    """Roles in the order in which they start behind a returned hub."""
+    roles = [role for role in DEVICES.roles.values() if role.duty is not Duty.MONITOR]
+    return tuple(role.name for role in sorted(roles, key=lambda role: role.start))

@@ -1,25 +1,32 @@
-"""Which devices a robot has, where they hang, and how they are set: the sections ``devices`` and ``monitors``."""
+"""Which devices a robot has, where they hang, and how they are set: the sections ``devices`` and ``monitors``.
 
+Both have a key for every role of the catalog, and take the settings of every kind that fills the role.
+"""
+
+from collections.abc import Iterator
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
-from monstertruck_drivers.ax12.config import Ax12Config
-from monstertruck_drivers.battery.config import IioConfig
-from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.link_quality.config import LinkQualityConfig
-from monstertruck_drivers.maestro.config import MaestroConfig
-from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, Role
+from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import place
-from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import SHAFTS
+
+if TYPE_CHECKING:
+    from monstertruck_drivers.ax12.config import Ax12Config
+    from monstertruck_drivers.battery.config import IioConfig
+    from monstertruck_drivers.epos.config import EposConfig
+    from monstertruck_drivers.host_health.config import HostHealthConfig
+    from monstertruck_drivers.link_quality.config import LinkQualityConfig
+    from monstertruck_drivers.maestro.config import MaestroConfig
 
 C = TypeVar("C", bound=Schema)
 
@@ -29,8 +36,8 @@ class PortConfig(Schema):
 
     path: Path
     """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
-    baud: Annotated[int, Field(ge=4800, le=1_000_000)] = 115200
-    """Bits per second; USB-CDC devices ignore it"""
+    baud: Annotated[int, Field(ge=4800, le=1_000_000)] | None = None
+    """Bits per second; null = the device's own. USB-CDC devices ignore it"""
 
 
 def _way(port: Any) -> str:
@@ -53,33 +60,34 @@ class Device(Schema, Generic[C]):
     driver: C
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> DeviceKind:
         """What the driver's settings say it is."""
-        return str(vars(self.driver)["kind"])
+        return kind_of(self.driver)
+
+    @model_validator(mode="after")
+    def _own_baud(self) -> Self:
+        if self.port.baud is not None:
+            return self
+        port = self.port.model_copy(update={"baud": self.kind.baud or BAUD})
+        return self.model_copy(update={"port": port})
 
 
-class Devices(Schema):
+def kind_of(settings: Schema) -> DeviceKind:
+    """Kind of device that has such settings."""
+    return DEVICES[str(vars(settings)["kind"])]
+
+
+class _Devices(Schema):
     """The robot's devices by role; a role that is left out is not there."""
 
-    lidar: Device[HokuyoConfig] | None = None
-    drive: Device[EposConfig] | None = None
-    drive_2: Device[EposConfig] | None = None
-    """Controller of the body's second driven shaft, if it has one"""
-    drive_3: Device[EposConfig] | None = None
-    drive_4: Device[EposConfig] | None = None
-    steering: Device[MaestroConfig] | None = None
-    compass: Device[Os4000Config] | None = None
-    stabiliser: Device[Ax12Config] | None = None
-    """Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"""
-    camera: Device[WebcamConfig] | None = None
-
-    def present(self) -> dict[str, Device[Schema]]:
+    def present(self) -> dict[str, Device[Any]]:
         """The devices that are configured, by role."""
-        return {role: device for role in type(self).model_fields if (device := getattr(self, role)) is not None}
+        return dict(_present(self))
 
-    def shafts(self) -> dict[str, Device[EposConfig]]:
+    def shafts(self) -> "dict[str, Device[EposConfig]]":
         """The controllers of the driven shafts, by role."""
-        return {role: device for role in SHAFTS if (device := getattr(self, role)) is not None}
+        present = self.present()
+        return {role: present[role] for role in SHAFTS if role in present}
 
     @model_validator(mode="after")
     def _one_port_each(self) -> Self:
@@ -93,10 +101,62 @@ class Devices(Schema):
         return self
 
 
-class Monitors(Schema):
+class _Monitors(Schema):
     """What is read from the computer itself, without a port; what is left out is not watched."""
 
-    battery: IioConfig | None = None
-    """Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input"""
-    link: LinkQualityConfig | None = None
-    host: HostHealthConfig | None = None
+    def present(self) -> dict[str, Schema]:
+        """Settings of those that are configured, by role."""
+        return dict(_present(self))
+
+
+def _present(section: Schema) -> Iterator[tuple[str, Any]]:
+    return ((role, found) for role in type(section).model_fields if (found := getattr(section, role)) is not None)
+
+
+def _section(base: type[Schema], name: str, *, monitors: bool) -> Any:
+    roles = [role for role in DEVICES.roles.values() if (role.duty is Duty.MONITOR) is monitors]
+    fields: dict[str, Any] = {
+        role.name: (_choice(role, monitors=monitors) | None, Field(None, description=role.doc)) for role in roles
+    }
+    return create_model(name, __base__=base, __module__=__name__, __doc__=base.__doc__, **fields)
+
+
+def _choice(role: Role, *, monitors: bool) -> Any:
+    """One of the kinds that fill a role."""
+    kinds = {kind.name: kind.settings_class() for kind in DEVICES.of_role(role.name)}
+    models = {name: model if monitors else Device[model] for name, model in kinds.items()}  # type: ignore[valid-type]
+    if len(models) == 1:
+        return next(iter(models.values()))
+    default = next(iter(models))
+
+    def tag(value: Any) -> str:
+        if isinstance(value, dict):
+            driver = value if monitors else value.get("driver")
+            return str(driver.get("kind", default)) if isinstance(driver, dict) else default
+        return str(vars(value if monitors else value.driver)["kind"])
+
+    return Annotated[reduce(or_, (Annotated[model, Tag(name)] for name, model in models.items())), Discriminator(tag)]
+
+
+if TYPE_CHECKING:
+
+    class Devices(_Devices):
+        """By name only what the robot's own code asks for."""
+
+        lidar: Device[Schema] | None = None
+        drive: Device[EposConfig] | None = None
+        steering: Device[MaestroConfig] | None = None
+        compass: Device[Schema] | None = None
+        stabiliser: Device[Ax12Config] | None = None
+        camera: Device[Schema] | None = None
+
+    class Monitors(_Monitors):
+        """By name only what the robot's own code asks for."""
+
+        battery: IioConfig | None = None
+        link: LinkQualityConfig | None = None
+        host: HostHealthConfig | None = None
+
+else:
+    Devices = _section(_Devices, "Devices", monitors=False)
+    Monitors = _section(_Monitors, "Monitors", monitors=True)

@@ -18,6 +18,8 @@ import serial_asyncio
 
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
 
+BAUD = 115200
+"""Bits per second of a line whose device takes any."""
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
 TIMER_STEP = 0.001
@@ -282,7 +284,7 @@ class SerialPort:
         baud: bits per second; meaningless on USB-CDC and ptys.
     """
 
-    def __init__(self, path: Path, baud: int = 115200) -> None:
+    def __init__(self, path: Path, baud: int = BAUD) -> None:
         self.name = str(path)
         self._path = path
         self._baud = baud

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
+from monstertruck_drivers.catalog import UsbIdentity
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.config import Devices
 from monstertruck_drivers.host_health.readings import Disk
@@ -14,16 +15,9 @@ from monstertruck_drivers.usb.tree import ancestors
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-IDENTITIES = {
-    "hokuyo_urg": ("15d1:0000", "URG-Series USB Driver", "ttyACM"),
-    "epos": ("0403:6001", "FT232R USB UART", "ttyUSB"),
-    "maestro": ("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
-    "os4000": ("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
-    "ax12": ("0403:6001", "USB2Dynamixel", "ttyUSB"),
-    "webcam": ("046d:080a", "Webcam C905", "video"),
-}
-"""USB identity, product and kind of node by kind of device."""
 HUB_PORTS = 7
+OTHER = UsbIdentity("1a86:7523", "USB Serial", "ttyUSB")
+"""A device whose kind says nothing of USB hangs on an adapter."""
 DISK = Disk(total=64_000_000_000, free=32_000_000_000)
 """Of an emulated computer; on the real one, every run would record something else."""
 HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
@@ -88,12 +82,12 @@ class EmulatedComputer:
         for hub in sorted(hubs):
             self.usb.add_hub(hub, ports=HUB_PORTS)
         for role, (port, kind) in places.items():
-            usb_id, title, node = IDENTITIES[kind]
+            identity = kind.usb or OTHER
             self.usb.add_device(
                 port.device,
-                port.usb_id or usb_id,
-                title,
-                node=node,
+                port.usb_id or identity.usb_id,
+                identity.title,
+                node=identity.node,
                 interface=port.interface,
                 serial=f"emulated-{role}",
                 cable=cables[role],

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, TextIO
 
-from monstertruck_drivers.base import Emulator
+from monstertruck_drivers.base import Emulator, FileEmulator
 from monstertruck_drivers.cable import EmulatedPort, LineFaults
 from monstertruck_runtime.errors import InputError
 
@@ -55,22 +55,6 @@ class Emulated:
                 self.emulator.inject(fault, *values)
             case _:
                 raise InputError(HELP)
-
-
-class FileEmulator(Protocol):
-    """A part of the computer that shows in files."""
-
-    async def run(self) -> None:
-        """Bring them up to date until cancelled."""
-        ...
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_estimation.fusion.service import FusionService
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryService
@@ -25,6 +26,7 @@ from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import DRIVES, Writer
 from monstertruckd.assembly.goals import build_goals
 from monstertruckd.bus.local import Bus
@@ -38,7 +40,6 @@ ODOMETRIES: Final = 256
 """Poses and angles that may wait for a scan."""
 STEP_DEADLINE: Final = 5.0
 """Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
-SENSOR_FRAMES = ("lidar", "compass", "stabiliser", "camera")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +64,12 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
     mounts = {
         role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
         for role, m in ((role, device.mount) for role, device in config.devices.present().items())
-        if role in SENSOR_FRAMES
+        if DEVICES.roles[role].frame
     }
-    joints = mounts.pop("stabiliser", None)
-    if joints is not None and "lidar" in mounts:
-        mounts["lidar"] = compose(invert(joints), mounts["lidar"])
+    joints = mounts.pop(DeviceRole.STABILISER, None)
+    if joints is not None and DeviceRole.LIDAR in mounts:
+        lidar = mounts[DeviceRole.LIDAR]
+        mounts[DeviceRole.LIDAR] = compose(invert(joints), lidar)
     slam = _build_slam(config, bus, clock)
     yield TransformService(
         list(mounts.values()),

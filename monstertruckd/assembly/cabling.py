@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.config import AnyPort
-from monstertruck_drivers.link import Port, SerialPort
+from monstertruck_drivers.link import BAUD, Port, SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator
 from monstertruck_drivers.usb.machine import Machine
@@ -55,7 +55,7 @@ class Cabling:
             return self._given[role]
         if isinstance(port, UsbPortConfig):
             return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
-        return SerialPort(port.path, port.baud)
+        return SerialPort(port.path, port.baud or BAUD)
 
     def camera(self, role: str) -> FrameSource:
         """Where a camera's pictures come from."""
@@ -87,7 +87,7 @@ class HubCamera:
     async def open(self, mode: Mode, buffers: int) -> FrameStream:
         """Wait for the camera's turn, find its node, start it; see ``FrameSource``."""
         path = self._machine.dev / (await self._node.resolve()).name
-        port = self._machine.serial(path, 115200)
+        port = self._machine.serial(path, BAUD)
         if isinstance(port, SerialPort):
             return await PathSource(str(path), self._machine.clock).open(mode, buffers)
         # Only what is emulated in this process leads from a camera's node to a port.

@@ -1,23 +1,20 @@
-"""Builds the device drivers of a configuration and gives each its ends of the bus."""
+"""Builds the drivers of a configuration and gives each the ends of its role's topics."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from typing import Any
 
-from monstertruck_drivers.battery.driver import IioBatteryDriver
-from monstertruck_drivers.battery.iio import CONVERTERS
-from monstertruck_drivers.catalog import BY_NAME
+from monstertruck_drivers.catalog import DEVICES, Duty, Role
 from monstertruck_drivers.computer import Computer
-from monstertruck_drivers.host_health.driver import HostHealthDriver
-from monstertruck_drivers.link_quality.driver import LinkQualityDriver
+from monstertruck_drivers.config import kind_of
 from monstertruck_estimation.scan_tilt import TiltStamper
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Delivery, latest
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
-from monstertruck_schemas.roles import SHAFTS
+from monstertruck_schemas.base import Schema
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Writer
+from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.cabling import Cabling
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
@@ -26,37 +23,44 @@ RECENT = Delivery(16, counted=False)
 """Enough of the past for the tilt in the middle of a scan."""
 
 
-def build_drivers(config: TruckConfig, cabling: Cabling, clock: Clock, bus: Bus) -> dict[str, Service]:
-    """One driver per configured device, by role."""
+def build_drivers(
+    config: TruckConfig, cabling: Cabling, computer: Computer, clock: Clock, bus: Bus
+) -> dict[str, Service]:
+    """One driver per configured device and monitor, by role, in the order of the catalog."""
+    settings: dict[str, Schema] = {role: device.driver for role, device in config.devices.present().items()}
+    settings |= config.monitors.present()
+    roles = {role: DEVICES.roles[role] for role in settings}
     drivers: dict[str, Service] = {}
-    for role, device in config.devices.present().items():
-        driver: Any = BY_NAME[device.kind].driver_class()
-        where = cabling.camera(role) if role == "camera" else cabling.port(role)
-        ends = _ends(role, config, bus)
-        # The motor's current explains the sag of the battery the servo controller measures.
-        sag = {"drive": bus.subscribe(topics.DRIVE, latest())} if role == "steering" else {}
-        drivers[role] = driver(device.driver, where, clock, *ends, bus.event_sink(), role, **sag)
+    for role in roles.values():
+        kind = kind_of(settings[role.name])
+        match kind.opens:
+            case "serial":
+                where: Any = cabling.port(role.name)
+            case "video":
+                where = cabling.camera(role.name)
+            case "computer":
+                where = computer
+        ends: dict[str, Any] = {name: bus.subscribe(topic, latest()) for name, topic in role.reads.items()}
+        ends |= {name: _publisher(role, name, roles, config, bus) for name in role.writes}
+        driver = kind.implementation_class()
+        drivers[role.name] = driver(settings[role.name], where, clock, **ends, events=bus.event_sink(), name=role.name)
     return drivers
 
 
-def _ends(role: str, config: TruckConfig, bus: Bus) -> tuple[Any, ...]:
-    """What a driver reads and writes, in the order its constructor takes them."""
-    match role:
-        case "lidar":
-            return (scan_publisher(config, bus),)
-        case "compass":
-            return (bus.publisher(topics.COMPASS, Writer.DRIVER),)
-        case "camera":
-            return (bus.publisher(topics.CAMERA, Writer.DRIVER),)
-        case "drive" | "drive_2" | "drive_3" | "drive_4":
-            shaft = SHAFTS.index(role)
-            return bus.subscribe(CMD_DRIVES[shaft], latest()), bus.publisher(DRIVES[shaft], Writer.DRIVER)
-        case "stabiliser":
-            return bus.subscribe(topics.PLAN_STABILISER, latest()), bus.publisher(topics.STABILISER, Writer.DRIVER)
-        case _:
-            battery = bus.publisher(topics.BATTERY, Writer.DRIVER) if config.monitors.battery is None else None
-            commands = bus.subscribe(topics.CMD_STEERING, latest())
-            return commands, bus.publisher(topics.STEERING, Writer.DRIVER), battery
+def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:
+    """Those of the drivers that are there for one of ``duties``."""
+    return {role: driver for role, driver in drivers.items() if DEVICES.roles[role].duty in duties}
+
+
+def _publisher(
+    role: Role, name: str, roles: Mapping[str, Role], config: TruckConfig, bus: Bus
+) -> Publisher[Any] | None:
+    """Write end of one of a role's topics; None where it is another configured role's own."""
+    topic = role.writes[name]
+    owner = next((other for other in roles.values() if next(iter(other.writes.values())) is topic), role)
+    if owner is not role:
+        return None
+    return scan_publisher(config, bus) if topic is topics.SCAN else bus.publisher(topic, Writer.DRIVER)
 
 
 def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
@@ -67,26 +71,3 @@ def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
     stabiliser = config.devices.stabiliser
     joints = bus.subscribe(topics.STABILISER, RECENT) if stabiliser is not None else None
     return TiltStamper(out, bus.subscribe(topics.COMPASS, RECENT), joints)
-
-
-def build_monitors(config: TruckConfig, computer: Computer, clock: Clock, bus: Bus) -> Iterator[Service]:
-    """What is read from the computer itself."""
-    monitors, events, beside = config.monitors, bus.event_sink(), computer.machine.beside
-    if monitors.battery is not None:
-        yield IioBatteryDriver(
-            monitors.battery,
-            clock,
-            bus.publisher(topics.BATTERY, Writer.DRIVER),
-            events,
-            bus.subscribe(topics.DRIVE, latest()),
-            root=computer.root / CONVERTERS,
-            offload=beside,
-        )
-    if monitors.link is not None:
-        link = bus.publisher(topics.LINK, Writer.DRIVER)
-        yield LinkQualityDriver(monitors.link, clock, link, events, root=computer.root, offload=beside)
-    if monitors.host is not None:
-        host = bus.publisher(topics.HOST, Writer.DRIVER)
-        yield HostHealthDriver(
-            monitors.host, clock, host, events, root=computer.root, disk=computer.disk, offload=beside
-        )

@@ -88,9 +88,9 @@ class Catalog(Mapping[str, P], Generic[P]):
 
     @cached_property
     def _all(self) -> Extended[P]:
-        return extended(self.group, self._ours, self._fault)
+        return extended(self.group, self._ours, self.fault)
 
-    def _fault(self, name: str, row: Any) -> str | None:
+    def fault(self, name: str, row: Any) -> str | None:
         """What is wrong with a row of another distribution."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 
-from monstertruck_drivers.catalog import KINDS
+from monstertruck_drivers.catalog import DEVICES
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from pages.markdown import Page, join
 from pages.models import Definitions, Json, label, plain
 
 DRIVER = "And `driver`: the settings of the device's kind, on the device's page."
-DRIVERS = {kind.config_class().__name__: kind for kind in KINDS}
+DRIVERS = {kind.settings_class().__name__: kind for kind in DEVICES.values()}
 
 
 def pages() -> list[Page]:

@@ -2,12 +2,13 @@
 
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
-from monstertruck_drivers.catalog import KINDS, Kind
+from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty
 from monstertruck_runtime.yaml_files import yaml_text
-from monstertruck_schemas.topics import TOPICS
+from monstertruck_schemas.topics import Topic
 from monstertruckd.config.load import load_tree
 from pages.markdown import Page, join, prose, raised, section, table
 from pages.models import Definitions, label, plain
@@ -26,15 +27,16 @@ def pages(sections: dict[str, str]) -> list[Page]:
     Args:
         sections: heading of ``devices.md`` by role, in lower case.
     """
-    return [_page(kind, sections.get(kind.role)) for kind in KINDS]
+    return [_page(kind, sections.get(kind.role.name)) for kind in DEVICES.values()]
 
 
-def _page(kind: Kind, habits: str | None) -> Page:
-    driver, emulator, probe = kind.driver_class(), kind.emulator_class(), kind.probe()
-    models = Definitions(kind.config_class())
+def _page(kind: DeviceKind, habits: str | None) -> Page:
+    driver, probe = kind.implementation_class(), kind.probe_function()
+    emulator = get_type_hints(kind.emulator_factory())["return"]
+    models = Definitions(kind.settings_class())
     text = join(
         f"# {kind.doc}",
-        _facts(kind, driver),
+        _facts(kind),
         f"What its emulator does as the device does, test by test: [table](../devices.md#{habits})." if habits else "",
         "## Driver",
         prose(driver.__doc__),
@@ -44,58 +46,48 @@ def _page(kind: Kind, habits: str | None) -> Page:
         _example(kind),
         *_settings(models),
         "## Probe",
-        f"`monstertruckd probe {kind.name}{PROBED[kind.asked]}`: {prose(probe.__doc__)}",
+        f"`monstertruckd probe {kind.name}{PROBED[kind.opens]}`: {prose(probe.__doc__)}",
         section(probe.__doc__, "Returns"),
         "## Emulator",
         prose(sys.modules[emulator.__module__].__doc__).partition("\n\n")[2],
         _without_faults(emulator.__doc__),
         "## Faults",
         _faults(emulator),
-        LINE_FAULTS if kind.asked == "port" else "",
+        LINE_FAULTS if kind.opens == "serial" else "",
     )
-    return Page(f"devices/{kind.name}.md", f"{kind.role}: {kind.name}", text)
+    return Page(f"devices/{kind.name}.md", f"{kind.role.name}: {kind.name}", text)
 
 
-PROBED = {"port": " --port /dev/...", "path": " --port '/dev/video*'", "machine": ""}
+PROBED = {"serial": " --port /dev/...", "video": " --port '/dev/video*'", "computer": ""}
 
 
-def _facts(kind: Kind, driver: type[Any]) -> str:
-    writes, reads = _topics(kind, driver, "Publisher"), _topics(kind, driver, "Subscription")
-    place = f"monitors.{kind.role}" if kind.asked == "machine" else f"devices.{kind.role}"
+def _facts(kind: DeviceKind) -> str:
     rows = [
-        ("place in the configuration", f"`{place}`"),
+        ("place in the configuration", f"`{_group(kind)}.{kind.role.name}`"),
         ("`kind`", f"`{kind.name}`"),
-        ("publishes", writes),
-        ("reads", reads),
-        ("line", f"{kind.baud} baud" if kind.baud and kind.asked == "port" else ""),
-        ("code", f"`{kind.package}`"),
+        ("publishes", _topics(kind.role.writes)),
+        ("reads", _topics(kind.role.reads)),
+        ("line", "" if kind.baud is None else f"{kind.baud} baud"),
+        ("code", f"`{kind.implementation.partition('.driver:')[0]}`"),
     ]
     return table(("", " "), [row for row in rows if row[1]])
 
 
-def _topics(kind: Kind, driver: type[Any], port: str) -> str:
-    """Topics whose messages go through the ``port`` s of a driver's constructor."""
-    models = {
-        get_args(end)[0]
-        for hint in get_type_hints(driver.__init__).values()
-        for end in (hint, *get_args(hint))
-        if getattr(get_origin(end), "__name__", "") == port
-    }
-    writers = {"Publisher": {"driver"}, "Subscription": {"gate", "planner", "driver"}}[port]
-    fitting = [topic for topic in TOPICS if topic.model in models and topic.writer in writers]
-    own = [topic for topic in fitting if topic.name.partition("/")[2].startswith(kind.role)]
-    first = {topic.model: topic for topic in reversed(fitting)}  # other shafts' feedback is none of its business
-    found = [topic for topic in fitting if topic in own or topic is first[topic.model]]
-    return ", ".join(f"[`{topic.name}`](../topics/{topic.group}.md#{anchor(topic)})" for topic in found)
+def _group(kind: DeviceKind) -> str:
+    return "monitors" if kind.role.duty is Duty.MONITOR else "devices"
 
 
-def _example(kind: Kind) -> str:
+def _topics(ends: Mapping[str, Topic[Any]]) -> str:
+    return ", ".join(f"[`{topic.name}`](../topics/{topic.group}.md#{anchor(topic)})" for topic in ends.values())
+
+
+def _example(kind: DeviceKind) -> str:
     """What the author's truck says of it."""
-    group = "monitors" if kind.asked == "machine" else "devices"
-    said = load_tree(CONFIG).data.get(group, {}).get(kind.role)
+    group, role = _group(kind), kind.role.name
+    said = load_tree(CONFIG).data.get(group, {}).get(role)
     if said is None:
         return ""
-    text = yaml_text({group: {kind.role: said}})
+    text = yaml_text({group: {role: said}})
     return f"In [truck.yaml](../../configs/truck.yaml):\n\n```yaml\n{text}```"
 
 

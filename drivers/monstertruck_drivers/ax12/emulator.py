@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
-from monstertruck_drivers.base import Trail
+from monstertruck_drivers.base import EmulatorSetup, Trail
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
@@ -280,3 +281,34 @@ class Ax12Bus:
     def _garbled(self, wire: bytes) -> bytes:
         noise = self._rng.integers(1, 256, len(wire), dtype=np.uint8)
         return bytes(np.frombuffer(wire, dtype=np.uint8) ^ noise)
+
+
+class TrueJoints:
+    """``JointSource``: where the shafts of an emulated stabiliser really are.
+
+    Args:
+        bus: the units.
+        config: which unit turns what.
+    """
+
+    def __init__(self, bus: Ax12Bus, config: Ax12Config) -> None:
+        self._bus = bus
+        self._joints = (config.pitch, config.roll)
+
+    def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pitch and roll of the mount, rad."""
+        pitch, roll = (
+            joint.direction * (self._bus.angles(joint.id, times_ns) - joint.zero * p.STEP) for joint in self._joints
+        )
+        return pitch, roll
+
+
+def emulated(setup: EmulatorSetup) -> Ax12Bus:
+    """Both units below a simulated truck's lidar, at rest where it is parallel to the body; a line of real speed."""
+    config: Ax12Config = setup.settings or Ax12Config()
+    joints = (config.pitch, config.roll)
+    places = {joint.id: float(joint.zero) for joint in joints}
+    bus = Ax12Bus(setup.clock, [joint.id for joint in joints], seed=setup.seed, positions=places)
+    setup.port.device.baud = p.BAUD
+    setup.physics.carry_lidar(TrueJoints(bus, config))
+    return bus

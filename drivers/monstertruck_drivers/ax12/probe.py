@@ -13,7 +13,7 @@ IDS = range(1, 7)
 STORED = 19
 
 
-async def probe(port: Port, clock: Clock) -> dict[str, object]:
+async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) -> dict[str, object]:
     """Ping units 1 to 6 at 1 Mbaud and read settings and state of those that answer.
 
     Returns:
@@ -27,7 +27,7 @@ async def probe(port: Port, clock: Clock) -> dict[str, object]:
         PortBusyError: another process holds the port.
     """
     async with await port.open() as link:
-        session = Session(link, clock, Ax12Config().timeout)
+        session = Session(link, clock, (settings or Ax12Config()).timeout)
         await session.find_echo(*IDS)
         units = [found for unit in IDS if (found := await _describe(session, unit)) is not None]
     if not units and session.strange:

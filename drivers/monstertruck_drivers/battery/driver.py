@@ -1,16 +1,15 @@
 """Battery driver on a Linux IIO converter."""
 
-from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.battery import iio
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.monitor import BatteryMonitor
+from monstertruck_drivers.computer import Computer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import IN_THREADS, Schedule
-from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.sensor import Battery, DriveFeedback
 
 MISSES: Final = 3
@@ -22,32 +21,29 @@ class IioBatteryDriver:
 
     Args:
         config: pack, converter, divider.
+        computer: whose converter; files are read off the loop, as a conversion over I2C takes milliseconds.
         clock: time.
         out: battery messages.
         events: told when the battery's level changes.
         drive: the motor's feedback, whose current explains the sag; None = not used.
-        root: the kernel's folder of converters.
-        offload: where files are read: a conversion over I2C takes milliseconds.
         name: service name.
     """
 
     def __init__(
         self,
         config: IioConfig,
+        computer: Computer,
         clock: Clock,
         out: Publisher[Battery],
         events: EventSink,
         drive: Subscription[DriveFeedback] | None = None,
-        *,
-        root: Path = iio.ROOT,
-        offload: Offload = in_thread,
         name: str = "battery",
     ) -> None:
         self.name = name
         self._config = config
         self._clock = clock
-        self._root = root
-        self._offload = offload
+        self._root = computer.root / iio.CONVERTERS
+        self._offload = computer.machine.beside
         self._monitor = BatteryMonitor(config, out, events, name, drive)
 
     async def run(self, ready: Ready) -> None:

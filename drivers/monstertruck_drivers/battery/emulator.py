@@ -6,6 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.base import EmulatorSetup
+from monstertruck_drivers.battery.config import IioConfig
+from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.file_tree import FileTree
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -23,7 +26,7 @@ class IioEmulator:
     instead of the source), ``unplug``, ``plug``.
 
     Args:
-        root: folder that stands for /sys/bus/iio/devices.
+        root: folder that stands for /.
         clock: time.
         source: volts at the pin at an instant, ns.
         seed: of the noise.
@@ -49,7 +52,7 @@ class IioEmulator:
         self.name = name
         self.plugged = False
         """Whether the kernel shows it."""
-        self._files = FileTree(root)
+        self._files = FileTree(root / CONVERTERS)
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
@@ -129,3 +132,12 @@ class IioEmulator:
 
     def _bounce(self, seconds: float) -> None:
         self._bounce_until = self._clock.now() + round(seconds * SECOND)
+
+
+def emulated(setup: EmulatorSetup) -> IioEmulator:
+    """The converter at the battery of a simulated truck."""
+    config: IioConfig = setup.settings or IioConfig()
+    device = config.device or "mcp3208"
+    return IioEmulator(
+        setup.root, setup.clock, setup.physics.battery_volts, seed=setup.seed, channel=config.channel, device=device
+    )

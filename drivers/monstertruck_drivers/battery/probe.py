@@ -1,20 +1,24 @@
 """Which converters are there, and what do they read."""
 
-from pathlib import Path
 from typing import Any
 
 from monstertruck_drivers.battery import iio
+from monstertruck_drivers.battery.config import IioConfig
+from monstertruck_drivers.computer import Computer
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceError
-from monstertruck_runtime.threads import Offload, in_thread
 
 
-async def probe(root: Path = iio.ROOT, offload: Offload = in_thread) -> dict[str, Any]:
+async def probe(computer: Computer, clock: Clock, settings: IioConfig | None = None) -> dict[str, Any]:
     """Read every voltage input of every converter once.
 
     Returns:
         JSON-able: ``converters``: name, path, and per channel the reading and the volts at the pin, or why not.
     """
-    return await offload(lambda: {"converters": [_describe(converter) for converter in iio.converters(root)]})
+    root = computer.root / iio.CONVERTERS
+    return await computer.machine.beside(
+        lambda: {"converters": [_describe(converter) for converter in iio.converters(root)]}
+    )
 
 
 def _describe(converter: iio.Converter) -> dict[str, Any]:

@@ -10,12 +10,13 @@ from contextlib import suppress
 
 import numpy as np
 
-from monstertruck_drivers.base import MotorPlant
+from monstertruck_drivers.base import EmulatorSetup, MotorPlant
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
 from monstertruck_drivers.epos.protocol import (
     ANSWER,
+    BAUD,
     FRAME_TIMEOUT,
     MAX_WORDS,
     READY,
@@ -34,6 +35,7 @@ from monstertruck_drivers.epos.protocol import (
 )
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
 
 TURN_AROUND = 0.001
 """Seconds from the last byte received to the first one sent; most of it is the host's USB converter."""
@@ -320,3 +322,10 @@ class EposEmulator:
 
 def _flag(word: str) -> bool:
     return {"on": True, "off": False}[word]
+
+
+def emulated(setup: EmulatorSetup) -> EposEmulator:
+    """The controller of one driven shaft of a simulated truck, on a line of real speed."""
+    shaft = SHAFTS.index(DeviceRole(setup.role))
+    setup.port.device.baud = BAUD
+    return EposEmulator(setup.clock, setup.physics.motors[shaft], seed=setup.seed + shaft)

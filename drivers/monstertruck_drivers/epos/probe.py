@@ -3,6 +3,7 @@
 from typing import Any
 
 from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger
 from monstertruck_drivers.epos.identity import read_identity
 from monstertruck_drivers.epos.protocol import state_of
@@ -14,13 +15,13 @@ SAMPLES = 5
 SAMPLE_PERIOD = 0.05
 
 
-async def probe(port: Port, clock: Clock, node: int = 1) -> dict[str, Any]:
+async def probe(port: Port, clock: Clock, settings: EposConfig | None = None) -> dict[str, Any]:
     """Handshake, identity, state, fault history and first samples; only reads.
 
     Args:
-        port: where the controller hangs, at 38400 baud.
+        port: where the controller hangs.
         clock: time.
-        node: node id; 0 = whichever is there.
+        settings: with its node id.
 
     Returns:
         JSON-able report in the controller's own units and sign.
@@ -31,7 +32,7 @@ async def probe(port: Port, clock: Clock, node: int = 1) -> dict[str, Any]:
         WrongDeviceError: something else answers.
     """
     async with await port.open() as link:
-        line = Exchanger(link, clock, node)
+        line = Exchanger(link, clock, (settings or EposConfig()).node)
         try:
             return await _report(line, clock)
         except (DeviceTimeoutError, ProtocolError) as error:

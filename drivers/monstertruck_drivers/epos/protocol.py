@@ -22,6 +22,9 @@ from typing import NamedTuple
 
 from monstertruck_drivers.epos.objects import CONTROLWORD, Entry
 
+BAUD = 38400
+"""Of the RS232 line, as set at the author's controller."""
+
 READY = 0x4F
 """'O': ready for what follows, or accepted."""
 REFUSED = 0x46

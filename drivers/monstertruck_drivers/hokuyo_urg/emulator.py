@@ -17,7 +17,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import RangeSource
+from monstertruck_drivers.base import EmulatorSetup, RangeSource
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.hokuyo_urg.identity import build_fields
 from monstertruck_drivers.hokuyo_urg.orders import (
@@ -425,3 +425,8 @@ class HokuyoEmulator:
 
 def _switch(word: str) -> bool:
     return {"on": True, "off": False}[word]
+
+
+def emulated(setup: EmulatorSetup) -> HokuyoEmulator:
+    """The lidar of a simulated truck."""
+    return HokuyoEmulator(setup.clock, setup.physics.lidar, seed=setup.seed)

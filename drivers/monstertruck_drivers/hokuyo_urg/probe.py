@@ -21,14 +21,14 @@ FIRST_SCAN = 1.6
 """Seconds allowed for the first scan."""
 
 
-async def probe(port: Port, clock: Clock) -> dict[str, object]:
+async def probe(port: Port, clock: Clock, settings: HokuyoConfig | None = None) -> dict[str, object]:
     """Handshake, identity, state and a summary of the first scan, ready for JSON; the laser is off afterwards.
 
     Raises:
         DeviceError: as the driver's ``run``.
     """
     async with await port.open() as link:
-        session = ScipSession(link, clock, HokuyoConfig())
+        session = ScipSession(link, clock, settings or HokuyoConfig())
         sensor = await session.handshake()
         try:
             block = await _one_scan(session, sensor)

@@ -1,15 +1,13 @@
 """Host monitor: looks once a second, reports what gets short."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.host_health.readings import Disk, Reading, busy_share, disk_of, read_host
+from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_runtime.schedule import IN_THREADS, Schedule
-from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_runtime.thresholds import Alarm, Threshold
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth
@@ -24,25 +22,20 @@ class HostHealthDriver:
 
     Args:
         config: limits.
+        computer: whose health.
         clock: time.
         out: host health.
         events: what gets short, and when it is over.
-        root: folder that holds ``proc`` and ``sys``.
-        disk: asks for the file system of a path.
-        offload: where files are read.
         name: service name.
     """
 
     def __init__(
         self,
         config: HostHealthConfig,
+        computer: Computer,
         clock: Clock,
         out: Publisher[HostHealth],
         events: EventSink,
-        *,
-        root: Path = Path("/"),
-        disk: Callable[[Path], Disk] = disk_of,
-        offload: Offload = in_thread,
         name: str = "host",
     ) -> None:
         self.name = name
@@ -50,9 +43,9 @@ class HostHealthDriver:
         self._clock = clock
         self._out = out
         self._events = events
-        self._root = root
-        self._disk = disk
-        self._offload = offload
+        self._root = computer.root
+        self._disk = computer.disk
+        self._offload = computer.machine.beside
         self._before: Reading | None = None
         self._alarms = {
             Reason.HOST_HOT: Alarm(Threshold(config.hot, config.hot_clear, config.after)),

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.base import EmulatorSetup
 from monstertruck_drivers.file_tree import FileTree
 from monstertruck_drivers.host_health.readings import FIRMWARE_THROTTLED
 from monstertruck_runtime.clock import Clock
@@ -113,3 +114,8 @@ class HostEmulator:
             self._files.put(f"{folder}/cpufreq/scaling_max_freq", str(round(MAX_KILOHERTZ * self._cap)))
             self._files.put(f"{folder}/cpufreq/scaling_cur_freq", str(round(MAX_KILOHERTZ * self._cap * 0.9)))
             self._files.put(f"{folder}/thermal_throttle/core_throttle_count", str(self._throttled))
+
+
+def emulated(setup: EmulatorSetup) -> HostEmulator:
+    """The files of a simulated truck's computer."""
+    return HostEmulator(setup.root, setup.clock)

@@ -4,11 +4,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from monstertruck_drivers.host_health.readings import disk_of, read_host
-from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.host_health.config import HostHealthConfig
+from monstertruck_drivers.host_health.readings import read_host
+from monstertruck_runtime.clock import Clock
 
 
-async def probe(root: Path = Path("/"), disk_path: Path = Path(), offload: Offload = in_thread) -> dict[str, Any]:
+async def probe(computer: Computer, clock: Clock, settings: HostHealthConfig | None = None) -> dict[str, Any]:
     """Look once.
 
     Returns:
@@ -17,4 +19,5 @@ async def probe(root: Path = Path("/"), disk_path: Path = Path(), offload: Offlo
     Raises:
         DeviceError: /proc cannot be read.
     """
-    return asdict(await offload(lambda: read_host(root, disk_of(disk_path))))
+    disk = Path() if settings is None else settings.disk_path
+    return asdict(await computer.machine.beside(lambda: read_host(computer.root, computer.disk(disk))))

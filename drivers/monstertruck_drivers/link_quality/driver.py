@@ -1,15 +1,14 @@
 """Link monitor: looks at the interface once a second."""
 
-from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.interfaces import Sample, choose, read_interfaces
 from monstertruck_drivers.link_quality.judge import LinkJudge
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_runtime.schedule import IN_THREADS, Schedule
-from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
 from monstertruck_schemas.reasons import Reason
@@ -29,23 +28,20 @@ class LinkQualityDriver:
 
     Args:
         config: interface and limits.
+        computer: whose interfaces.
         clock: time.
         out: link health.
         events: changes for the worse and back.
-        root: folder that holds ``proc`` and ``sys``.
-        offload: where files are read.
         name: service name.
     """
 
     def __init__(
         self,
         config: LinkQualityConfig,
+        computer: Computer,
         clock: Clock,
         out: Publisher[LinkHealth],
         events: EventSink,
-        *,
-        root: Path = Path("/"),
-        offload: Offload = in_thread,
         name: str = "link",
     ) -> None:
         self.name = name
@@ -53,8 +49,8 @@ class LinkQualityDriver:
         self._clock = clock
         self._out = out
         self._events = events
-        self._root = root
-        self._offload = offload
+        self._root = computer.root
+        self._offload = computer.machine.beside
         self._judge = LinkJudge(config)
         self._concern = FINE
         self._before: tuple[int, Sample] | None = None

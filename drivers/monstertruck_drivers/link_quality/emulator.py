@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.base import EmulatorSetup
 from monstertruck_drivers.file_tree import FileTree
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
@@ -114,3 +115,8 @@ class NetworkEmulator:
         shown = 0 if level is None else round(level) + (256 if self._style == "unsigned" else 0)
         row = f" wlan0: 0000   54{dot}  {shown}{dot}  -256        0      0      0      3     42        0\n"
         self._files.put("proc/net/wireless", HEADER + (row if self._present and self._style != "header" else ""))
+
+
+def emulated(setup: EmulatorSetup) -> NetworkEmulator:
+    """The network of a simulated truck's computer."""
+    return NetworkEmulator(setup.root, setup.clock)

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import ServoPlant, Trail
+from monstertruck_drivers.base import EmulatorSetup, ServoPlant, Trail
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
@@ -127,7 +127,7 @@ class MaestroEmulator:
         self._servos = servos
         self._rng = np.random.default_rng(seed)
         self._mode = mode
-        self._timeout = round(serial_timeout_s * SECOND)
+        self.set_serial_timeout(serial_timeout_s)
         self._home: dict[int, Home] = {
             channel: "off" if channel in outputs else "ignore" for channel in range(CHANNELS)
         }
@@ -159,6 +159,10 @@ class MaestroEmulator:
             if isinstance(home, int | float):
                 self._aim(channel, round(4 * home))
         self._tell_outputs()
+
+    def set_serial_timeout(self, seconds: float) -> None:
+        """Store the silence after which all channels go home; 0 = never."""
+        self._timeout = round(seconds * SECOND)
 
     # What the world calls
 
@@ -359,3 +363,8 @@ class MaestroEmulator:
         else:
             self.usb.unplug()
             asyncio.get_running_loop().call_later(seconds, self.usb.plug)
+
+
+def emulated(setup: EmulatorSetup) -> MaestroEmulator:
+    """The servo controller of a simulated truck."""
+    return MaestroEmulator(setup.clock, setup.physics.servos, seed=setup.seed)

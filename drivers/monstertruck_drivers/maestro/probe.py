@@ -1,12 +1,13 @@
 """Who is on the port, and what does it read: without moving anything."""
 
 from monstertruck_drivers.link import Port
+from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.protocol import CHANNELS, Encoder, error_names
 from monstertruck_drivers.maestro.session import Session
 from monstertruck_runtime.clock import Clock
 
 
-async def probe(port: Port, clock: Clock) -> dict[str, object]:
+async def probe(port: Port, clock: Clock, settings: MaestroConfig | None = None) -> dict[str, object]:
     """Identify a Maestro by compact commands without CRC, and read all channels.
 
     Only positions and the error word are read; reading clears the errors.

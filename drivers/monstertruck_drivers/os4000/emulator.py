@@ -7,9 +7,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import AttitudeSource, CompassReading, Trail
+from monstertruck_drivers.base import AttitudeSource, CompassReading, EmulatorSetup, Trail
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.os4000.protocol import (
+    BAUD,
     BAUDS,
     ESC,
     FORMAT_TAGGED,
@@ -41,7 +42,7 @@ class Settings:
     rate: int
     fields: int
     format: int = FORMAT_TAGGED
-    baud: int = BAUDS.index(19200)
+    baud: int = BAUDS.index(BAUD)
     mounting: int = 1
     temperature_offset: int = 0
 
@@ -357,3 +358,8 @@ def _replace_field(line: bytes, tag: str, text: str) -> bytes:
     while stop < len(body) and body[stop] in "+-.0123456789":
         stop += 1
     return frame(body[:start] + text + body[stop:])
+
+
+def emulated(setup: EmulatorSetup) -> Os4000Emulator:
+    """The compass of a simulated truck."""
+    return Os4000Emulator(setup.clock, setup.physics.compass, seed=setup.seed)

@@ -1,6 +1,7 @@
 """Who is on the port, and what does it read."""
 
 from monstertruck_drivers.link import Port
+from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.protocol import Fields, Key
 from monstertruck_drivers.os4000.session import Session, observed_fields, observed_rate
 from monstertruck_runtime.clock import Clock
@@ -9,7 +10,7 @@ PROBE_RATE = 20
 """Set only when the unit was told to be silent."""
 
 
-async def probe(port: Port, clock: Clock) -> dict[str, object]:
+async def probe(port: Port, clock: Clock, settings: Os4000Config | None = None) -> dict[str, object]:
     """Listen, and ask for the firmware version. Only a silent unit is set to another rate.
 
     Returns:

@@ -15,6 +15,8 @@ ESC: Final = 0x1B
 SENTENCE_LIMIT: Final = 200
 """Bytes without a line end after which what was collected is dropped."""
 
+BAUD: Final = 19200
+"""From the factory."""
 BAUDS: Final = (4800, 9600, 14400, 19200, 38400, 57600, 115200)
 """Baud rates by the value the baud command takes; a change acts from the next power-up on."""
 RATE_MIN: Final = -100

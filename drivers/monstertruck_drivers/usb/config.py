@@ -5,6 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_drivers.catalog import start_order
 from monstertruck_drivers.usb.tree import device_name
 from monstertruck_schemas.base import Schema
 
@@ -20,8 +21,8 @@ class UsbPortConfig(Schema):
     """Port of that hub"""
     interface: Annotated[int, Field(ge=0, le=31)] = 0
     """USB interface that is the serial line; a Maestro's commands are 0"""
-    baud: Annotated[int, Field(ge=4800, le=1_000_000)] = 115200
-    """Bits per second; USB-CDC devices ignore it"""
+    baud: Annotated[int, Field(ge=4800, le=1_000_000)] | None = None
+    """Bits per second; null = the device's own. USB-CDC devices ignore it"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1
@@ -74,17 +75,7 @@ class UsbConfig(Schema):
     """Seconds a returned hub may stay empty until its devices count as unplugged"""
     stagger: Seconds = 0.3
     """Seconds between the starts of two devices of one hub"""
-    start_order: tuple[str, ...] = (
-        "drive",
-        "drive_2",
-        "drive_3",
-        "drive_4",
-        "steering",
-        "compass",
-        "lidar",
-        "stabiliser",
-        "camera",
-    )
+    start_order: tuple[str, ...] = Field(default_factory=start_order)
     """Roles in the order they start behind a returned hub: what stops the truck first, what loads the bus last"""
     over_current_hold: Seconds = 10.0
     """Seconds a device is not started after its port reported over-current"""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
-from monstertruck_drivers.usb.tree import Device, Snapshot, ancestors, parent_of, place, sort_key
+from monstertruck_drivers.usb.tree import Snapshot, UsbDevice, ancestors, parent_of, place, sort_key
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink
 from monstertruck_schemas.event import Severity
@@ -26,7 +26,7 @@ NAME: Final = "usb"
 class _Slot:
     """What is known of one place of the tree."""
 
-    device: Device | None = None
+    device: UsbDevice | None = None
     """As last seen."""
     present: bool = False
     replugs: int = 0
@@ -156,7 +156,7 @@ class HubCoordinator:
             outage.members.add(name)
             outage.changed = now
 
-    def _arrive(self, name: str, slot: _Slot, before: Device | None, now: int) -> None:
+    def _arrive(self, name: str, slot: _Slot, before: UsbDevice | None, now: int) -> None:
         assert slot.device is not None
         slot.present = True
         slot.replugs += before is not None
@@ -279,7 +279,7 @@ class HubCoordinator:
             seconds=(now - outage.since) / SECOND,
         )
 
-    def _tell_if_moved(self, name: str, device: Device) -> None:
+    def _tell_if_moved(self, name: str, device: UsbDevice) -> None:
         """A device that looks like a missing one came at another place. It is told, never used there."""
         for other, slot in self._slots.items():
             known = slot.device
@@ -334,7 +334,7 @@ class HubCoordinator:
         self._turn = asyncio.Event()
 
 
-def _alike(a: Device, b: Device) -> bool:
+def _alike(a: UsbDevice, b: UsbDevice) -> bool:
     return (a.usb_id, a.serial) == (b.usb_id, b.serial)
 
 

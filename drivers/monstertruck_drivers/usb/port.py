@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from monstertruck_drivers.link import Link
+from monstertruck_drivers.link import BAUD, Link
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.ftdi import ADVICE, set_latency
 from monstertruck_drivers.usb.hub import HubCoordinator
@@ -126,7 +126,7 @@ class HubPort:
             node = await self._node.resolve()
             device = self._machine.dev / node.name
             try:
-                link = await self._machine.serial(device, self._config.baud).open()
+                link = await self._machine.serial(device, self._config.baud or BAUD).open()
             except (DeviceLostError, PortBusyError):
                 if self._machine.clock.now() >= give_up:
                     raise

@@ -36,7 +36,7 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Device:
+class UsbDevice:
     """A hub or device at one look."""
 
     name: str
@@ -63,7 +63,7 @@ class Device:
 class Snapshot:
     """The whole tree at one look."""
 
-    devices: dict[str, Device]
+    devices: dict[str, UsbDevice]
     over_current: dict[str, int]
     """Over-current conditions a port has counted since its hub came, by the name a device there has."""
 
@@ -137,7 +137,7 @@ def read_tree(sysfs: Sysfs) -> Snapshot:
     return Snapshot(devices, over_current)
 
 
-def read_device(sysfs: Sysfs, name: str) -> Device | None:
+def read_device(sysfs: Sysfs, name: str) -> UsbDevice | None:
     """Look at one device; None if nothing hangs there."""
     nodes: list[Node] = []
     for entry in sysfs.names(f"{DEVICES}/{name}"):
@@ -146,13 +146,13 @@ def read_device(sysfs: Sysfs, name: str) -> Device | None:
     return _read_device(sysfs, name, tuple(nodes))
 
 
-def _read_device(sysfs: Sysfs, name: str, nodes: tuple[Node, ...]) -> Device | None:
+def _read_device(sysfs: Sysfs, name: str, nodes: tuple[Node, ...]) -> UsbDevice | None:
     path = f"{DEVICES}/{name}"
     devnum = sysfs.number(f"{path}/devnum")
     vendor, product = sysfs.text(f"{path}/idVendor"), sysfs.text(f"{path}/idProduct")
     if devnum is None or vendor is None or product is None:
         return None
-    return Device(
+    return UsbDevice(
         name=name,
         devnum=devnum,
         usb_id=f"{vendor}:{product}",

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import ViewSource
+from monstertruck_drivers.base import EmulatorSetup, ViewSource
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.webcam.packets import Kind, Packet, encode_mode
 from monstertruck_drivers.webcam.render import Renderer
@@ -196,3 +196,8 @@ class WebcamEmulator:
         else:
             self.usb.unplug()
             asyncio.get_running_loop().call_later(seconds, self.usb.plug)
+
+
+def emulated(setup: EmulatorSetup) -> WebcamEmulator:
+    """The camera of a simulated truck."""
+    return WebcamEmulator(setup.clock, setup.physics.view, offload=setup.offload, usb=setup.port)

@@ -3,13 +3,19 @@
 from typing import Any
 
 from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.v4l2_source import asked, enumerate_formats, enumerate_modes
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.threads import Offload, in_thread
 
 
 async def probe(
-    pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_thread
+    pattern: str,
+    clock: Clock,
+    settings: WebcamConfig | None = None,
+    kernel: v4l2.Kernel | None = None,
+    offload: Offload = in_thread,
 ) -> dict[str, Any]:
     """Ask every node that fits ``pattern``; nothing is streamed.
 

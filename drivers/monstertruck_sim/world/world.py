@@ -66,8 +66,13 @@ class World:
         self.motors: tuple[MotorPlant, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )
+        self._battery_input = config.battery.channel
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
+
+    def battery_volts(self, time_ns: int) -> float:
+        """Voltage behind the battery's divider."""
+        return self.servos.analog_volts(self._battery_input, time_ns)
 
     @property
     def motor(self) -> MotorPlant:

@@ -21,9 +21,9 @@ DeviceArgument = Annotated[
 ]
 
 OWN_CLIENTS: Final = {
-    "camera": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks"
+    "video": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks"
 }
-"""What an emulator's link is not, by role."""
+"""What an emulator's link is not, by what its driver opens."""
 
 
 def emulate(
@@ -37,14 +37,14 @@ def emulate(
     `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, or a fault of the device itself
     (an unknown word lists them).
     """
-    from monstertruck_drivers.catalog import find_kind
+    from monstertruck_drivers.catalog import DEVICES
     from monstertruck_sim.console import FaultConsole
     from monstertruckd.tools.simulation.single import emulate_device
 
     async def main(clock: Clock) -> None:
         async with emulate_device(device, link, clock, seed) as emulated:
             remark(f"{device} on {link}; faults on standard input, Ctrl-C ends")
-            if (limits := OWN_CLIENTS.get(find_kind(device).role)) is not None:
+            if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
             await FaultConsole({device: emulated}, sys.stdin, typer.echo).run()
 
@@ -61,27 +61,29 @@ def probe(
     json_output: JsonOption = False,
 ) -> None:
     """Handshake with a device and print its identity, state and first samples. Moves nothing."""
-    from monstertruck_drivers.catalog import find_kind
-    from monstertruck_drivers.link import SerialPort
+    from monstertruck_drivers.catalog import DEVICES
+    from monstertruck_drivers.computer import ROOT, Computer
+    from monstertruck_drivers.link import BAUD, SerialPort
     from monstertruck_runtime.errors import InputError, NotFoundError
 
-    kind = find_kind(device)
-    if kind.asked == "port" and port is None:
+    kind = DEVICES.named(device)
+    if kind.opens == "serial" and port is None:
         raise InputError(f"{device}: say where it hangs with --port")
-    if kind.asked == "machine" and port is not None:
+    if kind.opens == "computer" and port is not None:
         raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
 
     async def main(clock: Clock) -> dict[str, Any]:
-        if port is None:
-            return await kind.probe()()
-        if kind.asked == "path":
-            return await kind.probe()(str(port))
-        return await kind.probe()(SerialPort(port, baud or kind.baud), clock)
+        where: Any = Computer.at(ROOT, clock)
+        if kind.opens == "video":
+            where = str(port or "/dev/video*")
+        elif port is not None:
+            where = SerialPort(port, baud or kind.baud or BAUD)
+        return await kind.probe_function()(where, clock, None)
 
     report = run_wall(main)
     found = [entry for entries in report.values() if isinstance(entries, list) for entry in entries]
-    if kind.asked == "path" and port is not None and not found:
-        raise NotFoundError(f"{port}: no such {kind.role}")
+    if kind.opens == "video" and port is not None and not found:
+        raise NotFoundError(f"{port}: no such {kind.role.name}")
     if json_output:
         print_json(report)
     else:

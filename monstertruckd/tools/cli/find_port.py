@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.catalog import BY_ROLE
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.tree import Device, Snapshot, parent_of, place, port_of, read_device, read_tree
+from monstertruck_drivers.usb.tree import Snapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
 from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.edit import YamlText
@@ -15,7 +15,6 @@ from monstertruckd.config.edit import YamlText
 POLL: Final = 0.2
 SETTLE: Final = 0.4
 """Seconds after the first loss until all of it is seen: a hub takes its devices along."""
-DEFAULT_BAUD: Final = UsbPortConfig.model_fields["baud"].default
 
 
 async def find_cable(role: str, machine: Machine, say: Callable[[str], None], patience: float) -> UsbPortConfig:
@@ -45,17 +44,17 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], pa
     except TimeoutError:
         say("still not plugged in there; the port counts all the same")
     node = device.nodes[0]
-    kind = BY_ROLE.get(role.partition("_")[0])
+    kinds = DEVICES.of_role(role)
     return UsbPortConfig(
         hub=str(parent_of(device.name)),
         port=port_of(device.name),
         interface=node.interface,
-        baud=DEFAULT_BAUD if kind is None else kind.baud,
+        baud=kinds[0].baud if kinds else None,
         usb_id=device.usb_id,
     )
 
 
-async def _unplugged(machine: Machine, say: Callable[[str], None]) -> Device:
+async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
     """Wait until one device with a node vanishes alone."""
 
     async def look() -> Snapshot:
@@ -82,7 +81,7 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> Device:
         before = now
 
 
-def _lost(before: Snapshot, now: Snapshot) -> list[Device]:
+def _lost(before: Snapshot, now: Snapshot) -> list[UsbDevice]:
     """What is gone, or was for a moment."""
     return [
         device
@@ -100,7 +99,7 @@ def _flow(port: UsbPortConfig) -> str:
     parts = [f'hub: "{port.hub}"', f"port: {port.port}"]
     if port.interface:
         parts.append(f"interface: {port.interface}")
-    if port.baud != DEFAULT_BAUD:
+    if port.baud is not None:
         parts.append(f"baud: {port.baud}")
     if port.usb_id is not None:
         parts.append(f'usb_id: "{port.usb_id}"')

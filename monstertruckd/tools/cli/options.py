@@ -20,10 +20,10 @@ def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
 
 def complete_device(incomplete: str) -> Iterator[tuple[str, str]]:
     """Roles and kinds of devices."""
-    from monstertruck_drivers.catalog import BY_ROLE
+    from monstertruck_drivers.catalog import DEVICES
 
-    words = [(role, kind.name) for role, kind in BY_ROLE.items()]
-    words += [(kind.name, role) for role, kind in BY_ROLE.items()]
+    words = [(role, DEVICES.named(role).name) for role in DEVICES.roles]
+    words += [(kind.name, kind.role.name) for kind in DEVICES.values()]
     return (word for word in words if word[0].startswith(incomplete))
 
 

@@ -5,8 +5,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, Final
 
-from monstertruck_drivers.catalog import BY_NAME, Kind
+from monstertruck_drivers.catalog import DeviceKind
 from monstertruck_drivers.config import Device
+from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.port import HubPort
 from monstertruck_runtime.errors import DeviceError, PortBusyError, WrongDeviceError
@@ -31,14 +32,14 @@ async def handshakes(patient: Patient) -> AsyncIterator[Finding]:
     plugged = {
         role: (device, node)
         for role, device in patient.config.devices.present().items()
-        if (node := patient.node(device.port, camera=role == "camera")) is not None
+        if (node := patient.node(device.port, camera=device.kind.opens == "video")) is not None
     }
     for found in await asyncio.gather(*(_shake(patient, role, *ends) for role, ends in plugged.items())):
         yield found
 
 
 async def _shake(patient: Patient, role: str, device: Device[Schema], node: Path) -> Finding:
-    check, kind = f"{role} handshake", BY_NAME[device.kind]
+    check, kind = f"{role} handshake", device.kind
     again = patient.command("probe", role, "--port", str(node))
     try:
         async with patient.computer.machine.clock.deadline(PATIENCE):
@@ -51,19 +52,18 @@ async def _shake(patient: Patient, role: str, device: Device[Schema], node: Path
         return fail(check, error.reason, str(error), patient.find_port_command(role))
     except DeviceError as error:
         return fail(check, error.reason, str(error), again)
-    if role == "camera" and not any(one.get("mjpg_modes") for one in answer["nodes"]):
+    if kind.opens == "video" and not any(one.get("mjpg_modes") for one in answer["nodes"]):
         return warn(check, Reason.DEVICE_WRONG, f"{node} offers no motion JPEG", again)
     return fine(check, f"{kind.doc} answers")
 
 
-async def _ask(patient: Patient, role: str, device: Device[Schema], kind: Kind, node: Path) -> dict[str, Any]:
-    if kind.asked == "path":
-        return await kind.probe()(str(node))
+async def _ask(patient: Patient, role: str, device: Device[Schema], kind: DeviceKind, node: Path) -> dict[str, Any]:
     port, machine = device.port, patient.computer.machine
+    if kind.opens == "video":
+        return await kind.probe_function()(str(node), machine.clock, device.driver)
     line = (
         HubPort(port, machine, lambda *_, **__: None, role=role)
         if isinstance(port, UsbPortConfig)
-        else machine.serial(node, port.baud)
+        else machine.serial(node, port.baud or BAUD)
     )
-    address = (vars(device.driver)["node"],) if kind.name == "epos" else ()
-    return await kind.probe()(line, machine.clock, *address)
+    return await kind.probe_function()(line, machine.clock, device.driver)

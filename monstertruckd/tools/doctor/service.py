@@ -67,7 +67,7 @@ def rights(patient: Patient) -> Iterator[Finding]:
     else:
         yield fine("user", f"{account.name}, groups {', '.join(account.groups) or 'all as root'}")
     for role, device in patient.config.devices.present().items() if patient.config is not None else ():
-        node = patient.node(device.port, camera=role == "camera")
+        node = patient.node(device.port, camera=device.kind.opens == "video")
         if node is not None and node.exists() and not account.may_use(node):
             mend = usermod if lacking else f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
             yield fail(f"{role} rights", Reason.NOT_PERMITTED, f"{account.name} may not use {node}", mend)

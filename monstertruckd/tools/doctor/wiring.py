@@ -1,10 +1,11 @@
 """What hangs where, against the configuration."""
 
 from collections.abc import Iterator
+from typing import Any
 
-from monstertruck_drivers.config import AnyPort
+from monstertruck_drivers.config import AnyPort, Device
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.tree import DEVICES, Device, Node, Snapshot, ancestors, place, read_tree
+from monstertruck_drivers.usb.tree import DEVICES, Node, Snapshot, UsbDevice, ancestors, place, read_tree
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.finding import Finding, fail, fine, warn
 from monstertruckd.tools.doctor.patient import Patient
@@ -22,7 +23,7 @@ def wiring(patient: Patient) -> Iterator[Finding]:
     taken = {device.port.device for device in devices.values() if isinstance(device.port, UsbPortConfig)}
     for role, device in devices.items():
         if isinstance(device.port, UsbPortConfig):
-            yield from _by_hub(patient, tree, role, device.port, taken)
+            yield from _by_hub(patient, tree, role, device, taken)
         else:
             yield _by_path(patient, role, device.port)
     for name, count in tree.over_current.items():
@@ -38,7 +39,9 @@ def _by_path(patient: Patient, role: str, port: AnyPort) -> Finding:
     return fine(role, str(node))
 
 
-def _by_hub(patient: Patient, tree: Snapshot, role: str, port: UsbPortConfig, taken: set[str]) -> Iterator[Finding]:
+def _by_hub(patient: Patient, tree: Snapshot, role: str, device: Device[Any], taken: set[str]) -> Iterator[Finding]:
+    port, video = device.port, device.kind.opens == "video"
+    assert isinstance(port, UsbPortConfig)
     where = place(port.device)
     found = tree.devices.get(port.device)
     if found is None:
@@ -46,8 +49,8 @@ def _by_hub(patient: Patient, tree: Snapshot, role: str, port: UsbPortConfig, ta
     elif port.usb_id is not None and found.usb_id != port.usb_id:
         seen = f"{where}: expected {port.usb_id}, found {found.usb_id} {found.title}"
         yield fail(role, Reason.DEVICE_WRONG, seen, patient.find_port_command(role))
-    elif (node := found.find("video4linux" if role == "camera" else "tty", port.interface)) is None:
-        module = "uvcvideo" if role == "camera" else MODULES.get(found.usb_id[:4], "cdc_acm")
+    elif (node := found.find("video4linux" if video else "tty", port.interface)) is None:
+        module = "uvcvideo" if video else MODULES.get(found.usb_id[:4], "cdc_acm")
         seen = f"{where}: {found.usb_id} {found.title} has no node at interface {port.interface}"
         yield fail(role, Reason.DEVICE_LOST, seen, f"sudo modprobe {module}")
     else:
@@ -69,7 +72,7 @@ def _absent(patient: Patient, tree: Snapshot, role: str, port: UsbPortConfig, ta
     return fail(role, Reason.DEVICE_LOST, f"{where}: not plugged in", patient.find_port_command(role))
 
 
-def _settings(role: str, port: UsbPortConfig, device: Device, node: Node) -> Iterator[Finding]:
+def _settings(role: str, port: UsbPortConfig, device: UsbDevice, node: Node) -> Iterator[Finding]:
     if node.latency_ms is not None and node.latency_ms > port.latency_ms:
         seen = f"{node.name} answers after {node.latency_ms} ms instead of {port.latency_ms} ms"
         mend = f"echo {port.latency_ms} | sudo tee /sys/{node.path}/latency_timer"

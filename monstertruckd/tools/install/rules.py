@@ -22,7 +22,7 @@ def _devices(config: TruckConfig) -> Iterator[str]:
         if isinstance(device.port, UsbPortConfig):
             yield ""
             yield f"# {role}: {place(device.port.device)}"
-            yield from _device(role, device.port, method, camera=role == "camera")
+            yield from _device(role, device.port, method, camera=device.kind.opens == "video")
 
 
 def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camera: bool) -> Iterator[str]:

@@ -27,7 +27,7 @@ def test_both_ways_to_name_a_port(tmp_path: Path):
     by_path = truck(tmp_path, lidar("{path: /dev/truck/lidar}")).devices.lidar
     by_hub = truck(tmp_path, lidar('{hub: "1-1", port: 3, baud: 19200}')).devices.lidar
     assert by_path is not None
-    assert by_path.port == PortConfig(path=Path("/dev/truck/lidar"))
+    assert by_path.port == PortConfig(path=Path("/dev/truck/lidar"), baud=115200)
     assert by_hub is not None
     assert by_hub.port == UsbPortConfig(hub="1-1", port=3, baud=19200)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers.catalog import KINDS
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.tools.cli.main import app
 from tests.unit.docs.command_lines import commands_of
@@ -62,7 +62,7 @@ def test_no_page_fetches_anything_from_elsewhere_or_that_is_not_there(site: Path
 
 
 def test_every_device_command_and_topic_has_its_place(site: Path):
-    for kind in KINDS:
+    for kind in DEVICES.values():
         text = (site / "devices" / f"{kind.name}.html").read_text()
         for heading in ("Settings", "Probe", "Emulator", "Faults"):
             assert f'id="{heading.lower()}"' in text, (kind.name, heading)

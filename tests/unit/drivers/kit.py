@@ -3,15 +3,25 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.usb.machine import Machine
+from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 
 M = TypeVar("M", bound=Message)
+
+
+def emulated_computer(root: Path, clock: Clock) -> Computer:
+    """The computer whose files are in ``root``; they are read at once, so that the virtual clock goes on."""
+    return Computer(Machine(clock, Sysfs(root / "sys"), root / "dev", inline), root)
 
 
 class Kept(Generic[M]):

@@ -10,13 +10,14 @@ import pytest
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.driver import IioBatteryDriver
 from monstertruck_drivers.battery.emulator import IioEmulator
+from monstertruck_drivers.battery.iio import CONVERTERS
+from monstertruck_drivers.computer import Computer
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, InputError, ProtocolError
 from monstertruck_runtime.mailbox import Mailbox, latest
-from monstertruck_runtime.threads import inline
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
-from tests.unit.drivers.kit import Events, Kept, background
+from tests.unit.drivers.kit import Events, Kept, background, emulated_computer
 
 pytestmark = pytest.mark.virtual
 
@@ -31,7 +32,7 @@ class Rig:
         self.drive: Mailbox[DriveFeedback] = Mailbox(latest())
         self.ready = 0
         self.driver = IioBatteryDriver(
-            IioConfig(**config), clock, self.out, self.events, self.drive, root=root, offload=inline
+            IioConfig(**config), emulated_computer(root, clock), clock, self.out, self.events, self.drive
         )
 
     def current(self, amperes: float | None) -> None:
@@ -175,7 +176,7 @@ def test_unknown_faults_are_refused_with_a_list(tmp_path: Path):
         rig.emulator.inject("freeze", "on")
         rig.emulator.inject("bounce", "0.0")
         rig.emulator.convert()
-        assert (tmp_path / "iio:device0/in_voltage0_raw").read_text() == "2000\n"
+        assert (tmp_path / CONVERTERS / "iio:device0/in_voltage0_raw").read_text() == "2000\n"
 
     on_bench(tmp_path, test)
 
@@ -185,7 +186,7 @@ async def test_files_are_read_beside_the_loop_by_default(tmp_path: Path):
     clock = WallClock()
     IioEmulator(tmp_path, clock, lambda _: 2.4)
     out: Kept[Battery] = Kept()
-    driver = IioBatteryDriver(IioConfig(rate=50.0), clock, out, Events(), root=tmp_path)
+    driver = IioBatteryDriver(IioConfig(rate=50.0), Computer.at(tmp_path, clock), clock, out, Events())
     async with background(driver.run(lambda: None)):
         await out.count(6)
     assert out.last.voltage == pytest.approx(24.0, abs=0.1)

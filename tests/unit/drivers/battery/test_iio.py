@@ -7,6 +7,7 @@ import pytest
 
 from monstertruck_drivers.battery import iio
 from monstertruck_drivers.battery.probe import probe
+from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceLostError,
@@ -15,12 +16,12 @@ from monstertruck_runtime.errors import (
     PortBusyError,
     ProtocolError,
 )
-from monstertruck_runtime.threads import inline
+from tests.unit.drivers.kit import emulated_computer
 
 
 def converter(root: Path, number: int = 0, name: str = "ads1015", **files: str) -> Path:
     folder = root / f"iio:device{number}"
-    folder.mkdir()
+    folder.mkdir(parents=True)
     (folder / "name").write_text(f"{name}\n")
     for file, text in files.items():
         (folder / file).parent.mkdir(exist_ok=True)
@@ -114,8 +115,8 @@ def test_garbage_is_no_number(tmp_path: Path):
 
 
 async def test_the_probe_lists_readings_and_what_is_wrong(tmp_path: Path):
-    converter(tmp_path, in_voltage0_raw="500", in_voltage_scale="2", in_voltage3_raw="-")
-    found = await probe(tmp_path, inline)
+    converter(tmp_path / iio.CONVERTERS, in_voltage0_raw="500", in_voltage_scale="2", in_voltage3_raw="-")
+    found = await probe(emulated_computer(tmp_path, WallClock()), WallClock())
     (one,) = found["converters"]
     assert one["name"] == "ads1015"
     good, bad = one["channels"]

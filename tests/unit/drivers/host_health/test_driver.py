@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
+from monstertruck_drivers.computer import ROOT, Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.driver import HostHealthDriver
 from monstertruck_drivers.host_health.emulator import HostEmulator
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import ProtocolError
-from monstertruck_runtime.threads import inline
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth
 from monstertruck_schemas.reasons import Reason
-from tests.unit.drivers.kit import Events, Kept, background
+from tests.unit.drivers.kit import Events, Kept, background, emulated_computer
 
 
 class Rig:
@@ -28,7 +28,7 @@ class Rig:
         self.events = Events()
         self.driver = HostHealthDriver(
             HostHealthConfig(disk_path=root, **{"disk": 0, "disk_clear": 1} | config),
-            clock, self.out, self.events, root=root, offload=inline,
+            emulated_computer(root, clock), clock, self.out, self.events,
         )  # fmt: skip
 
     async def follow(self, *steps: tuple[str, str, float]) -> None:
@@ -148,7 +148,8 @@ def test_limits_must_leave_room():
 
 async def test_this_computer_in_a_thread(tmp_path: Path):
     out: Kept[HostHealth] = Kept()
-    driver = HostHealthDriver(HostHealthConfig(rate=10.0, disk_path=tmp_path), WallClock(), out, Events())
+    clock, config = WallClock(), HostHealthConfig(rate=10.0, disk_path=tmp_path)
+    driver = HostHealthDriver(config, Computer.at(ROOT, clock), clock, out, Events())
     async with background(driver.run(lambda: None)):
         await out.count(3)
     assert out.last.cpu is not None

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
+from monstertruck_drivers.computer import ROOT, Computer
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.driver import LinkQualityDriver
 from monstertruck_drivers.link_quality.emulator import ON_AIR, NetworkEmulator
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
-from monstertruck_runtime.threads import inline
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
 from monstertruck_schemas.reasons import Reason
-from tests.unit.drivers.kit import Events, Kept, background
+from tests.unit.drivers.kit import Events, Kept, background, emulated_computer
 
 
 class Rig:
@@ -25,7 +25,7 @@ class Rig:
         self.events = Events()
         self.ready = 0
         self.driver = LinkQualityDriver(
-            LinkQualityConfig(**config), clock, self.out, self.events, root=root, offload=inline
+            LinkQualityConfig(**config), emulated_computer(root, clock), clock, self.out, self.events
         )
 
     def be_ready(self) -> None:
@@ -138,7 +138,7 @@ def test_every_form_of_the_kernels_table(tmp_path: Path, style: str, level: Link
 
 async def test_this_computers_own_link_in_a_thread():
     out: Kept[LinkHealth] = Kept()
-    async with background(
-        LinkQualityDriver(LinkQualityConfig(rate=10.0), WallClock(), out, Events()).run(lambda: None)
-    ):
+    clock = WallClock()
+    driver = LinkQualityDriver(LinkQualityConfig(rate=10.0), Computer.at(ROOT, clock), clock, out, Events())
+    async with background(driver.run(lambda: None)):
         await out.count(2)

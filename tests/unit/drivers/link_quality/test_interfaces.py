@@ -11,8 +11,8 @@ from monstertruck_drivers.link_quality.interfaces import Signal, choose, parse_w
 from monstertruck_drivers.link_quality.probe import probe
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.threads import inline
 from monstertruck_schemas.health import LinkMedium
+from tests.unit.drivers.kit import emulated_computer
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_the_choice(tmp_path: Path):
 
 async def test_the_probe(tmp_path: Path):
     NetworkEmulator(tmp_path, WallClock())
-    found = await probe(tmp_path, inline)
+    found = await probe(emulated_computer(tmp_path, WallClock()), WallClock())
     assert found["chosen"] == "wlan0"
     assert [row["name"] for row in found["interfaces"]] == ["eth0", "wlan0"]
 

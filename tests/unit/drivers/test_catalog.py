@@ -1,0 +1,113 @@
+"""Roles and kinds: everything that lists devices agrees with them, and what does not fit is refused by name."""
+
+import dataclasses
+from pathlib import Path
+from typing import get_type_hints
+
+import pytest
+
+from monstertruck_drivers.catalog import DEVICES, LIDAR, DeviceKind, Duty, Role, start_order
+from monstertruck_drivers.config import Device, Devices, Monitors
+from monstertruck_drivers.usb.config import UsbConfig
+from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.ports import Publisher, Subscription
+from monstertruck_schemas import topics
+from monstertruck_schemas.roles import DeviceRole
+from monstertruckd.config.load import load_truck
+
+KINDS = list(DEVICES.values())
+
+
+def test_every_role_of_the_enum_has_its_row_a_kind_and_a_key():
+    assert set(DEVICES.roles) == set(DeviceRole)
+    for role in DEVICES.roles.values():
+        section = Monitors if role.duty is Duty.MONITOR else Devices
+        assert section.model_fields[role.name].description == role.doc
+        assert DEVICES.of_role(role.name), role.name
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_driver_takes_the_ends_of_its_roles_topics(kind: DeviceKind):
+    hints = get_type_hints(kind.implementation_class().__init__)
+    for role in kind.roles:
+        for ends, end in ((role.writes, Publisher), (role.reads, Subscription)):
+            for name, topic in ends.items():
+                assert end[topic.model] in (hints[name], *getattr(hints[name], "__args__", ())), (kind.name, name)
+    assert {"events", "name", "clock", "config"} <= hints.keys()
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_every_kind_has_an_emulator_and_a_probe(kind: DeviceKind):
+    emulator = get_type_hints(kind.emulator_factory())["return"]
+    assert hasattr(emulator, "run")
+    assert hasattr(emulator, "inject")
+    assert "settings" in kind.probe_function().__annotations__
+
+
+def test_devices_start_behind_a_hub_in_the_order_of_their_rows():
+    assert start_order() == UsbConfig().start_order
+    assert start_order()[0] == DeviceRole.DRIVE, "what stops the truck comes first"
+    assert start_order()[-1] == DeviceRole.CAMERA, "what loads the bus comes last"
+
+
+def test_kinds_are_found_by_name_and_by_role():
+    assert DEVICES.named("epos") is DEVICES.named("drive_3") is DEVICES["epos"]
+    with pytest.raises(InputError, match=r"unknown device 'wheel'; known: hokuyo_urg \(lidar\), epos"):
+        DEVICES.named("wheel")
+
+
+CONFIG = """\
+version: 1
+devices:
+  lidar: {{ port: {{ path: /dev/lidar }}, driver: {{ kind: hokuyo_urg }} }}
+  {line}
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("sonar: { port: { path: /dev/x }, driver: { kind: os4000 } }", ":4: devices.sonar: unknown key; known here: "),
+        ("compas: { port: { path: /dev/x }, driver: { kind: os4000 } }", "unknown key (did you mean compass?)"),
+        ("compass: { port: { path: /dev/x }, driver: { kind: epos } }", ":4: devices.compass.driver.kind: "),
+    ],
+)
+def test_a_role_without_a_row_is_refused_with_its_line_and_what_is_known(tmp_path: Path, line: str, complaint: str):
+    (tmp_path / "truck.yaml").write_text(CONFIG.format(line=line))
+    with pytest.raises(ConfigError) as caught:
+        load_truck(tmp_path / "truck.yaml")
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize(("role", "baud"), [("drive", 38400), ("compass", 19200), ("stabiliser", 1_000_000)])
+def test_a_port_without_a_baud_has_its_devices_own(tmp_path: Path, role: str, baud: int):
+    kind = DEVICES.named(role).name
+    text = f"version: 1\ndevices:\n  {role}: {{ port: {{ path: /dev/x }}, driver: {{ kind: {kind} }} }}\n"
+    (tmp_path / "truck.yaml").write_text(text)
+    config, _ = load_truck(tmp_path / "truck.yaml")
+    device = config.devices.present()[role]
+    assert isinstance(device, Device)
+    assert (device.port.baud, device.kind.name) == (baud, kind)
+
+
+SONAR = Role(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": topics.COMPASS})
+
+
+@pytest.mark.parametrize(
+    ("role", "fault"),
+    [
+        (SONAR, None),
+        (dataclasses.replace(LIDAR, doc="another"), "role lidar: there is another one of that name"),
+        (dataclasses.replace(SONAR, name="so nar"), "expected an identifier"),
+        (dataclasses.replace(SONAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
+        (
+            dataclasses.replace(SONAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/sonar")}),
+            "sensor/sonar is no entry point of monstertruck.topics",
+        ),
+    ],
+)
+def test_a_role_of_another_distribution_must_fit_in(role: Role, fault: str | None):
+    catalog = type(DEVICES)(*KINDS)
+    kind = dataclasses.replace(DEVICES["os4000"], roles=(role,))
+    found = catalog.fault("os4000", kind)
+    assert (found is None) if fault is None else (found is not None and fault in found)
