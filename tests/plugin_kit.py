@@ -1,0 +1,59 @@
+"""Distributions made from a documentation page's own code blocks, installed outside the tree without network."""
+
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r'^```\w+ title="(?P<file>[^"]+)"\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
+
+
+def files_of(page: Path) -> dict[str, str]:
+    """Code blocks of a page by their titles, the names of the files they are."""
+    return {block["file"]: block["text"] for block in BLOCK.finditer(page.read_text(encoding="utf-8"))}
+
+
+def written(files: dict[str, str], folder: Path) -> Path:
+    """The files in ``folder``."""
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return folder
+
+
+def installed(project: Path, target: Path) -> Path:
+    """Build the wheel of ``project`` and unpack it into ``target``, which then belongs on the path of a process.
+
+    That is all an installer does for a wheel of pure Python; its entry points are found there.
+    """
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(project / "dist")]
+    subprocess.run(build, cwd=project, check=True, capture_output=True)
+    (wheel,) = (project / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(target)
+    return target
+
+
+def run_with(target: Path, *arguments: str, cwd: Path = ROOT) -> str:
+    """Run the command line in a process that sees what is installed in ``target``.
+
+    Returns:
+        What it printed on standard output.
+
+    Raises:
+        AssertionError: it failed; the text is what it printed.
+    """
+    ended = subprocess.run(
+        [sys.executable, "-m", "monstertruckd", *arguments],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(target)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
