@@ -11,7 +11,7 @@ import numpy as np
 from monstertruck_estimation.se2 import between, compose, transform
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
-from monstertruck_estimation.slam.mapping import Event, Mapper
+from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scans import prepare
 from slam_parts.kiss_alone import KissOdometry
 from slam_parts.logs import Log, load, scored
@@ -91,8 +91,8 @@ def ours(log: Log) -> Run:
     notes = {
         f"online_{name}": online[name],
         "keys": float(len(mapper.map)),
-        "closures": float(events.count(Event.CLOSED)),
-        "rejected": float(events.count(Event.REJECTED)),
+        "closures": float(events.count(MappingEvent.CLOSED)),
+        "rejected": float(events.count(MappingEvent.REJECTED)),
         "scan_p95_ms": 1e3 * float(np.percentile(times, 95)),
         "finish_s": polish,
     }
@@ -100,7 +100,7 @@ def ours(log: Log) -> Run:
         notes["graph_ms"] = graph
     points = [
         transform(pose, key.scan.points[np.hypot(*key.scan.points.T) < 10.0])
-        for pose, key in zip(mapper.map.poses, mapper.map.keys, strict=True)
+        for pose, key in zip(mapper.map.poses, mapper.map.frames, strict=True)
     ]
     return Run(
         log.name,
@@ -115,7 +115,7 @@ def ours(log: Log) -> Run:
 
 
 def graph_ms(mapper: Mapper) -> float | None:
-    """Processor time, ms, to settle the first 1000 key scans' graph after a push; None if there are fewer."""
+    """Processor time, ms, to settle the first 1000 keyframes' graph after a push; None if there are fewer."""
     if len(mapper.map) < NODES:
         return None
     edges = mapper.map.edges.edges()

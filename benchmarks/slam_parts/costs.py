@@ -9,7 +9,7 @@ from numba import njit
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.mapping import MappingEstimator
-from monstertruck_estimation.slam.scans import prepared
+from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.logs.scans import read_scans
@@ -64,7 +64,7 @@ def step_cost(recording: Path) -> dict[str, float]:
     estimator, times = MappingEstimator(MapperConfig(), GridConfig()), []
     for scan in read_scans(recording).scans:
         begin = time.thread_time_ns()
-        estimator.step(prepared(scan, 30.0, estimator.twist), scan)
+        estimator.step(prepare_input(scan, 30.0, estimator.twist), scan)
         times.append(time.thread_time_ns() - begin)
     values = np.array(times[5:]) / 1e6
     return {"step_median_ms": float(np.median(values)), "step_p99_ms": float(np.percentile(values, 99))}

@@ -1,7 +1,7 @@
 """Two hours of driving round and round: does the mapper's memory stay bounded?
 
 A truck with drifting wheels follows one closed way through the rooms of the emulators' world, ten scans a second; every
-pass adds key scans until the most dispensable have to go. The estimation worker runs in this process, whose resident
+pass adds keyframes until the most dispensable have to go. The estimation worker runs in this process, whose resident
 memory is taken once in ten minutes.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_estimation.slam.worker import EstimationWorker
+from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import OCCUPIED, load_map
@@ -49,7 +49,7 @@ def run() -> tuple[dict[str, float], dict[str, float], bool]:
     """Figures, goals, and whether all are met."""
     world, poses, rng = load_map(MAP), way(), np.random.default_rng(1)
     clear, (left, low) = clearance(world.cells == OCCUPIED), world.origin[:2]
-    worker = EstimationWorker()
+    worker = SlamWorker()
     worker.step(WorkerInput(start=Start(SlamConfig())))
     odom, memory, off = poses[0].copy(), [], []
     count = round(HOURS * 3600 / PERIOD)
@@ -70,7 +70,7 @@ def run() -> tuple[dict[str, float], dict[str, float], bool]:
             memory.append(resident())
             keys, minute = told.counts["keys"], (k + 1) * PERIOD / 60
             late = float(np.mean(off[-round(count / (6 * HOURS)) :]))
-            print(f"minute {minute:3.0f}: {memory[-1]:.1f} MB, {keys} key scans, off by {late:.3f} m", flush=True)
+            print(f"minute {minute:3.0f}: {memory[-1]:.1f} MB, {keys} keyframes, off by {late:.3f} m", flush=True)
     figures = {f"endurance_{10 * (n + 1)}min_mb": round(value, 1) for n, value in enumerate(memory)}
     figures |= {
         "endurance_growth_mb": round(max(memory[-4:]) - memory[-5], 1),

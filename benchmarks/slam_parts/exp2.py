@@ -5,7 +5,7 @@ when it was measured. kiss-icp never learns of the sweep, so its poses are those
 lower entropy and fewer points that were later seen through mean a sharper map; the free area must not be bought by
 leaving out. A wall that falls on the edge of a cell is two cells wide, and seen through or not by chance: every map is
 drawn in ``PLACEMENTS`` random places of the grid, the figures are means, ``spread`` their standard deviation. Ours is
-the trajectory as the saved graph has it at the end, the correction of its key scans spread over the scans between; what
+the trajectory as the saved graph has it at the end, the correction of its keyframes spread over the scans between; what
 was told while driving is drawn too (``online``), and ours with every scan drawn at the pose of its middle (``rigid``).
 
 Entropy is that of all cells of one frame round both maps, a bit for each that was not seen: it is lower by
@@ -34,9 +34,9 @@ from monstertruck_estimation.se2 import between, compose, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig, SlamConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.mapping import MappingEstimator
-from monstertruck_estimation.slam.scans import prepared
+from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import load
-from monstertruck_estimation.slam.worker import front_of
+from monstertruck_estimation.slam.worker import matcher_of
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
@@ -91,7 +91,7 @@ def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float
 
 
 def settled(folder: Path, stamps: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """The poses that were told, moved as the saved graph has moved the key scans before and after each."""
+    """The poses that were told, moved as the saved graph has moved the keyframes before and after each."""
     graph = load(folder).graph
     at = np.clip(np.searchsorted(graph.stamps, stamps, side="right") - 1, 0, len(graph.stamps) - 2)
     then = interpolate(stamps, told, graph.stamps.astype(float))
@@ -176,10 +176,10 @@ def compared(ours: dict[str, np.ndarray], kiss: dict[str, np.ndarray]) -> dict[s
 
 def mapped(scans: list[LaserScan], mount: float, front: str = "planar") -> Track:
     """What the mapper with this front end makes of ``scans`` without the daemon."""
-    estimator = MappingEstimator(SlamConfig().mapper, GridConfig(), front_of(front))
+    estimator = MappingEstimator(SlamConfig().mapper, GridConfig(), matcher_of(front))
     for scan in scans:
         inputs = ScanInput.of(scan, (mount, 0.0, 0.0))
-        estimator.step(prepared(inputs, estimator.mapper.config.longest, estimator.twist), inputs)
+        estimator.step(prepare_input(inputs, estimator.mapper.config.longest, estimator.twist), inputs)
     estimator.finish()
     stamps, poses = estimator.mapper.trajectory()
     return stamps.astype(float), poses

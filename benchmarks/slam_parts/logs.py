@@ -35,7 +35,7 @@ MANIFEST = {
     ),
 }
 FULL_RATE_ENDS = 976053945.95
-"""Intel: from here on only key scans are in the log, s."""
+"""Intel: from here on only keyframes are in the log, s."""
 SHORT = 10.0
 """Pairs less than this apart show the front end, s."""
 

@@ -3,7 +3,7 @@
 Absolute error (ATE): root mean square of the position in odom, which begins at the truth; no alignment. Relative error
 (RPE): of the motion over every metre driven. After a kidnapping odom goes on from where it was, so that part of the
 drive counts from its own beginning. ``reckoning`` is the daemon's default: wheels, its heading held by the compass.
-The scans are matched by the mapper itself, on the odometry that is judged (without wheels: on nothing), and told
+The scans are matched by the mapper itself, on the odometry under test (without wheels: on nothing), and told
 30 ms after their end; in kidnapped drives by the localisation in a map that another drive has saved, and by all
 sensors once more in the plain grid the world is drawn from.
 """
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
-from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, Reckoner
-from monstertruck_estimation.scan_tilt import Track, plane_slopes, plane_tilt
+from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryEstimator
+from monstertruck_estimation.scan_tilt import AngleHistory, plane_slopes, plane_tilt
 from monstertruck_estimation.se2 import between, compose, interpolate, inverse
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
-from monstertruck_estimation.slam.localisation import LocalisingEstimator
+from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator
-from monstertruck_estimation.slam.scans import prepared
+from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import load, save
-from monstertruck_estimation.slam.worker_io import Estimate, Moved, ScanInput
+from monstertruck_estimation.slam.worker_io import ScanIncrement, ScanInput, SlamEstimate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
 from monstertruck_sim.world.config import TruckConfig
@@ -51,7 +51,7 @@ SUBSETS = {
 }
 PLAIN = Path(__file__).resolve().parents[2] / "configs" / "worlds" / "rooms.yaml"
 STARTED = 2.0
-"""Seconds in which nothing is judged."""
+"""Seconds in which nothing is evaluated."""
 GOALS = {
     "all_ate_over_reckoning": 1.0,
     "corridor_degenerate": 0.9,
@@ -73,7 +73,7 @@ class Run:
     stamps: list[float] = field(default_factory=list)
     poses: list[tuple[float, ...]] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
-    standings: Counter[Standing] = field(default_factory=Counter)
+    standings: Counter[LocalisationStatus] = field(default_factory=Counter)
     slips: list[float] = field(default_factory=list)
     """Stamps of their onsets."""
     found: float | None = None
@@ -84,18 +84,18 @@ class Matching:
     """Scans to motion, as the estimation worker does it."""
 
     def __init__(self, drive: Drive, saved: Path | None = None) -> None:
-        self._body = Track()
-        self.newest: Estimate | None = None
+        self._body = AngleHistory()
+        self.newest: SlamEstimate | None = None
         if saved is None:
             self.estimator: Estimator = MappingEstimator(MapperConfig(), GridConfig(), start=drive.start)
         else:
-            self.estimator = LocalisingEstimator(load(saved), MapperConfig(), drive.start)
+            self.estimator = LocalisationEstimator(load(saved), MapperConfig(), drive.start)
 
     def heed(self, attitude: Attitude) -> None:
         """Take the tilt."""
         self._body.extend(((attitude.stamp, (attitude.roll, attitude.pitch)),))
 
-    def match(self, stamp: int, ranges: Array, history: list[tuple[float, ...]] | None) -> Moved | None:
+    def match(self, stamp: int, ranges: Array, history: list[tuple[float, ...]] | None) -> ScanIncrement | None:
         """Motion up to the scan; ``history`` are stamps (s) and poses of odometry, None without."""
         tilt = self._body.at(stamp + SWEEP // 2)
         if tilt is not None and plane_tilt(*tilt) > MAX_TILT:
@@ -115,7 +115,7 @@ class Matching:
             slopes=None if tilt is None else plane_slopes(*tilt),
             height=0.25,
         )
-        self.newest = self.estimator.step(prepared(inputs, 30.0, self.estimator.twist), inputs)
+        self.newest = self.estimator.step(prepare_input(inputs, 30.0, self.estimator.twist), inputs)
         return None if self.newest is None else self.newest.moved
 
 
@@ -138,7 +138,7 @@ def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path |
     x, y, yaw = drive.start
     start = Pose2D(x=x, y=y, yaw=yaw)
     fusion = Fusion(FusionConfig(kind="fusion", start=start), chassis)
-    reckoner: Reckoner = fusion
+    reckoner: OdometryEstimator = fusion
     if subset == "reckoning":
         reckoner = DeadReckoning(OdometryConfig(start=start), chassis)
     matching = Matching(drive, saved) if "scans" in sensors else None
@@ -170,7 +170,7 @@ def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path |
     return run
 
 
-def _message(stamp: int, moved: Moved) -> ScanMotion:
+def _message(stamp: int, moved: ScanIncrement) -> ScanMotion:
     x, y, yaw = moved.motion
     return ScanMotion(
         stamp=stamp,
@@ -182,7 +182,7 @@ def _message(stamp: int, moved: Moved) -> ScanMotion:
     )
 
 
-def _tell(run: Run, reckoner: Reckoner, now: int, truth: Array, drive: Drive) -> None:
+def _tell(run: Run, reckoner: OdometryEstimator, now: int, truth: Array, drive: Drive) -> None:
     estimate = reckoner.estimate(now)
     if estimate is None:
         return
@@ -198,10 +198,10 @@ def _judge_match(run: Run, matching: Matching, drive: Drive, stamp: int, truth: 
     estimate = matching.newest
     if estimate is None:
         return
-    run.standings[estimate.standing] += 1
+    run.standings[estimate.status] += 1
     if drive.carried is None or stamp <= drive.carried or run.found is not None:
         return
-    if estimate.standing in (Standing.LOCALISED, Standing.DEGENERATE):
+    if estimate.status in (LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE):
         off = np.array(estimate.pose) - _at(truth, stamp / SECOND)
         if math.hypot(off[0], off[1]) < 0.1:
             run.found = (stamp - drive.carried) / SECOND
@@ -212,7 +212,7 @@ def _at(truth: Array, second: float) -> Array:
     return row
 
 
-def judged(run: Run, drive: Drive) -> dict[str, float]:
+def evaluated(run: Run, drive: Drive) -> dict[str, float]:
     """ATE (m), RPE (m and degrees per metre), NEES and the greatest step of one run."""
     stamps, poses = np.array(run.stamps), np.array(run.poses)
     every = np.array(drive.truth)
@@ -261,7 +261,7 @@ def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[st
             drive = driven(scenario, seed, folder)
             for subset in SUBSETS:
                 done = run_drive(drive, subset, saved)
-                cells.setdefault((scenario.name, subset), []).append(judged(done, drive))
+                cells.setdefault((scenario.name, subset), []).append(evaluated(done, drive))
                 if subset == "all":
                     robots.setdefault(scenario.name, []).append((drive, done))
             if saved is not None:
@@ -299,8 +299,8 @@ def _figures(
     }
     figures |= {f"world_{subset}_ate_m": round(float(value), 4) for subset, value in mean.items()}
     figures["all_ate_over_reckoning"] = round(float(mean["all"] / mean["reckoning"]), 4)
-    corridor = sum((run.standings for _, run in robots["corridor"]), Counter[Standing]())
-    figures["corridor_degenerate"] = round(corridor[Standing.DEGENERATE] / corridor.total(), 4)
+    corridor = sum((run.standings for _, run in robots["corridor"]), Counter[LocalisationStatus]())
+    figures["corridor_degenerate"] = round(corridor[LocalisationStatus.DEGENERATE] / corridor.total(), 4)
     figures["corridor_nees"] = round(_mean(cells["corridor", "all"], "nees"), 3)
     for name in ("kidnap", "kidnap_plain"):
         found = [run.found for _, run in robots[name]]

@@ -1,4 +1,4 @@
-"""Odom in map as it is shown: the newest correction, approached at a limited pace so that no tracker sees a jump."""
+"""Odom in map as published: follows the newest correction at a limited rate, so that no tracker sees a jump."""
 
 import math
 
@@ -11,14 +11,14 @@ from monstertruck_estimation.slam.worker_io import Vector
 Array = NDArray[np.float64]
 
 
-class Correction:
-    """Follows corrections where the robot is, not where odom begins: a turn about a far origin would be a jump.
+class SmoothedCorrection:
+    """Follows corrections at the robot's place, not at the origin of odom: a turn about a far origin would be a jump.
 
     Args:
         slew: greatest speed of the change, m/s and rad/s.
         jump: corrections of the robot's place beyond this, m, count at once.
-        settle: time constant of the approach within that, s; 0 = none. Whoever undoes the motion of a scan by these
-            poses must not see every correction as motion: matched so, the next scan would be wrong by as much.
+        settle: time constant of the approach within that, s; 0 = none. Scans are deskewed by these poses: a correction
+            must not look like motion.
     """
 
     def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:
@@ -29,13 +29,13 @@ class Correction:
         self._shown = np.zeros(3)
 
     @property
-    def shown(self) -> Vector:
+    def value(self) -> Vector:
         """Odom in map, m and rad."""
         x, y, yaw = self._shown.tolist()
         return x, y, yaw
 
-    def aim(self, map_from_odom: Vector, *, at_once: bool = False) -> None:
-        """Take a new correction; ``at_once``: what was shown before meant nothing."""
+    def set_target(self, map_from_odom: Vector, *, at_once: bool = False) -> None:
+        """Take a new correction; ``at_once``: apply it without a transition."""
         self._target = np.array(map_from_odom)
         if at_once:
             self._shown = self._target.copy()

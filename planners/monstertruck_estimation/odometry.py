@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from monstertruck_estimation.transforms import wrap_angle
-from monstertruck_estimation.wheel_motion import Roll, WheelMotion
+from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND, Clock
@@ -32,17 +32,17 @@ Share = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 
 STILL: Final = 0.02
-"""Way, m, after which the truck no longer counts as standing at its start."""
+"""Distance, m, up to which the truck counts as standing at its start."""
 
-MEMORY: Final = SECOND
-"""A reading counts as a source of the estimate for this long, ns."""
+SOURCE_TIMEOUT: Final = SECOND
+"""A sensor is listed as a source for this long after a reading, ns."""
 
 
 _NINE: Final = Struct("9d")
 
 
-class Spread(NamedTuple):
-    """Covariance of (x, y, yaw), of which one half stands for both: m^2, m rad, rad^2."""
+class PlanarCovariance(NamedTuple):
+    """Covariance of (x, y, yaw) as its upper triangle, m^2, m rad, rad^2: so few plain floats are faster than numpy."""
 
     xx: float = 0.0
     xy: float = 0.0
@@ -51,20 +51,22 @@ class Spread(NamedTuple):
     yw: float = 0.0
     ww: float = 0.0
 
-    def moved(self, dx: float, dy: float) -> "Spread":
-        """After a way (dx, dy), m, in the frame of the pose: it swings with the uncertain yaw."""
+    def moved(self, dx: float, dy: float) -> "PlanarCovariance":
+        """After a motion (dx, dy), m, in the frame of the pose: the uncertain yaw turns it."""
         xx, xy, yy, xw, yw, ww = self
         ahead, aside = xw - dy * ww, yw + dx * ww
-        return Spread(xx - dy * (xw + ahead), xy + dx * xw - dy * aside, yy + dx * (yw + aside), ahead, aside, ww)
+        return PlanarCovariance(
+            xx - dy * (xw + ahead), xy + dx * xw - dy * aside, yy + dx * (yw + aside), ahead, aside, ww
+        )
 
-    def plus(self, other: Iterable[float]) -> "Spread":
-        """With another one added that is independent of it."""
-        return Spread(*map(operator.add, self, other))
+    def plus(self, other: Iterable[float]) -> "PlanarCovariance":
+        """Sum with an independent covariance."""
+        return PlanarCovariance(*map(operator.add, self, other))
 
-    def corrected(self, gain_x: float, gain_y: float, gain: float) -> "Spread":
-        """After a yaw was taken in with these gains."""
+    def corrected(self, gain_x: float, gain_y: float, gain: float) -> "PlanarCovariance":
+        """After an update with a yaw of these gains."""
         xx, xy, yy, xw, yw, ww = self
-        return Spread(
+        return PlanarCovariance(
             xx - gain_x * xw, xy - gain_x * yw, yy - gain_y * yw, xw - gain_x * ww, yw - gain_y * ww, ww - gain * ww
         )
 
@@ -112,7 +114,7 @@ class OdometryConfig(Schema):
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class OdometryEstimate:
     """Pose of base in odom, twist in base, at one instant."""
 
     pose: Vector
@@ -128,8 +130,8 @@ class Estimate:
     sources: tuple[str, ...]
 
 
-class Reckoner(Protocol):
-    """What ``OdometryService`` drives."""
+class OdometryEstimator(Protocol):
+    """Estimator of an ``OdometryService``."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent."""
@@ -140,7 +142,7 @@ class Reckoner(Protocol):
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take heading and tilt."""
 
-    def estimate(self, now: int) -> Estimate | None:
+    def estimate(self, now: int) -> OdometryEstimate | None:
         """Pose at ``now`` (ns); None while nothing is known."""
 
 
@@ -156,9 +158,9 @@ class DeadReckoning:
         self._config = config
         self._chassis = chassis
         self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
-        self._covariance = Spread()
+        self._covariance = PlanarCovariance()
         self._slip = (config.distance_noise**2, config.lateral_noise**2, config.yaw_noise**2)
-        self._drift = Spread(xx=config.speed_noise**2, yy=config.speed_noise**2, ww=config.turn_noise**2)
+        self._drift = PlanarCovariance(xx=config.speed_noise**2, yy=config.speed_noise**2, ww=config.turn_noise**2)
         self._twist_covariance = self._drift.matrix()
         self._wheels = WheelMotion(chassis, config.max_speed)
         self._driven = 0.0
@@ -169,7 +171,7 @@ class DeadReckoning:
         """Headings left out because they were too far off."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
         self._wheels.observe_steering(feedback)
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
@@ -210,7 +212,7 @@ class DeadReckoning:
         self._covariance = self._covariance.corrected(gain_x, gain_y, gain)
         self._compass_used = attitude.stamp
 
-    def estimate(self, now: int) -> Estimate | None:
+    def estimate(self, now: int) -> OdometryEstimate | None:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
         if not self._wheels.known:
             return None
@@ -222,9 +224,9 @@ class DeadReckoning:
         covariance = moved.plus(term * age**2 for term in self._drift)
         sources = ["drive"]
         for name, used in (("steering", self._wheels.steered), ("compass", self._compass_used)):
-            if used is not None and now - used <= MEMORY:
+            if used is not None and now - used <= SOURCE_TIMEOUT:
                 sources.append(name)
-        return Estimate(
+        return OdometryEstimate(
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
             pose_covariance=covariance.matrix(),
@@ -237,13 +239,13 @@ class DeadReckoning:
         """The drive counts from a new origin: what it did in between is not known."""
         lost = (self._config.max_speed * dt) ** 2
         turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
-        self._covariance = self._covariance.plus(Spread(xx=lost, yy=lost, ww=turned))
+        self._covariance = self._covariance.plus(PlanarCovariance(xx=lost, yy=lost, ww=turned))
 
-    def _slipped(self, roll: Roll) -> Spread:
+    def _slipped(self, roll: WheelIncrement) -> PlanarCovariance:
         """What slip adds along the arc."""
         (a, b, c), (d, e, f), (_, _, g) = integration_jacobians(self._pose, *roll.twist, roll.dt)[1].tolist()
         along, aside, turned = (share * roll.way / roll.dt**2 for share in self._slip)
-        return Spread(
+        return PlanarCovariance(
             xx=a * a * along + b * b * aside + c * c * turned,
             xy=a * d * along + b * e * aside + c * f * turned,
             yy=d * d * along + e * e * aside + f * f * turned,
@@ -261,7 +263,7 @@ class DeadReckoning:
 
 
 class OdometryService:
-    """Publishes odometry on an absolute schedule, in odom and, unless something localises, unchanged in map.
+    """Publishes odometry on an absolute schedule, in odom and, without localisation, unchanged in map.
 
     Args:
         reckoning: the filter.
@@ -270,7 +272,7 @@ class OdometryService:
         steering: servo feedback, of a body that steers.
         compass: headings, if there is a compass.
         odometry: ``state/odometry``.
-        pose: ``state/pose``; None = something else publishes it.
+        pose: ``state/pose``; None = published by localisation.
         rate: poses per second.
     """
 
@@ -278,7 +280,7 @@ class OdometryService:
 
     def __init__(
         self,
-        reckoning: Reckoner,
+        reckoning: OdometryEstimator,
         clock: Clock,
         *,
         drives: Sequence[Subscription[DriveFeedback]],
@@ -315,7 +317,7 @@ class OdometryService:
                     self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
     def take(self) -> None:
-        """Hand on what is new."""
+        """Pass new messages to the estimator."""
         steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen
@@ -327,19 +329,16 @@ class OdometryService:
         if len(drives) == len(self._drives) and all(now is not then for now, then in zip(drives, known, strict=True)):
             self._reckoned = drives
             self._reckoning.observe_drive(*drives)
-        if compass is not None and compass is not before[1] and self.hears_compass():
+        if compass is not None and compass is not before[1] and self.accepts_compass():
             self._seen = (steering, compass)
             self._reckoning.observe_attitude(compass)
 
-    def hears_compass(self) -> bool:
-        """Whether a heading counts yet: it is held against a pose, which begins with the first drive reading.
-
-        Until then it waits, so that what a log shows first does not depend on ticks that showed nothing.
-        """
+    def accepts_compass(self) -> bool:
+        """Whether headings are used yet: they correct a pose, which begins with the first drive reading."""
         return bool(self._reckoned)
 
 
-def _message(estimate: Estimate, now: int, seq: int) -> Odometry:
+def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
     x, y, yaw = estimate.pose
     vx, vy, wz = estimate.twist
     return Odometry(

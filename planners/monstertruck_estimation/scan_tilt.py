@@ -2,7 +2,7 @@
 
 Body R = Ry(pitch) Rx(roll) in a level frame, mount M = Ry(a) Rx(b) on the body: the plane's normal is R M z, and the
 tilt is its angle to the vertical, acos(u . M z) with u = R^T z = (-sin p, sin r cos p, cos r cos p) the body's view of
-up. Compass and joints are told at other instants than scans, so both are taken at the middle of the scan.
+up. Compass and joints are read at other instants than scans, so both are interpolated to the middle of the scan.
 """
 
 import math
@@ -19,7 +19,7 @@ STALE: Final = SECOND // 4
 """Nanoseconds over which angles are extended beyond the newest reading."""
 KEPT: Final = 16
 UNKNOWN: Final = math.pi / 2
-"""Tilt of a scan whose mount or body does not tell its angles: nothing shall trust it."""
+"""Tilt of a scan whose mount or body angles are unknown, so that it is not used."""
 
 Angles = tuple[float, float]
 
@@ -47,7 +47,7 @@ def plane_slopes(
     return along * c + across * s, across * c - along * s
 
 
-class Track:
+class AngleHistory:
     """Recent values of two angles, read at any instant between and shortly after them."""
 
     def __init__(self) -> None:
@@ -86,8 +86,8 @@ class TiltStamper:
         self._out = out
         self._compass = compass
         self._feedback = joints
-        self._body = Track()
-        self._mount = Track()
+        self._body = AngleHistory()
+        self._mount = AngleHistory()
 
     def next_seq(self) -> int:
         """Sequence number for the next scan."""

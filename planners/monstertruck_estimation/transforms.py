@@ -1,4 +1,4 @@
-"""The frame tree: angles and quaternions in one place, look-up between any two frames, and the service that tells it.
+"""The frame tree: angles and quaternions, look-up between any two frames, and the service that publishes it.
 
 map > odom > base > sensors (REP 105). map to odom is the identity until something localises the truck in the map.
 A transform is the pose of ``child`` in ``parent``.
@@ -212,7 +212,7 @@ class TransformService:
         rate: messages per second.
         joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Whatever it carries
             has it for parent; until the angles are known it counts as level.
-        localised: what a localisation knows of the frames above base; it outweighs odometry and the fixed map to odom.
+        localised: transforms above base by localisation, which replace odometry and the fixed map to odom.
     """
 
     name = "transforms"

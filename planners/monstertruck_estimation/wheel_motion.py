@@ -1,7 +1,7 @@
-"""What the wheels did between two readings, of any drive family, and how far that is to be trusted.
+"""Motion of base by the wheels between two readings, of any drive family, with its covariance.
 
 The covariance comes from the family's own kinematics: the noise of every driven shaft and of both axle angles goes
-through the derivatives of the body's twist, and what no wheel can tell (sideways slip, scrubbing) is added to it.
+through the derivatives of the body's twist, and what wheels do not measure (sideways slip, scrubbing) is added to it.
 """
 
 import math
@@ -21,7 +21,7 @@ _ANGLE_STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Roll:
+class WheelIncrement:
     """Motion of base between two readings of all driven shafts."""
 
     since: int
@@ -76,13 +76,13 @@ class WheelMotion:
         return self._chassis.twist(self._pace, *self._angles)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
         if not feedback.trusted or not math.isfinite(feedback.front + feedback.rear):
             return
         self._angles = self._chassis.axles(feedback.front, feedback.rear)
         self.steered = feedback.stamp
 
-    def observe_drive(self, *shafts: DriveFeedback) -> Roll | None:
+    def observe_drive(self, *shafts: DriveFeedback) -> WheelIncrement | None:
         """Motion since the last reading; None for the first, one that is not later, or one that is not a number.
 
         Positions that were not read at one instant are brought to the newest by their own speeds; what that misses is
@@ -102,13 +102,13 @@ class WheelMotion:
         angles = ((then[0] + self._angles[0]) / 2, (then[1] + self._angles[1]) / 2)
         if max(map(abs, rolled)) > self._max_speed * dt:
             self._pace = (0.0,) * len(self._pace)
-            return Roll(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
+            return WheelIncrement(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
         self._pace = self._chassis.pace(tuple(way / dt for way in rolled), *angles)
         way = max(map(abs, self._pace)) * dt
-        return Roll(since, stamp, self._chassis.twist(self._pace, *angles), way, self._pace, angles)
+        return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), way, self._pace, angles)
 
 
-def way_covariance(chassis: Chassis, roll: Roll, shaft: float, angle: float, slip: Vector) -> Array:
+def way_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Vector) -> Array:
     """Covariance, shape (3, 3), of the way (dx, dy, dyaw) that ``roll`` stands for, in base; m and rad.
 
     It grows with the way, not with the number of readings the way is cut into.

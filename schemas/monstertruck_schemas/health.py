@@ -60,7 +60,7 @@ class RecorderHealth(Message):
     reason: Reason = Reason.OK
 
 
-class Standing(StrEnum):
+class LocalisationStatus(StrEnum):
     """How much the pose in map is worth."""
 
     MAPPING = "mapping"
@@ -78,7 +78,7 @@ class Standing(StrEnum):
 class SlamHealth(Message):
     """How well the newest scan fitted the map, and what has happened since the start."""
 
-    standing: Standing
+    standing: LocalisationStatus
     accepted: bool
     """Whether the scan corrected the pose; otherwise odometry alone moved it."""
     overlap: Annotated[float, Field(ge=0, le=1)]

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_schemas import topics
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_sim.world.built_in import BUILT_IN
@@ -94,7 +94,7 @@ def test_what_it_mapped_stands_in_the_world(drive: dict):
 
 def test_health_tiles_and_the_saved_map(drive: dict):
     health = drive["health/slam"]
-    assert {message.standing for message in health} <= {Standing.MAPPING, Standing.DEGENERATE}
+    assert {message.standing for message in health} <= {LocalisationStatus.MAPPING, LocalisationStatus.DEGENERATE}
     assert health[-1].keys > 5
     assert health[-1].left_out == 0
     assert drive["state/map_tiles"]

@@ -10,7 +10,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.health import OdometryHealth, Standing
+from monstertruck_schemas.health import LocalisationStatus, OdometryHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_sim.world.config import Iron
@@ -52,7 +52,7 @@ def test_a_corridor_shows_in_health_as_degenerate(tmp_path: Path):
 
     health, events, poses = run_virtual(main, start=SECOND)
     assert len(health) > 40
-    assert np.mean([message.standing is Standing.DEGENERATE for message in health[5:]]) > 0.9
+    assert np.mean([message.standing is LocalisationStatus.DEGENERATE for message in health[5:]]) > 0.9
     assert health[-1].degeneracy < 0.03
     assert abs(np.sin(health[-1].direction)) < 0.1, "it knows least along the corridor"
     assert Reason.MATCH_DEGENERATE in {event.reason for event in events}

@@ -10,7 +10,7 @@ from monstertruckd.tools.cli.options import ENDPOINT
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
-    from monstertruck_estimation.slam.worker_io import Estimate, WorkerOutput
+    from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
     from monstertruckd.tools.logs.scans import ScanLog
 
 app = command_group("Build, show, save and use occupancy maps.")
@@ -30,7 +30,7 @@ def build(
 ) -> None:
     """A map from a log's scans, and its odometry where there is one."""
     from monstertruck_estimation.slam.config import SlamConfig
-    from monstertruck_estimation.slam.worker import EstimationWorker
+    from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_estimation.slam.worker_io import WorkerInput
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.logs.scans import read_scans
@@ -38,7 +38,7 @@ def build(
     if front not in ("planar", "kiss"):
         raise InputError(f"--front {front}: expected planar or kiss")
     scans = read_scans(log)
-    worker = EstimationWorker()
+    worker = SlamWorker()
     facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front}))
     done: WorkerOutput = worker.step(WorkerInput(finish=True, whole=True, save=output))
     if done.error is not None:
@@ -86,7 +86,7 @@ def save(
 ) -> None:
     """The map that a running robot has published, as map_server files."""
     from monstertruck_estimation.slam.storage import trinary
-    from monstertruck_estimation.slam.worker_io import Patch
+    from monstertruck_estimation.slam.worker_io import GridPatch
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock, run_wall
     from monstertruck_runtime.errors import NoAnswerError
@@ -106,7 +106,7 @@ def save(
 
     grid = run_wall(newest)
     cells = grid.cells.reshape(grid.height, grid.width)
-    save_map(trinary(Patch(cells, (grid.origin.x, grid.origin.y), grid.resolution)), output.with_suffix(".yaml"))
+    save_map(trinary(GridPatch(cells, (grid.origin.x, grid.origin.y), grid.resolution)), output.with_suffix(".yaml"))
     remark(f"wrote {output.with_suffix('.yaml')}")
 
 
@@ -138,12 +138,12 @@ def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption
     """Where a log's scans were taken in a saved map, without knowing where it begins."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.storage import load
-    from monstertruck_estimation.slam.worker import EstimationWorker
+    from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruckd.tools.logs.scans import read_scans
 
     saved, scans = load(place), read_scans(log)
-    facts, estimates = _run(EstimationWorker(), scans, SlamConfig(mode="localisation", map=place))
-    known = [estimate for estimate in estimates if estimate.standing.value in ("localised", "degenerate")]
+    facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
+    known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
     facts |= {"map": place, "localised": len(known)}
     if known:
         first = known[0]
@@ -154,13 +154,13 @@ def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption
     _print(facts, json_output)
 
 
-def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["Estimate"]]:
+def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["SlamEstimate"]]:
     """Every scan through the worker; what to tell of it, and the estimates."""
     from monstertruck_estimation.slam.worker_io import Start, WorkerInput
 
     first = log.scans[0].odom or (0.0, 0.0, 0.0)
     worker.step(WorkerInput(start=Start(config, first)))
-    estimates: list[Estimate] = []
+    estimates: list[SlamEstimate] = []
     refused = 0
     counts: dict[str, int] = {}
     with progress("scans", len(log.scans)) as advance:
@@ -171,14 +171,14 @@ def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list
             if outputs.estimate is not None:
                 estimates.append(outputs.estimate)
             advance(number)
-    standings = Counter(estimate.standing.value for estimate in estimates)
+    statuses = Counter(estimate.status.value for estimate in estimates)
     offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
     facts: dict[str, Any] = {
         "log": log.make,
         "seconds": (log.scans[-1].stamp - log.scans[0].stamp) / 1e9,
         **counts,
         "left_out": refused,
-        "standing": dict(standings),
+        "standing": dict(statuses),
         "odometry_ahead_s": offsets[-1] if offsets else None,
     }
     return facts, estimates
@@ -194,7 +194,7 @@ def _print(facts: dict[str, Any], json_output: bool) -> None:
 
 
 def _draw(path: Path, saved: Any, way: Any = ()) -> None:
-    """The grid with the poses of its key scans, or with another way."""
+    """The grid with the poses of its keyframes, or with another way."""
     import numpy as np
 
     from monstertruckd.tools.cli.kinematics_output import figure
@@ -207,7 +207,7 @@ def _draw(path: Path, saved: Any, way: Any = ()) -> None:
         extent = (x0, x0 + width, y0, y0 + height)
         axes.imshow(shades, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
         axes.plot(
-            poses[:, 0], poses[:, 1], color="#e0482f", linewidth=1.2, label="localised" if len(way) else "key scans"
+            poses[:, 0], poses[:, 1], color="#e0482f", linewidth=1.2, label="localised" if len(way) else "keyframes"
         )
         axes.legend(loc="upper right")
         axes.set_aspect("equal")

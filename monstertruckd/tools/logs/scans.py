@@ -24,7 +24,7 @@ from monstertruckd.recorder.reader import open_log
 
 BEGIN: Final = SECOND
 """Stamp of the first scan of a log that counts from elsewhere, ns."""
-FARTHEST: Final = 80.0
+LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
 URG_STEP: Final = math.tau / 1024
 URG_ERRORS: Final = 0.02
@@ -106,7 +106,7 @@ def _arrays(path: Path) -> Iterator[ScanInput]:
     lengths = {len(times), len(ranges), len(times if odom is None else odom)}
     if ranges.ndim != 2 or len(lengths) != 1:
         raise InputError(f"{path}: expected t (n,), ranges (n, beams), odom (n, 3); got lengths {sorted(lengths)}")
-    limit = min(math.floor(float(np.nanmax(ranges)) / 10) * 10.0, FARTHEST) or FARTHEST
+    limit = min(math.floor(float(np.nanmax(ranges)) / 10) * 10.0, LONGEST_RANGE) or LONGEST_RANGE
     for i, row in enumerate(ranges):
         stamp = BEGIN + round((float(times[i]) - float(times[0])) * SECOND)
         yield _sick(stamp, np.asarray(row, np.float64), None if odom is None else _vector(odom[i]), limit)
@@ -130,7 +130,7 @@ def _carmen(path: Path) -> Iterator[ScanInput]:
                 except (ValueError, IndexError) as error:
                     raise InputError(f"{path}:{number}: expected FLASER n, n ranges, 6 numbers, time") from error
                 begin = time if begin is None else begin
-                yield _sick(BEGIN + round((time - begin) * SECOND), ranges, odom, FARTHEST)
+                yield _sick(BEGIN + round((time - begin) * SECOND), ranges, odom, LONGEST_RANGE)
     except (OSError, EOFError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a log with scans: {error}") from error
 

@@ -1,5 +1,5 @@
-"""Odometry from every sensor there is: wheels, compass with tilt, and the motion between scans.
+"""Odometry from all sensors: wheels, compass with tilt, and the motion between scans.
 
-``beliefs`` holds the filter's equations, ``history`` lets measurements come late, ``heading`` gates the compass,
-``slip`` watches the wheels, ``estimator`` ties them together and ``service`` gives them the bus.
+``filter`` holds the equations of the filter, ``compass_gate`` accepts or rejects headings, ``slip`` detects wheel slip,
+``estimator`` keeps measurements in order and combines them, ``service`` subscribes and publishes.
 """

@@ -1,4 +1,4 @@
-"""When a heading may be believed: by the device's own word, the field's strength, and how far it is off."""
+"""Accepts or rejects headings of the compass: by the device's flag, the field strength, and the innovation."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,20 +13,20 @@ REFERENCE: Final = 20
 """Headings from which the undisturbed strength of the field is taken."""
 
 
-class Verdict(StrEnum):
-    """What becomes of a heading."""
+class HeadingUse(StrEnum):
+    """How a heading is used."""
 
     USED = "used"
     LEFT_OUT = "left out"
     ANCHORED = "anchored"
-    """North is wherever it now says: at the start, or after it was steadily off for long."""
+    """North is set from it: at the start, or after it was steadily off for long."""
     HOME = "home"
     """It agrees with an earlier north again."""
 
 
 @dataclass(frozen=True, slots=True)
-class Gate:
-    """What is remembered of the compass."""
+class CompassGate:
+    """State of the gate."""
 
     anchored: bool = False
     disturbed: bool = False
@@ -55,8 +55,8 @@ class Gate:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
-    """A heading against what is believed."""
+class HeadingInnovation:
+    """A heading compared with the filter's state."""
 
     stamp: int
     place: tuple[float, float, float]
@@ -69,91 +69,93 @@ class Evidence:
     north: tuple[float, float]
     """Present north, rad, and its variance."""
     local: float
-    """Local deviation as it is believed to be, rad."""
+    """Estimated local deviation, rad."""
     flagged: bool
-    """The device calls itself disturbed."""
+    """Flagged as disturbed by the device."""
     taken_back: bool
-    """A disturbance was noticed soon after."""
+    """A disturbance was detected soon after."""
     field: float | None
 
 
-def judged(gate: Gate, evidence: Evidence, config: HeadingTrust) -> tuple[Verdict, Gate]:
-    """What becomes of a heading, and what is remembered of it.
+def gate_heading(
+    gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust
+) -> tuple[HeadingUse, CompassGate]:
+    """How a heading is used, and the next state of the gate.
 
-    A heading is off if it is further from the belief than ``config.gate`` standard deviations (chi-square gating),
+    A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating),
     disturbed if the device says so, the field's strength is not that of the start, or the local deviation has crept
     further than that. Neither locks the compass out:
     ``config.recover`` good ones over ``config.regain`` let it in again (beside a magnet, too, there is a place where
     the heading is right), and so does one that is steadily off for ``config.patience``, as a
     new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it.
     """
-    gate, disturbed = _field(gate, evidence, config)
-    crept = not gate.disturbed and abs(evidence.local) > config.gate * config.local
+    gate, disturbed = _field(gate, innovation, config)
+    crept = not gate.disturbed and abs(innovation.local) > config.gate * config.local
     # The first heading stays, or there would be no north to come back to.
-    if disturbed or crept or (evidence.taken_back and gate.anchored):
-        return Verdict.LEFT_OUT, _off(gate, evidence, steady=False)
+    if disturbed or crept or (innovation.taken_back and gate.anchored):
+        return HeadingUse.LEFT_OUT, _off(gate, innovation, steady=False)
     if not gate.anchored:
-        return Verdict.ANCHORED, replace(gate, anchored=True, disturbed=False, good=0)
-    if abs(evidence.residual) <= config.gate * (evidence.variance + config.noise**2) ** 0.5:
-        gate, enough = _good(gate, evidence, config) if gate.disturbed else (gate, True)
+        return HeadingUse.ANCHORED, replace(gate, anchored=True, disturbed=False, good=0)
+    if abs(innovation.residual) <= config.gate * (innovation.variance + config.noise**2) ** 0.5:
+        gate, enough = _good(gate, innovation, config) if gate.disturbed else (gate, True)
         if not enough:
-            return Verdict.LEFT_OUT, replace(gate, rejected=gate.rejected + 1, steady_since=evidence.stamp)
-        return Verdict.USED, replace(gate, disturbed=False, good=0, home_good=0)
-    return _far(gate, evidence, config)
+            return HeadingUse.LEFT_OUT, replace(gate, rejected=gate.rejected + 1, steady_since=innovation.stamp)
+        return HeadingUse.USED, replace(gate, disturbed=False, good=0, home_good=0)
+    return _far(gate, innovation, config)
 
 
-def _field(gate: Gate, evidence: Evidence, config: HeadingTrust) -> tuple[Gate, bool]:
+def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
     """The gate with the field learned, and whether the reading is disturbed."""
-    if evidence.flagged:
+    if innovation.flagged:
         return gate, True
-    if evidence.field is None:
+    if innovation.field is None:
         return gate, False
     if gate.fields >= REFERENCE:
-        return gate, abs(evidence.field - gate.field) > config.field * gate.field
+        return gate, abs(innovation.field - gate.field) > config.field * gate.field
     count = gate.fields + 1
-    return replace(gate, fields=count, field=gate.field + (evidence.field - gate.field) / count), False
+    return replace(gate, fields=count, field=gate.field + (innovation.field - gate.field) / count), False
 
 
-def _good(gate: Gate, evidence: Evidence, config: HeadingTrust) -> tuple[Gate, bool]:
+def _good(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
     """The gate after a good heading while disturbed, and whether there were enough that agree."""
-    if not gate.good or abs(wrap_angle(evidence.residual - gate.good_residual)) > 2 * config.local:
+    if not gate.good or abs(wrap_angle(innovation.residual - gate.good_residual)) > 2 * config.local:
         gate = replace(
             gate,
             good=0,
-            good_since=evidence.stamp,
-            good_from=evidence.place,
-            good_residual=evidence.residual,
+            good_since=innovation.stamp,
+            good_from=innovation.place,
+            good_residual=innovation.residual,
         )
     gate = replace(gate, good=gate.good + 1)
-    (x, y, yaw), (x0, y0, yaw0) = evidence.place, gate.good_from
+    (x, y, yaw), (x0, y0, yaw0) = innovation.place, gate.good_from
     far = math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0)) >= config.regain
-    long = evidence.stamp - gate.good_since >= config.patience * SECOND
+    long = innovation.stamp - gate.good_since >= config.patience * SECOND
     return gate, gate.good >= config.recover and (far or long)
 
 
-def _far(gate: Gate, evidence: Evidence, config: HeadingTrust) -> tuple[Verdict, Gate]:
+def _far(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[HeadingUse, CompassGate]:
     if gate.home is not None:
         north, variance = gate.home
-        off = wrap_angle(evidence.residual + north - evidence.north[0])
-        near = abs(off) <= config.gate * (evidence.yaw_variance + variance + config.local**2 + config.noise**2) ** 0.5
+        off = wrap_angle(innovation.residual + north - innovation.north[0])
+        near = abs(off) <= config.gate * (innovation.yaw_variance + variance + config.local**2 + config.noise**2) ** 0.5
         gate = replace(gate, home_good=gate.home_good + 1 if near else 0)
         if gate.home_good >= config.recover:
-            return Verdict.HOME, replace(gate, disturbed=False, good=0, home_good=0)
-    steady = abs(wrap_angle(evidence.residual - gate.last)) <= config.local
-    gate = _off(gate, evidence, steady=steady)
-    if evidence.stamp - gate.steady_since < config.patience * SECOND:
-        return Verdict.LEFT_OUT, gate
-    home = gate.home or evidence.north
-    return Verdict.ANCHORED, replace(gate, disturbed=False, good=0, home=home, home_good=0)
+            return HeadingUse.HOME, replace(gate, disturbed=False, good=0, home_good=0)
+    steady = abs(wrap_angle(innovation.residual - gate.last)) <= config.local
+    gate = _off(gate, innovation, steady=steady)
+    if innovation.stamp - gate.steady_since < config.patience * SECOND:
+        return HeadingUse.LEFT_OUT, gate
+    home = gate.home or innovation.north
+    return HeadingUse.ANCHORED, replace(gate, disturbed=False, good=0, home=home, home_good=0)
 
 
-def _off(gate: Gate, evidence: Evidence, *, steady: bool) -> Gate:
-    since = gate.steady_since if steady and gate.disturbed else evidence.stamp
+def _off(gate: CompassGate, innovation: HeadingInnovation, *, steady: bool) -> CompassGate:
+    since = gate.steady_since if steady and gate.disturbed else innovation.stamp
     return replace(
         gate,
         disturbed=True,
         good=0,
         steady_since=since,
-        last=evidence.residual if not steady else gate.last,
+        last=innovation.residual if not steady else gate.last,
         rejected=gate.rejected + 1,
     )

@@ -9,7 +9,7 @@ from monstertruck_schemas.base import Pose2D, Schema
 
 Share = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
-LASTING: Final = (2.0, 1.0)
+DEVIATION_SCALE: Final = (2.0, 1.0)
 """Way, m, and turn, rad, after which the local deviation of the compass is another: iron is in floors and furniture."""
 
 

@@ -1,4 +1,4 @@
-"""Measurements in the order of their stamps, however late they come, and redone a few at a time."""
+"""Fusion of all sensors into one pose: validates and orders measurements, and publishes a pose that never jumps."""
 
 import math
 from bisect import bisect_left, bisect_right
@@ -11,107 +11,107 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.correction import Correction
+from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.filter import (
     MOVED_BY,
     POSE,
     TRIM,
     TWIST,
-    Belief,
-    Heading,
-    Operation,
-    ScanMark,
-    ScanWay,
-    WheelWay,
-    advanced,
-    initial,
-    predicted,
+    FilterState,
+    HeadingMeasurement,
+    Measurement,
+    ScanClone,
+    ScanMeasurement,
+    WheelMeasurement,
+    apply_measurement,
+    initial_state,
+    predict,
 )
-from monstertruck_estimation.fusion.slip import Change, SlipWatch
-from monstertruck_estimation.odometry import MEMORY, Estimate
+from monstertruck_estimation.fusion.slip import SlipChange, SlipDetector
+from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import compose, inverse
-from monstertruck_estimation.wheel_motion import Roll, WheelMotion, way_covariance
+from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.motion import integrate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
 
-Advance = Callable[[Belief, Operation], Belief]
+Advance = Callable[[FilterState, Measurement], FilterState]
 
 
-class History:
-    """The belief after every operation of the last while; a late one is put in its place and what follows redone.
+class MeasurementHistory:
+    """Measurements of the last seconds in the order of their stamps, each with the state after it.
 
-    What is to be redone waits for ``catch_up``, which is told how many operations it may spend. Until all are redone,
-    ``newest`` goes on from the belief as it was, with every operation that is in time; then the redone one takes over.
+    After a late measurement is inserted, those that follow are recomputed by ``catch_up``, a bounded number per call.
+    Until all are, ``newest`` continues from the state as it was, with every measurement that is in time.
 
     Args:
-        start: the belief before everything.
-        advance: the belief after an operation.
-        horizon: ns for which operations are remembered.
+        start: the initial state.
+        advance: applies a measurement.
+        horizon: ns for which measurements are kept.
     """
 
-    def __init__(self, start: Belief, advance: Advance, horizon: int) -> None:
+    def __init__(self, start: FilterState, advance: Advance, horizon: int) -> None:
         self._floor = start
         self._advance = advance
         self._horizon = horizon
-        self._rows: list[tuple[Operation, Belief]] = []
+        self._rows: list[tuple[Measurement, FilterState]] = []
         self._done = 0
-        """The beliefs of so many rows are as they should be; those after them wait to be redone."""
+        """Number of leading rows whose states are current."""
         self.newest = start
-        """The belief after all operations in time, and after all others that are redone."""
+        """The state after all measurements in time and all recomputed late ones."""
 
     @property
     def waiting(self) -> int:
-        """Operations that wait to be redone."""
+        """Measurements to be recomputed."""
         return len(self._rows) - self._done
 
     def reaches(self, stamp: int) -> bool:
-        """Whether an operation of this stamp (ns) can still be put in."""
+        """Whether a measurement of this stamp (ns) can still be inserted."""
         return stamp >= self._floor.stamp
 
     def scan_before(self, stamp: int) -> int | None:
         """Stamp of the last scan that is not later than ``stamp``, ns; None if there was none."""
-        for operation, _ in reversed(self._rows[: self._place(stamp)]):
-            if isinstance(operation, ScanMark | ScanWay):
-                return operation.stamp
+        for measurement, _ in reversed(self._rows[: self._place(stamp)]):
+            if isinstance(measurement, ScanClone | ScanMeasurement):
+                return measurement.stamp
         return self._floor.scan
 
-    def insert(self, operation: Operation) -> bool:
-        """Put an operation in its place; False if that is forgotten already."""
-        if not self.reaches(operation.stamp):
+    def insert(self, measurement: Measurement) -> bool:
+        """Insert a measurement; False if it is older than the horizon."""
+        if not self.reaches(measurement.stamp):
             return False
-        row = self._place(operation.stamp)
+        row = self._place(measurement.stamp)
         if row == len(self._rows):
-            self.newest = self._advance(self.newest, operation)
+            self.newest = self._advance(self.newest, measurement)
             self._done += not self.waiting
         else:
             self._done = min(self._done, row)
-        self._rows.insert(row, (operation, self.newest))
+        self._rows.insert(row, (measurement, self.newest))
         self._forget()
         return True
 
-    def rewrite(self, since: int, change: Callable[[Operation], Operation]) -> None:
-        """Change the operations later than ``since``, ns; they wait to be redone."""
+    def rewrite(self, since: int, change: Callable[[Measurement], Measurement]) -> None:
+        """Replace the measurements later than ``since``, ns; they are to be recomputed."""
         first = self._place(since)
-        self._rows[first:] = [(change(operation), belief) for operation, belief in self._rows[first:]]
+        self._rows[first:] = [(change(measurement), state) for measurement, state in self._rows[first:]]
         self._done = min(self._done, first)
 
     def catch_up(self, most: int) -> None:
-        """Redo what waits, the oldest first, ``most`` operations at most."""
+        """Recompute at most ``most`` measurements, the oldest first."""
         if not self.waiting:
             return
         end = min(self._done + most, len(self._rows))
-        belief = self._rows[self._done - 1][1] if self._done else self._floor
+        state = self._rows[self._done - 1][1] if self._done else self._floor
         for row in range(self._done, end):
-            operation = self._rows[row][0]
-            belief = self._advance(belief, operation)
-            self._rows[row] = (operation, belief)
+            measurement = self._rows[row][0]
+            state = self._advance(state, measurement)
+            self._rows[row] = (measurement, state)
         self._done = end
         if not self.waiting:
-            self.newest = belief
+            self.newest = state
             self._forget()
 
     def _place(self, stamp: int) -> int:
@@ -129,20 +129,20 @@ class History:
 Array = NDArray[np.float64]
 
 MARGIN: Final = (0.1, 0.1)
-"""By which two scans may be wrong beside that, m and rad."""
-REDONE: Final = 6
-"""Readings that one estimate redoes at most, about a millisecond; what follows waits for the next."""
+"""Allowance for errors of two scans in the limits of their motion, m and rad."""
+MAX_RECOMPUTED: Final = 6
+"""Most measurements that one estimate recomputes, about a millisecond."""
 NAMES: Final = ("drive", "steering", "compass", "tilt", "lidar")
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """How the sensors are doing."""
+class FusionStatus:
+    """State of the sensors."""
 
     slipping: bool
-    """The wheels do not hold the ground."""
+    """The wheels slip."""
     disturbed: bool
-    """The compass is left out."""
+    """The compass is rejected."""
     north: float | None
     """Yaw in odom of the compass's zero, rad; None until it was found."""
     trim: float
@@ -164,19 +164,19 @@ class Fusion:
         self._chassis = chassis
         use = chassis is not None and config.wheels is not None
         self._wheels = WheelMotion(chassis, config.max_speed) if use and chassis is not None else None
-        self._slip = SlipWatch(config.slip, 0.0 if config.compass is None else config.compass.local)
-        self._history: History | None = None
+        self._slip = SlipDetector(config.slip, 0.0 if config.compass is None else config.compass.local)
+        self._history: MeasurementHistory | None = None
         self._last: dict[str, int] = {}
         self._shown: tuple[int, Array] | None = None
-        self._correction = Correction(config.slew, math.inf, config.settle)
+        self._correction = SmoothedCorrection(config.slew, math.inf, config.settle)
         self._left_out: Counter[str] = Counter()
-        self._changes: deque[Change] = deque()
+        self._changes: deque[SlipChange] = deque()
         self._was_disturbed = False
 
     # What comes in
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the servo angles being sent, unless the servo controller does not vouch for them."""
+        """Take the servo angles being sent, unless the servo controller marks them untrusted."""
         if self._wheels is not None:
             self._wheels.observe_steering(feedback)
 
@@ -210,7 +210,7 @@ class Fusion:
             return
         field = attitude.magnetic_field
         strength = None if field is None else math.hypot(field.x, field.y, field.z)
-        heading = Heading(
+        heading = HeadingMeasurement(
             stamp=attitude.stamp,
             # The device counts clockwise from north.
             yaw=-attitude.heading,
@@ -225,7 +225,7 @@ class Fusion:
             self._left_out["compass: too late"] += 1
         self._look_for_disturbance()
         if in_time and heading.field is not None and not heading.disturbed and not self._disturbed:
-            self._heed(self._slip.heading(attitude.stamp, heading.yaw))
+            self._apply_slip(self._slip.heading(attitude.stamp, heading.yaw))
         else:
             self._slip.forget_headings()
 
@@ -244,45 +244,45 @@ class Fusion:
         if max(x, y) > self._config.max_speed * dt + MARGIN[0] or yaw > self._config.max_turn * dt + MARGIN[1]:
             self._left_out["lidar: faster than the truck can be"] += 1
             return
-        self._heed(self._slip.scans(way))
+        self._apply_slip(self._slip.scans(way))
         if self._slip.doubted:
             self._left_out["lidar: against the wheels when it has just been blind"] += 1
             return
         history = self._begin(way.since)
         if history.scan_before(way.stamp) != way.since:
             # The clone of the earlier pose has to be made where it was.
-            self._insert(ScanMark(way.since, way.covariance))
+            self._insert(ScanClone(way.since, way.covariance))
         if not self._insert(way):
             self._left_out["lidar: too late"] += 1
 
     # What comes out
 
-    def changes(self) -> list[Change]:
+    def changes(self) -> list[SlipChange]:
         """Onsets and ends of slip since the last call."""
-        told = list(self._changes)
+        changes = list(self._changes)
         self._changes.clear()
-        return told
+        return changes
 
-    def standing(self) -> Standing:
-        """How the sensors are doing."""
-        belief = None if self._history is None else self._history.newest
-        gate = None if belief is None else belief.gate
-        return Standing(
+    def status(self) -> FusionStatus:
+        """State of the sensors."""
+        state = None if self._history is None else self._history.newest
+        gate = None if state is None else state.gate
+        return FusionStatus(
             slipping=self._slip.slipping,
             disturbed=gate is not None and gate.disturbed,
-            north=None if belief is None or not belief.gate.anchored else float(belief.mean[6]),
-            trim=0.0 if belief is None else float(belief.mean[TRIM]),
+            north=None if state is None or not state.gate.anchored else float(state.mean[6]),
+            trim=0.0 if state is None else float(state.mean[TRIM]),
             left_out=dict(self._left_out),
         )
 
     @property
-    def belief(self) -> Belief | None:
-        """What the filter believes at its newest measurement."""
+    def state(self) -> FilterState | None:
+        """State of the filter at its newest measurement."""
         return None if self._history is None else self._history.newest
 
     @property
     def waiting(self) -> int:
-        """Readings that wait to be redone: those that came late, and what followed them."""
+        """Measurements to be recomputed: late ones, and those after them."""
         return 0 if self._history is None else self._history.waiting
 
     def sources(self, now: int) -> tuple[str, ...]:
@@ -290,27 +290,27 @@ class Fusion:
         used = {} if self._history is None else dict(self._history.newest.used)
         if self._wheels is not None and self._wheels.steered is not None and "drive" in used:
             used["steering"] = self._wheels.steered
-        return tuple(name for name in NAMES if name in used and now - used[name] <= MEMORY)
+        return tuple(name for name in NAMES if name in used and now - used[name] <= SOURCE_TIMEOUT)
 
-    def estimate(self, now: int) -> Estimate | None:
+    def estimate(self, now: int) -> OdometryEstimate | None:
         """Pose at ``now`` (ns), continuous over corrections; None before the first reading.
 
-        Every call redoes ``REDONE`` of the readings that wait for it.
+        Every call recomputes at most ``MAX_RECOMPUTED`` measurements.
         """
         if self._history is None:
             return None
-        self._history.catch_up(REDONE)
+        self._history.catch_up(MAX_RECOMPUTED)
         self._look_for_disturbance()
-        belief, config = self._history.newest, self._config
-        moved = max((belief.used[name] for name in MOVED_BY if name in belief.used), default=belief.stamp)
-        last = max(moved, belief.stamp)
-        ahead = predicted(belief, min(now, last + round(config.max_prediction * SECOND)), config)
-        grown = predicted(belief, now, config).covariance
+        state, config = self._history.newest, self._config
+        moved = max((state.used[name] for name in MOVED_BY if name in state.used), default=state.stamp)
+        last = max(moved, state.stamp)
+        ahead = predict(state, min(now, last + round(config.max_prediction * SECOND)), config)
+        grown = predict(state, now, config).covariance
         pose = self._continuous(ahead, now)
         off = pose - ahead.mean[POSE]
         off[2] = math.remainder(off[2], math.tau)
         vx, vy, wz = ahead.mean[TWIST].tolist()
-        return Estimate(
+        return OdometryEstimate(
             pose=(float(pose[0]), float(pose[1]), math.remainder(float(pose[2]), math.tau)),
             twist=(vx, vy, wz),
             pose_covariance=(grown[POSE, POSE] + np.outer(off, off)).ravel(),
@@ -319,12 +319,12 @@ class Fusion:
             sources=self.sources(now),
         )
 
-    def _continuous(self, ahead: Belief, now: int) -> Array:
-        """The published pose: carried on by the twist, drawn to the belief at a limited pace."""
+    def _continuous(self, ahead: FilterState, now: int) -> Array:
+        """The published pose: integrated from the twist, corrected to the state at a limited rate."""
         target = ahead.mean[POSE].copy()
         if self._shown is None:
             self._shown = (now, target)
-            self._correction.aim((0.0, 0.0, 0.0), at_once=True)
+            self._correction.set_target((0.0, 0.0, 0.0), at_once=True)
             return target
         then, carried = self._shown
         dt = max((now - then) / SECOND, 0.0)
@@ -333,20 +333,22 @@ class Fusion:
         carried = np.array(integrate((x, y, yaw), vx, vy, wz, dt))
         self._shown = (max(now, then), carried)
         x, y, yaw = compose(target, inverse(carried)).tolist()
-        self._correction.aim((x, y, yaw))
+        self._correction.set_target((x, y, yaw))
         return np.array(self._correction.pose((carried[0], carried[1], carried[2]), dt))
 
     # Order
 
-    def _begin(self, stamp: int) -> History:
+    def _begin(self, stamp: int) -> MeasurementHistory:
         if self._history is None:
-            advance = partial(advanced, config=self._config)
-            self._history = History(initial(stamp, self._config), advance, round(self._config.horizon * SECOND))
+            advance = partial(apply_measurement, config=self._config)
+            self._history = MeasurementHistory(
+                initial_state(stamp, self._config), advance, round(self._config.horizon * SECOND)
+            )
         return self._history
 
-    def _insert(self, operation: Operation) -> bool:
-        stamp = operation.since if isinstance(operation, WheelWay | ScanWay) else operation.stamp
-        return self._begin(stamp).insert(operation)
+    def _insert(self, measurement: Measurement) -> bool:
+        stamp = measurement.since if isinstance(measurement, WheelMeasurement | ScanMeasurement) else measurement.stamp
+        return self._begin(stamp).insert(measurement)
 
     def _later(self, sensor: str, stamp: int) -> bool:
         if stamp <= self._last.get(sensor, -1):
@@ -360,36 +362,36 @@ class Fusion:
         return self._history is not None and self._history.newest.gate.disturbed
 
     def _look_for_disturbance(self) -> None:
-        """Take back headings from before a disturbance was noticed: a magnet comes nearer before that."""
+        """Mark headings before a detected disturbance as taken back: a magnet approaches before it is detected."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
             self._history.rewrite(0, _taken_back)
             self._slip.forget_headings()
         self._was_disturbed = self._disturbed
 
-    def _heed(self, change: Change | None) -> None:
+    def _apply_slip(self, change: SlipChange | None) -> None:
         if change is None:
             return
         self._changes.append(change)
         if change.slipping and self._history is not None:
             self._history.rewrite(change.since, _slipping)
 
-    def _way(self, roll: Roll, chassis: Chassis) -> WheelWay:
+    def _way(self, roll: WheelIncrement, chassis: Chassis) -> WheelMeasurement:
         assert self._config.wheels is not None
         trust = self._config.wheels
         delta = np.array(integrate((0.0, 0.0, 0.0), *roll.twist, roll.dt))
         noise = way_covariance(chassis, roll, trust.shaft_noise, trust.angle_noise, trust.slip_noise)
-        return WheelWay(roll.since, roll.stamp, delta, noise)
+        return WheelMeasurement(roll.since, roll.stamp, delta, noise)
 
 
-def _slipping(operation: Operation) -> Operation:
-    return replace(operation, slipping=True) if isinstance(operation, WheelWay) else operation
+def _slipping(measurement: Measurement) -> Measurement:
+    return replace(measurement, slipping=True) if isinstance(measurement, WheelMeasurement) else measurement
 
 
-def _taken_back(operation: Operation) -> Operation:
-    return replace(operation, taken_back=True) if isinstance(operation, Heading) else operation
+def _taken_back(measurement: Measurement) -> Measurement:
+    return replace(measurement, taken_back=True) if isinstance(measurement, HeadingMeasurement) else measurement
 
 
-def _scan_way(motion: ScanMotion, scale: float) -> ScanWay | None:
+def _scan_way(motion: ScanMotion, scale: float) -> ScanMeasurement | None:
     delta = np.array((motion.motion.x, motion.motion.y, motion.motion.yaw))
     covariance = np.array(motion.covariance).reshape(3, 3) * scale**2
     covariance = (covariance + covariance.T) / 2
@@ -397,4 +399,4 @@ def _scan_way(motion: ScanMotion, scale: float) -> ScanWay | None:
         return None
     if float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
         return None
-    return ScanWay(motion.since, motion.stamp, delta, covariance)
+    return ScanMeasurement(motion.since, motion.stamp, delta, covariance)

@@ -1,4 +1,4 @@
-"""What may happen to the belief, each at its instant."""
+"""An error-state extended Kalman filter with stochastic clones, as pure functions of a frozen state."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.fusion.compass_gate import Evidence, Gate, Verdict, judged
-from monstertruck_estimation.fusion.config import LASTING, FusionConfig
+from monstertruck_estimation.fusion.compass_gate import CompassGate, HeadingInnovation, HeadingUse, gate_heading
+from monstertruck_estimation.fusion.config import DEVIATION_SCALE, FusionConfig
 from monstertruck_estimation.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.motion import integrate, integration_jacobians
@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class WheelWay:
-    """The base moved by ``delta`` (dx, dy, dyaw in base at ``since``), say the wheels."""
+class WheelMeasurement:
+    """Motion of base ``delta`` (dx, dy, dyaw in base at ``since``) by the wheels."""
 
     since: int
     stamp: int
@@ -28,12 +28,12 @@ class WheelWay:
     covariance: Array
     """Shape (3, 3)."""
     slipping: bool = False
-    """The wheels are known not to hold the ground."""
+    """Measured while the wheels slip."""
 
 
 @dataclass(frozen=True, slots=True)
-class ScanWay:
-    """The base moved by ``delta`` between two scans."""
+class ScanMeasurement:
+    """Motion of base ``delta`` between two scans."""
 
     since: int
     stamp: int
@@ -44,32 +44,32 @@ class ScanWay:
 
 
 @dataclass(frozen=True, slots=True)
-class ScanMark:
-    """A scan was taken; a later one will tell how the base moved since."""
+class ScanClone:
+    """A scan whose pose is cloned, to relate a later scan to it."""
 
     stamp: int
     covariance: Array
-    """Shape (3, 3), of its place, as in ``ScanWay``."""
+    """Shape (3, 3), of its place, as in ``ScanMeasurement``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Heading:
+class HeadingMeasurement:
     """A reading of the compass."""
 
     stamp: int
     yaw: float
     """Counter-clockwise from magnetic north, rad."""
     disturbed: bool = False
-    """The device itself says so."""
+    """Flagged by the device."""
     taken_back: bool = False
-    """A disturbance was noticed soon after it."""
+    """A disturbance was detected soon after it."""
     field: float | None = None
     """Strength of the magnetic field, in the device's unit."""
     tilt: tuple[float, float] | None = None
-    """Roll and pitch, rad, while they are tilt."""
+    """Roll and pitch, rad, if valid."""
 
 
-Operation = WheelWay | ScanWay | ScanMark | Heading
+Measurement = WheelMeasurement | ScanMeasurement | ScanClone | HeadingMeasurement
 
 
 SIZE: Final = 15
@@ -80,24 +80,24 @@ SCAN: Final = slice(8, 11)
 WHEELS: Final = slice(11, 14)
 LOCAL: Final = 14
 LATER: Final = slice(15, 18)
-"""Place of the scan that is just being taken in."""
+"""Pose of the scan being applied."""
 IDENTITY: Final = np.eye(SIZE)
 LARGER: Final = np.eye(SIZE + 3)
 AT_REST: Final = 0.05
 """Standard deviation of the velocity at the start, m/s and rad/s."""
 QUANTUM: Final = (1e-5, 1e-5)
-"""Standard deviation of a wheel reading that did not move, m and rad: standing costs no certainty."""
+"""Standard deviation of a wheel reading that did not move, m and rad: status costs no certainty."""
 MOVED_BY: Final = ("drive", "lidar")
-"""Sensors that tell motion."""
+"""Sensors that measure motion."""
 STOPPING: Final = 0.1
 """Time constant with which the velocity dies away when all of them are silent, s."""
 FRESH: Final = SECOND // 2
-"""Tilt counts for this long, ns."""
+"""Tilt is used for this long, ns."""
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
-    """What is believed at one instant."""
+class FilterState:
+    """Mean, covariance and clones at one instant."""
 
     stamp: int
     mean: Array
@@ -108,7 +108,7 @@ class Belief:
     """Stamp of the clone at the last scan."""
     wheels: int | None = None
     """Stamp of the clone at the last wheel reading."""
-    gate: Gate = field(default_factory=Gate)
+    gate: CompassGate = field(default_factory=CompassGate)
     tilt: tuple[int, float, float] | None = None
     """Stamp, roll, pitch."""
     used: dict[str, int] = field(default_factory=dict)
@@ -116,9 +116,11 @@ class Belief:
     nis: float = 0.0
     """Normalised innovation squared of the last update."""
 
-    def estimated(self, mean: Array, covariance: Array, stamp: int | None = None, nis: float | None = None) -> "Belief":
+    def estimated(
+        self, mean: Array, covariance: Array, stamp: int | None = None, nis: float | None = None
+    ) -> "FilterState":
         """The same with another estimate: what ``dataclasses.replace`` does, in a tenth of its time."""
-        return Belief(
+        return FilterState(
             self.stamp if stamp is None else stamp,
             mean,
             covariance,
@@ -131,28 +133,28 @@ class Belief:
         )
 
 
-def initial(stamp: int, config: FusionConfig) -> Belief:
-    """The start: the pose is known by definition, the truck stands."""
+def initial_state(stamp: int, config: FusionConfig) -> FilterState:
+    """At the start the pose is known by definition and the truck stands."""
     mean = np.zeros(SIZE)
     mean[POSE] = config.start.x, config.start.y, config.start.yaw
     trim = config.wheels.trim if config.wheels is not None else 0.0
     spread = np.zeros(SIZE)
     spread[TWIST], spread[NORTH], spread[TRIM] = AT_REST, math.pi, trim
     spread[LOCAL] = config.compass.local if config.compass is not None else 0.0
-    return Belief(stamp, mean, np.diag(spread**2))
+    return FilterState(stamp, mean, np.diag(spread**2))
 
 
-def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
-    """The belief at a later instant (ns): the velocity dies away (Gauss-Markov), the pose follows the arc."""
-    dt = (stamp - belief.stamp) / SECOND
+def predict(state: FilterState, stamp: int, config: FusionConfig) -> FilterState:
+    """The state at a later instant (ns): the velocity dies away (Gauss-Markov), the pose follows the arc."""
+    dt = (stamp - state.stamp) / SECOND
     if dt <= 0:
-        return belief
-    moved = max((belief.used[name] for name in MOVED_BY if name in belief.used), default=stamp)
+        return state
+    moved = max((state.used[name] for name in MOVED_BY if name in state.used), default=stamp)
     blind = stamp - moved > config.max_prediction * SECOND
     lasting = STOPPING if blind else config.persistence
     keep = math.exp(-dt / lasting)
     span = lasting * (1.0 - keep)
-    mean = belief.mean.copy()
+    mean = state.mean.copy()
     x, y, yaw, vx, vy, wz = mean[:6].tolist()
     by_pose, by_twist = integration_jacobians((x, y, yaw), vx, vy, wz, span)
     mean[POSE] = integrate((x, y, yaw), vx, vy, wz, span)
@@ -160,10 +162,10 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
     step = IDENTITY.copy()
     step[POSE, POSE], step[POSE, TWIST] = by_pose, by_twist
     step[TWIST, TWIST] *= keep
-    like = math.exp(-(math.hypot(vx, vy) / LASTING[0] + abs(wz) / LASTING[1]) * span)
+    like = math.exp(-(math.hypot(vx, vy) / DEVIATION_SCALE[0] + abs(wz) / DEVIATION_SCALE[1]) * span)
     mean[LOCAL] *= like
     step[LOCAL, LOCAL] = like
-    covariance = step @ belief.covariance @ step.T
+    covariance = step @ state.covariance @ step.T
     agility = np.square(config.agility)
     turned = by_twist / span
     covariance[POSE, POSE] += turned * (agility * dt**3 / 3) @ turned.T
@@ -175,45 +177,45 @@ def predicted(belief: Belief, stamp: int, config: FusionConfig) -> Belief:
         covariance[NORTH, NORTH] += config.compass.drift**2 * dt
         covariance[LOCAL, LOCAL] += config.compass.local**2 * (1 - like**2)
     covariance[TRIM, TRIM] += (config.wheels.trim_drift**2 if config.wheels is not None else 0.0) * dt
-    return belief.estimated(mean, (covariance + covariance.T) / 2, stamp)
+    return state.estimated(mean, (covariance + covariance.T) / 2, stamp)
 
 
-def advanced(belief: Belief, operation: Operation, config: FusionConfig) -> Belief:
-    """The belief after an operation that is not earlier."""
-    belief = predicted(belief, operation.stamp, config)
-    match operation:
-        case WheelWay():
-            return _wheels(belief, operation, config)
-        case ScanWay():
-            return _scan(belief, operation, config)
-        case ScanMark():
-            return _marked(belief, operation.stamp, operation.covariance)
-        case Heading():
-            return _heading(belief, operation, config)
+def apply_measurement(state: FilterState, measurement: Measurement, config: FusionConfig) -> FilterState:
+    """Predict to the stamp of a measurement that is not earlier, and apply it."""
+    state = predict(state, measurement.stamp, config)
+    match measurement:
+        case WheelMeasurement():
+            return _wheels(state, measurement, config)
+        case ScanMeasurement():
+            return _scan(state, measurement, config)
+        case ScanClone():
+            return _marked(state, measurement.stamp, measurement.covariance)
+        case HeadingMeasurement():
+            return _heading(state, measurement, config)
 
 
-def updated(belief: Belief, residual: Array, by_state: Array, noise: Array) -> Belief:
-    """Kalman's update in Joseph's form.
+def kalman_update(state: FilterState, residual: Array, by_state: Array, noise: Array) -> FilterState:
+    """Kalman update in Joseph form.
 
     Args:
-        belief: prior.
+        state: prior.
         residual: shape (m,), measured minus expected.
         by_state: shape (m, n), derivative of the expected by the state.
         noise: shape (m, m), covariance of the measurement.
     """
-    spread = by_state @ belief.covariance
+    spread = by_state @ state.covariance
     innovation = spread @ by_state.T + noise
     inverse: Array = np.asarray(np.linalg.inv(innovation), np.float64) if len(residual) > 1 else 1.0 / innovation
     gain = spread.T @ inverse
-    left = LARGER[: len(belief.mean), : len(belief.mean)] - gain @ by_state
-    covariance = left @ belief.covariance @ left.T + gain @ noise @ gain.T
+    left = LARGER[: len(state.mean), : len(state.mean)] - gain @ by_state
+    covariance = left @ state.covariance @ left.T + gain @ noise @ gain.T
     nis = float(residual @ inverse @ residual)
-    return belief.estimated(belief.mean + gain @ residual, (covariance + covariance.T) / 2, nis=nis)
+    return state.estimated(state.mean + gain @ residual, (covariance + covariance.T) / 2, nis=nis)
 
 
-def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
+def _way(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
     """Residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
-    then, now = belief.mean[clone], belief.mean[POSE]
+    then, now = state.mean[clone], state.mean[POSE]
     residual = delta - between(then, now)
     residual[2] = wrap_angle(float(residual[2]))
     by_state = np.zeros((3, SIZE))
@@ -221,41 +223,41 @@ def _way(belief: Belief, clone: slice, delta: Array) -> tuple[Array, Array]:
     return residual, by_state
 
 
-def _wheels(belief: Belief, way: WheelWay, config: FusionConfig) -> Belief:
-    slip, used = config.slip, belief.used
-    if belief.wheels == way.since:
-        level = np.array((*_level(belief), 1.0))
+def _wheels(state: FilterState, way: WheelMeasurement, config: FusionConfig) -> FilterState:
+    slip, used = config.slip, state.used
+    if state.wheels == way.since:
+        level = np.array((*_level(state), 1.0))
         delta, dt = way.delta * level, (way.stamp - way.since) / SECOND
-        residual, by_state = _way(belief, WHEELS, delta)
+        residual, by_state = _way(state, WHEELS, delta)
         signed = math.copysign(math.hypot(delta[0], delta[1]), delta[0])
-        residual[2] -= belief.mean[TRIM] * signed
+        residual[2] -= state.mean[TRIM] * signed
         by_state[2, TRIM] = signed
         noise = way.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
         if way.slipping:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
-        belief = updated(belief, residual, by_state, noise)
+        state = kalman_update(state, residual, by_state, noise)
         if not way.slipping:
             used = {**used, "drive": way.stamp}
-    mean, covariance = _cloned(belief, WHEELS)
-    return replace(belief, mean=mean, covariance=covariance, wheels=way.stamp, used=used)
+    mean, covariance = _cloned(state, WHEELS)
+    return replace(state, mean=mean, covariance=covariance, wheels=way.stamp, used=used)
 
 
-def _level(belief: Belief) -> tuple[float, float]:
-    """Share of a way along x and along y that is level."""
-    if belief.tilt is None or belief.stamp - belief.tilt[0] > FRESH:
+def _level(state: FilterState) -> tuple[float, float]:
+    """Horizontal share of a motion along x and along y."""
+    if state.tilt is None or state.stamp - state.tilt[0] > FRESH:
         return 1.0, 1.0
-    return math.cos(belief.tilt[2]), math.cos(belief.tilt[1])
+    return math.cos(state.tilt[2]), math.cos(state.tilt[1])
 
 
-def _scan(belief: Belief, way: ScanWay, config: FusionConfig) -> Belief:
-    """The later scan's place joins the state, the motion ties it to the earlier one's, and it takes over."""
-    if belief.scan != way.since or config.scans is None:
-        return _marked(belief, way.stamp, way.covariance)
+def _scan(state: FilterState, way: ScanMeasurement, config: FusionConfig) -> FilterState:
+    """Augment with the later scan's pose, update with the motion since the earlier one, then replace that clone."""
+    if state.scan != way.since or config.scans is None:
+        return _marked(state, way.stamp, way.covariance)
     by_place = np.vstack((np.eye(SIZE), np.zeros((3, SIZE))))
     by_place[LATER, POSE] = np.eye(3)
-    mean = by_place @ belief.mean
-    covariance = by_place @ belief.covariance @ by_place.T
-    covariance[LATER, LATER] += _turned(way.covariance, float(belief.mean[YAW]))
+    mean = by_place @ state.mean
+    covariance = by_place @ state.covariance @ by_place.T
+    covariance[LATER, LATER] += _turned(way.covariance, float(state.mean[YAW]))
     earlier, later = mean[SCAN], mean[LATER]
     residual = way.delta - between(earlier, later)
     residual[2] = wrap_angle(float(residual[2]))
@@ -263,7 +265,7 @@ def _scan(belief: Belief, way: ScanWay, config: FusionConfig) -> Belief:
     by_state[:, SCAN], by_state[:, LATER] = between_jacobians(earlier, later)
     place, turn = config.scans.drift
     noise = np.diag((place**2, place**2, turn**2))
-    joint = updated(belief.estimated(mean, covariance), residual, by_state, noise)
+    joint = kalman_update(state.estimated(mean, covariance), residual, by_state, noise)
     kept = np.r_[0:SIZE]
     kept[SCAN] = np.r_[LATER]
     return replace(
@@ -271,7 +273,7 @@ def _scan(belief: Belief, way: ScanWay, config: FusionConfig) -> Belief:
         mean=joint.mean[kept],
         covariance=joint.covariance[np.ix_(kept, kept)],
         scan=way.stamp,
-        used={**belief.used, "lidar": way.stamp},
+        used={**state.used, "lidar": way.stamp},
     )
 
 
@@ -283,33 +285,33 @@ def _turned(covariance: Array, yaw: float) -> Array:
     return (result + result.T) / 2
 
 
-def _marked(belief: Belief, stamp: int, noise: Array) -> Belief:
-    """The pose as a scan sees it becomes the clone of the scan."""
-    mean, covariance = _cloned(belief, SCAN)
+def _marked(state: FilterState, stamp: int, noise: Array) -> FilterState:
+    """Clone the pose, with the error of the scan's match, as the clone of the scan."""
+    mean, covariance = _cloned(state, SCAN)
     covariance[SCAN, SCAN] += _turned(noise, float(mean[YAW]))
-    return replace(belief, mean=mean, covariance=covariance, scan=stamp)
+    return replace(state, mean=mean, covariance=covariance, scan=stamp)
 
 
-def _cloned(belief: Belief, clone: slice) -> tuple[Array, Array]:
-    """Mean and covariance with the pose as it is now as the clone."""
-    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+def _cloned(state: FilterState, clone: slice) -> tuple[Array, Array]:
+    """Mean and covariance with the clone replaced by the present pose."""
+    mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[clone] = mean[POSE]
     covariance[clone, :] = covariance[POSE, :]
     covariance[:, clone] = covariance[:, POSE]
     return mean, covariance
 
 
-def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
+def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConfig) -> FilterState:
     if heading.tilt is not None:
-        used = {**belief.used, "tilt": heading.stamp}
-        belief = replace(belief, tilt=(heading.stamp, *heading.tilt), used=used)
+        used = {**state.used, "tilt": heading.stamp}
+        state = replace(state, tilt=(heading.stamp, *heading.tilt), used=used)
     if config.compass is None:
-        return belief
-    mean, covariance = belief.mean, belief.covariance
+        return state
+    mean, covariance = state.mean, state.covariance
     by_state = np.zeros((1, SIZE))
     by_state[0, YAW], by_state[0, NORTH], by_state[0, LOCAL] = 1.0, -1.0, 1.0
-    residual = float(_residual(belief, heading)[0])
-    evidence = Evidence(
+    residual = float(_residual(state, heading)[0])
+    innovation = HeadingInnovation(
         stamp=heading.stamp,
         place=(float(mean[0]), float(mean[1]), float(mean[YAW])),
         residual=residual,
@@ -321,54 +323,54 @@ def _heading(belief: Belief, heading: Heading, config: FusionConfig) -> Belief:
         taken_back=heading.taken_back,
         field=heading.field,
     )
-    before = belief.gate
-    verdict, gate = judged(before, evidence, config.compass)
+    before = state.gate
+    verdict, gate = gate_heading(before, innovation, config.compass)
     if gate.disturbed and not before.disturbed:
-        belief = _elsewhere(belief, config.compass.local)
-    belief = replace(belief, gate=gate)
+        state = _elsewhere(state, config.compass.local)
+    state = replace(state, gate=gate)
     noise = config.compass.noise**2
-    if verdict is Verdict.LEFT_OUT:
-        return belief
-    if verdict is Verdict.ANCHORED:
-        belief = _anchored(belief, wrap_angle(float(mean[YAW] + mean[LOCAL]) - heading.yaw), noise)
-    elif verdict is Verdict.HOME and gate.home is not None:
-        belief = _returned(belief, *gate.home)
-        belief = updated(belief, _residual(belief, heading), by_state, np.array([[noise]]))
+    if verdict is HeadingUse.LEFT_OUT:
+        return state
+    if verdict is HeadingUse.ANCHORED:
+        state = _anchored(state, wrap_angle(float(mean[YAW] + mean[LOCAL]) - heading.yaw), noise)
+    elif verdict is HeadingUse.HOME and gate.home is not None:
+        state = _returned(state, *gate.home)
+        state = kalman_update(state, _residual(state, heading), by_state, np.array([[noise]]))
     else:
-        belief = updated(belief, np.array([residual]), by_state, np.array([[noise]]))
-    return replace(belief, used={**belief.used, "compass": heading.stamp})
+        state = kalman_update(state, np.array([residual]), by_state, np.array([[noise]]))
+    return replace(state, used={**state.used, "compass": heading.stamp})
 
 
-def _residual(belief: Belief, heading: Heading) -> Array:
-    return np.array([wrap_angle(heading.yaw - float(belief.mean[YAW] - belief.mean[NORTH] + belief.mean[LOCAL]))])
+def _residual(state: FilterState, heading: HeadingMeasurement) -> Array:
+    return np.array([wrap_angle(heading.yaw - float(state.mean[YAW] - state.mean[NORTH] + state.mean[LOCAL]))])
 
 
-def _anchored(belief: Belief, north: float, noise: float) -> Belief:
-    """North follows from yaw, heading and deviation: their errors add up in it."""
-    mean, by_state = belief.mean.copy(), np.eye(SIZE)
+def _anchored(state: FilterState, north: float, noise: float) -> FilterState:
+    """Initialise north from yaw, heading and deviation: their errors add up in it."""
+    mean, by_state = state.mean.copy(), np.eye(SIZE)
     mean[NORTH] = north
     by_state[NORTH, :] = 0.0
     by_state[NORTH, [YAW, LOCAL]] = 1.0
-    covariance = by_state @ belief.covariance @ by_state.T
+    covariance = by_state @ state.covariance @ by_state.T
     covariance[NORTH, NORTH] += noise
-    return replace(belief, mean=mean, covariance=covariance)
+    return replace(state, mean=mean, covariance=covariance)
 
 
-def _elsewhere(belief: Belief, deviation: float) -> Belief:
-    """What was taken for the local deviation was a disturbance; nothing is known of the one to come."""
-    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+def _elsewhere(state: FilterState, deviation: float) -> FilterState:
+    """Reset the local deviation: its estimate followed a disturbance."""
+    mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[LOCAL] = 0.0
     covariance[LOCAL, :] = 0.0
     covariance[:, LOCAL] = 0.0
     covariance[LOCAL, LOCAL] = deviation**2
-    return replace(belief, mean=mean, covariance=covariance)
+    return replace(state, mean=mean, covariance=covariance)
 
 
-def _returned(belief: Belief, north: float, variance: float) -> Belief:
-    """North is what it was before the disturbance."""
-    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+def _returned(state: FilterState, north: float, variance: float) -> FilterState:
+    """Restore north from before the disturbance."""
+    mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[NORTH] = north
     covariance[NORTH, :] = 0.0
     covariance[:, NORTH] = 0.0
     covariance[NORTH, NORTH] = variance
-    return replace(belief, mean=mean, covariance=covariance)
+    return replace(state, mean=mean, covariance=covariance)

@@ -1,8 +1,8 @@
-"""The fusion on the bus."""
+"""Publishes the fused odometry."""
 
 from collections.abc import Sequence
 
-from monstertruck_estimation.fusion.estimator import Fusion, Standing
+from monstertruck_estimation.fusion.estimator import Fusion, FusionStatus
 from monstertruck_estimation.odometry import OdometryService
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import Mailbox
@@ -15,7 +15,7 @@ from monstertruck_schemas.state import Odometry, ScanMotion
 
 
 class FusionService(OdometryService):
-    """``OdometryService`` that also takes the motion between scans, and tells slip and a disturbed compass.
+    """``OdometryService`` that also uses the motion between scans, and reports slip and a disturbed compass.
 
     Args:
         fusion: the filter.
@@ -25,9 +25,9 @@ class FusionService(OdometryService):
         compass: headings and tilt, if there is a compass.
         scans: motion between scans, bounded and counted, if something finds it.
         odometry: ``state/odometry``.
-        pose: ``state/pose``; None = something else publishes it.
+        pose: ``state/pose``; None = published by localisation.
         health: ``health/odometry``.
-        events: where slip and disturbances are told.
+        events: where slip and disturbances are reported.
         rate: poses per second.
     """
 
@@ -54,10 +54,10 @@ class FusionService(OdometryService):
         self._health = health
         self._events = events
         self._disturbed = False
-        self._told: tuple[int, tuple[bool, bool]] | None = None
+        self._published: tuple[int, tuple[bool, bool]] | None = None
 
     def take(self) -> None:
-        """Hand on what is new, and tell what has changed."""
+        """Pass new messages to the filter, and report changes."""
         super().take()
         for motion in self._scans.drain() if self._scans is not None else ():
             self._fusion.observe_scan(motion)
@@ -65,39 +65,39 @@ class FusionService(OdometryService):
             reason = Reason.WHEEL_SLIP if change.slipping else Reason.WHEEL_GRIP
             severity = Severity.WARNING if change.slipping else Severity.INFO
             self._events(reason, severity, self.name, change.text)
-        standing = self._fusion.standing()
-        if standing.disturbed is not self._disturbed:
-            self._disturbed = standing.disturbed
-            if standing.disturbed:
+        status = self._fusion.status()
+        if status.disturbed is not self._disturbed:
+            self._disturbed = status.disturbed
+            if status.disturbed:
                 self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, "the yaw goes on without it")
             else:
                 self._events(
-                    Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {standing.north or 0:.2f} rad in odom"
+                    Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {status.north or 0:.2f} rad in odom"
                 )
 
-        self._tell_health(standing)
+        self._publish_health(status)
 
-    def _tell_health(self, standing: Standing) -> None:
-        now, trouble = self._clock.now(), (standing.slipping, standing.disturbed)
-        if self._told is not None and trouble == self._told[1] and now - self._told[0] < SECOND:
+    def _publish_health(self, status: FusionStatus) -> None:
+        now, trouble = self._clock.now(), (status.slipping, status.disturbed)
+        if self._published is not None and trouble == self._published[1] and now - self._published[0] < SECOND:
             return
-        self._told = (now, trouble)
+        self._published = (now, trouble)
         self._health.put(
             OdometryHealth(
                 stamp=now,
                 received=now,
                 seq=self._health.next_seq(),
                 frame="odom",
-                slipping=standing.slipping,
-                disturbed=standing.disturbed,
+                slipping=status.slipping,
+                disturbed=status.disturbed,
                 sources=self._fusion.sources(now),
-                north=standing.north,
-                trim=standing.trim,
-                left_out=sum(standing.left_out.values()),
+                north=status.north,
+                trim=status.trim,
+                left_out=sum(status.left_out.values()),
                 waiting=self._fusion.waiting,
             )
         )
 
-    def hears_compass(self) -> bool:
-        """Always: a heading can be the first reading."""
+    def accepts_compass(self) -> bool:
+        """Always: a heading can be the first measurement."""
         return True

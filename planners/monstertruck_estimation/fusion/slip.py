@@ -1,8 +1,8 @@
-"""Whether the wheels hold the ground: their motion against that between scans, or their yaw against the compass.
+"""Wheel slip: the motion of the wheels compared with that between scans, or their yaw with the compass.
 
-Scans are a witness against the wheels only while they have known their place without a break. After a gap, or where
-they knew nothing along one direction, what they match may go along with the robot (the ground ahead on a slope), so
-they have to agree with the wheels for a while first; what does not agree then is doubted itself.
+Scans are evidence against the wheels only while matched without a gap. After a gap, or where one direction was
+unconstrained, what they match may move along with the robot (the ground ahead on a slope), so they first have to agree
+with the wheels for a while; scans that do not are rejected themselves.
 """
 
 import math
@@ -13,20 +13,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.fusion.config import LASTING, SlipConfig
-from monstertruck_estimation.fusion.filter import ScanWay, WheelWay
+from monstertruck_estimation.fusion.config import DEVIATION_SCALE, SlipConfig
+from monstertruck_estimation.fusion.filter import ScanMeasurement, WheelMeasurement
 from monstertruck_estimation.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
 
-MEMORY: Final = 3 * SECOND
+SOURCE_TIMEOUT: Final = 3 * SECOND
 """Wheel motion is remembered for this long, ns."""
 AHEAD: Final = SECOND // 8
 """A scan may be so much newer than the wheels, ns; they are taken to go on."""
 BLIND: Final = SECOND
-"""Without scans for so long, the compass is the judge, ns."""
+"""Without scans for so long, wheels are compared with the compass, ns."""
 FLOOR: Final = (0.003, 0.005)
 """Standard deviation of any comparison, m and rad."""
 JITTER: Final = 0.01
@@ -34,7 +34,7 @@ JITTER: Final = 0.01
 FASTEST: Final = 3.0
 """No robot turns faster than this, rad/s."""
 BLANK: Final = 1.0
-"""A scan tells nothing along a direction in which its standard deviation is greater, m."""
+"""A direction in which the standard deviation of a scan is greater is unconstrained, m."""
 SPANS: Final = 2
 """Windows over which wheels and scans are compared as well."""
 SPAN: Final = SECOND
@@ -42,22 +42,22 @@ SPAN: Final = SECOND
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """The wheels began to slip, or ceased to."""
+class SlipChange:
+    """Begin or end of wheel slip."""
 
     slipping: bool
     since: int
     """ns from which the wheels are not to be trusted."""
     text: str
-    """What disagreed, in words."""
+    """Description of the disagreement."""
 
 
-class SlipWatch:
-    """Compares, and remembers with hysteresis.
+class SlipDetector:
+    """Compares wheels with scans or compass, with hysteresis.
 
     Args:
         config: thresholds.
-        deviation: standard deviation of what a place adds to a heading, rad.
+        deviation: standard deviation of the local deviation of the compass, rad.
     """
 
     def __init__(self, config: SlipConfig, deviation: float) -> None:
@@ -65,31 +65,31 @@ class SlipWatch:
         self._deviation = deviation
         self._trail: deque[tuple[int, Array, Array]] = deque()
         """Stamp, pose, and the sum of the ways' covariances: over a window too short to turn them into each other."""
-        self._ways: deque[ScanWay] = deque()
+        self._ways: deque[ScanMeasurement] = deque()
         self._headings: deque[tuple[int, float]] = deque()
         self._suspicious = 0
         self._calm = 0
         self._scanned: int | None = None
         self._unproven = 0
-        """Scans that must agree before they are a witness."""
+        """Scans that must agree with the wheels before they are used."""
         self.slipping = False
         self.doubted = False
-        """The last scan is not to be believed against the wheels."""
+        """The last scan is rejected."""
         self.distance = 0.0
         """Last distance between the two, in standard deviations."""
 
-    def wheels(self, way: WheelWay) -> None:
-        """Take what the wheels say."""
+    def wheels(self, way: WheelMeasurement) -> None:
+        """Take the motion of the wheels."""
         if not self._trail or self._trail[-1][0] != way.since:
             self._trail.clear()
             self._trail.append((way.since, np.zeros(3), np.zeros((3, 3))))
         _, pose, spread = self._trail[-1]
         self._trail.append((way.stamp, compose(pose, way.delta), spread + way.covariance))
-        while self._trail[0][0] < way.stamp - MEMORY:
+        while self._trail[0][0] < way.stamp - SOURCE_TIMEOUT:
             self._trail.popleft()
 
-    def scans(self, way: ScanWay) -> Change | None:
-        """Take the motion between two scans; tells a change of verdict."""
+    def scans(self, way: ScanMeasurement) -> SlipChange | None:
+        """Take the motion between two scans; returns a change of the result."""
         self._scanned, self.doubted = way.stamp, False
         if self._ways and self._ways[-1].stamp != way.since:
             self._ways.clear()
@@ -118,7 +118,7 @@ class SlipWatch:
         return round(self._config.window * SECOND)
 
     def _agreed(self) -> None:
-        """What is past is settled."""
+        """Drop the older windows."""
         while len(self._ways) > 1:
             self._ways.popleft()
 
@@ -126,8 +126,8 @@ class SlipWatch:
         """Wheels against the last ``count`` motions: distance in deviations, since when (ns), and in words."""
         ways = list(self._ways)[-count:]
         since, stamp = ways[0].since, ways[-1].stamp
-        told = self._told(since, stamp)
-        if told is None:
+        wheels_moved = self._wheel_motion(since, stamp)
+        if wheels_moved is None:
             return None
         moved = np.zeros(3)
         for one in ways:
@@ -135,7 +135,7 @@ class SlipWatch:
         _, by_later = compose_jacobians(moved, np.zeros(3))
         # The places of the first and the last scan err; what was in between has cancelled.
         spread = ways[0].covariance + by_later @ ways[-1].covariance @ by_later.T
-        delta, noise = told
+        delta, noise = wheels_moved
         off = delta - moved
         off[2] = wrap_angle(float(off[2]))
         distance = math.sqrt(float(off @ np.linalg.solve(spread + noise, off)))
@@ -143,8 +143,8 @@ class SlipWatch:
         text = f"wheels and scans differ by {math.hypot(off[0], off[1]):.3f} m and {off[2]:+.3f} rad in {seconds:.1f} s"
         return distance, since, text
 
-    def heading(self, stamp: int, yaw: float) -> Change | None:
-        """Take an undisturbed heading (counter-clockwise, rad); it is the judge where there are no scans."""
+    def heading(self, stamp: int, yaw: float) -> SlipChange | None:
+        """Take an undisturbed heading (counter-clockwise, rad); it is used where there are no scans."""
         if self._headings:
             last, before = self._headings[-1]
             if abs(wrap_angle(yaw - before)) > JITTER * 4 + FASTEST * (stamp - last) / SECOND:
@@ -156,12 +156,14 @@ class SlipWatch:
         since, before = self._headings[0]
         if self._scanned is not None and stamp - self._scanned < BLIND:
             return None
-        told = self._told(since, stamp) if stamp - since >= SPAN * 3 // 4 else None
-        if told is None:
+        wheels_moved = self._wheel_motion(since, stamp) if stamp - since >= SPAN * 3 // 4 else None
+        if wheels_moved is None:
             return None
-        delta, noise = told
+        delta, noise = wheels_moved
         off = wrap_angle(float(delta[2]) - wrap_angle(yaw - before))
-        like = math.exp(-math.hypot(delta[0], delta[1]) / LASTING[0] - abs(float(delta[2])) / LASTING[1])
+        like = math.exp(
+            -math.hypot(delta[0], delta[1]) / DEVIATION_SCALE[0] - abs(float(delta[2])) / DEVIATION_SCALE[1]
+        )
         elsewhere = JITTER**2 + self._deviation**2 * (1 - like)
         distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * elsewhere)
         text = f"wheels and compass differ by {off:+.3f} rad in {(stamp - since) / SECOND:.1f} s"
@@ -171,7 +173,7 @@ class SlipWatch:
         """The compass was disturbed: what comes next is not to be compared with what was."""
         self._headings.clear()
 
-    def _told(self, since: int, stamp: int) -> tuple[Array, Array] | None:
+    def _wheel_motion(self, since: int, stamp: int) -> tuple[Array, Array] | None:
         """Way of the wheels between two instants and its covariance, (3,) and (3, 3); None if they are not known."""
         trail = self._trail
         if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + AHEAD:
@@ -207,17 +209,17 @@ class SlipWatch:
         elif self.doubted:
             self._unproven = self._config.calm
 
-    def _judged(self, distance: float, since: int, text: str) -> Change | None:
+    def _judged(self, distance: float, since: int, text: str) -> SlipChange | None:
         self.distance = distance
         config = self._config
         if not self.slipping:
             self._suspicious = self._suspicious + 1 if distance > config.gate else 0
             if self._suspicious >= 2 or distance > 2 * config.gate:
                 self.slipping, self._suspicious, self._calm = True, 0, 0
-                return Change(slipping=True, since=since, text=text)
+                return SlipChange(slipping=True, since=since, text=text)
             return None
         self._calm = self._calm + 1 if distance < config.release else 0
         if self._calm < config.calm:
             return None
         self.slipping = False
-        return Change(slipping=False, since=since, text=text)
+        return SlipChange(slipping=False, since=since, text=text)

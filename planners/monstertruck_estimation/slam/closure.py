@@ -1,14 +1,14 @@
-"""Loop closure: where the robot may have come back to, whether it has, and whether that agrees with everything else.
+"""Loop closure: candidates, their verification by scan matching, and their consistency with the pose graph.
 
-Candidates are key scans that the drift bound lets lie near though the graph is not sure of them: the likeliest by
-place, and the most alike by descriptor. The robot's own surroundings (not one scan: a corridor looks like itself
-everywhere) are searched for in the candidate's by branch and bound and fitted finely. A hit in a small window counts at
-once; in a wide one it waits until others, found from different places, agree with it (pairwise consistency: Mangelson
-et al. 2018). After the optimisation a closure that the graph resists is taken back.
+Candidates are keyframes that may be near within the bound of the drift: the likeliest by position, and the most similar
+by descriptor. The surroundings of the newest keyframe (not one scan: a corridor looks alike everywhere) are matched to
+those of the candidate by branch and bound, then by ICP. A match in a small window is accepted at once; in a wide one it
+waits until others, from different places, agree with it (pairwise consistency: Mangelson
+et al. 2018). A closure that the optimised graph rejects is removed.
 
-A place seen again from the other side shows little of what it showed before. At the end of a run (``review``), where
-the drift is small, so that little else is possible, a hit also counts if what must have been in view of the place fits,
-and neither side looked through the other's walls: one such hit proves nothing, so they need witnesses in any window.
+A place seen again from the other side overlaps little. At the end of a run (``review``), where the drift is small, a
+match is also accepted if the part that must have been in view of the place fits, and neither side looked through the
+other's walls. One such match is no evidence, so supporting ones are needed in any window.
 """
 
 import math
@@ -21,28 +21,28 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, inverse, rotation, transform
 from monstertruck_estimation.slam.correlation import Submap, correlate, merged
-from monstertruck_estimation.slam.frontend import degeneracy, deviations
-from monstertruck_estimation.slam.graph import optimise, residuals, trust
-from monstertruck_estimation.slam.keyframes import KeyMap
+from monstertruck_estimation.slam.graph import optimise, residuals, robust_weights
+from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.registration import measure, register
+from monstertruck_estimation.slam.scan_matcher import degeneracy, deviations
 from monstertruck_estimation.slam.scans import Scan
 
 Array = NDArray[np.float64]
 
 VIEW: Final = 2.5
-"""Two key scans this near see enough of the same, m."""
+"""Two keyframes this near see enough of the same, m."""
 WINDOW: Final = 3.0
 """Half width of a search in standard deviations of the drift."""
 MARGIN: Final = (0.3, 0.05)
 """What is added to that, m and rad."""
-WIDEST: Final = (12.0, 1.0)
+MAX_WINDOW: Final = (12.0, 1.0)
 """Half width of a search at most, m and rad."""
-SURE: Final = (1.5, 0.3)
-"""Hits in windows up to this need no witness, m and rad."""
+SMALL_WINDOW: Final = (1.5, 0.3)
+"""Matches in windows up to this need no support, m and rad."""
 LEVELS: Final = 7
 """Levels of the pyramid."""
 QUERY_KEYS: Final = 12
-"""Key scans of the query at most."""
+"""Keyframes of the query at most."""
 QUERY_REACH: Final = 3.0
 """They are this near to the newest, m."""
 QUERY_CELL: Final = 0.1
@@ -50,14 +50,14 @@ QUERY_CELL: Final = 0.1
 QUERY_POINTS: Final = 320
 """Points of the query at most."""
 PLACE_KEYS: Final = 60
-"""Key scans of the place it is searched in, at most."""
-LEAST_SCORE: Final = 0.45
+"""Keyframes of the place it is searched in, at most."""
+MIN_SCORE: Final = 0.45
 """Mean likelihood of surroundings found again."""
-LEAST_OVERLAP: Final = 0.55
+MIN_OVERLAP: Final = 0.55
 """Share of their points that must fit."""
-LEAST_RATIO: Final = 0.02
+MIN_RATIO: Final = 0.02
 """Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
-FARTHEST: Final = 0.3
+MAX_CORRECTION: Final = 0.3
 """The fine fit ends this near to the coarse one, m."""
 CONTRADICTION: Final = 0.15
 """Share of the points looked through by scans of the other side, from which a place is another one."""
@@ -72,36 +72,36 @@ PART_CONTRADICTION: Final = 0.05
 PART_WIDER: Final = (1.0, 2.0)
 """and how much wider the search is: scans alone drift further than any covariance says."""
 REVIEWED: Final = 250
-"""Key scans from which it begins, at most."""
-RIVAL: Final = 0.9
-"""A second place this nearly as good makes the first one worthless."""
-APART: Final = 1.0
+"""Keyframes from which it begins, at most."""
+MAX_RIVAL: Final = 0.9
+"""A match is ambiguous if another place scores more than this share of it."""
+MIN_SEPARATION: Final = 1.0
 """Distance at which places are different, m."""
-LEAST_LIKENESS: Final = 0.8
+MIN_LIKENESS: Final = 0.8
 """Of a candidate by descriptor."""
 FLOOR: Final = (0.03, 0.03, 0.01)
 """Standard deviation of a closure, m and rad: its submaps are not rigid."""
-WITNESSES: Final = 3
-"""Hits that must agree before a wide search is believed, and so many more for each that contradicts."""
+MIN_SUPPORT: Final = 3
+"""Matches that must agree before one of a wide search is accepted, and as many more for each that contradicts."""
 BASELINE: Final = 1.0
-"""Way between the first and the last of them, m."""
+"""Length of the trajectory between the first and the last of them, m."""
 CONSISTENT: Final = 11.3
 """Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
 STRETCH: Final = 3.0
-"""Way on either side of a hit within which the drift is small, so that of two contradicting hits one is false, m."""
-VAGUE: Final = 1.0
-"""Agreement proves nothing where the drift between the hits is greater, m."""
-FORGET: Final = 60
-"""Key scans after which a hit without witnesses is forgotten."""
-REST: Final = 4
-"""Key scans between two searches in the same place."""
-BROKEN: Final = 0.02
-"""Share of the relations that a closure may strain before it is taken back."""
+"""Length of trajectory within which the drift is small, so that of two contradicting matches one is false, m."""
+MAX_DRIFT: Final = 1.0
+"""Consistency is not judged where the drift between two matches is greater, m."""
+MAX_AGE: Final = 60
+"""Keyframes after which a match without support is dropped."""
+SEARCH_INTERVAL: Final = 4
+"""Keyframes between two searches in the same place."""
+MAX_STRAINED: Final = 0.02
+"""Share of the edges that may become outliers before a closure is removed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hit:
-    """The key scan ``target`` found near ``origin``; each is one of its own."""
+class LoopMatch:
+    """A verified match: the keyframe ``target`` found near ``origin``; compared by identity."""
 
     origin: int
     target: int
@@ -113,102 +113,102 @@ class LoopCloser:
     """Finds, checks and adds closures."""
 
     def __init__(self) -> None:
-        self._hits: list[Hit] = []
+        self._hits: list[LoopMatch] = []
         self._tried: dict[int, int] = {}
         self._fingerprints: list[Array] = []
         self.searches = 0
         """Searches made."""
         self.refused = 0
-        """Closures taken back because the graph resisted."""
+        """Closures removed because the optimised graph rejected them."""
 
-    def close(self, keymap: KeyMap) -> bool:
-        """Search from the newest key scan; True if a closure has moved the poses."""
-        newest = len(keymap) - 1
-        own = keymap.around(newest, QUERY_KEYS, QUERY_REACH)
-        query = _surroundings(keymap, own, newest)
+    def close(self, keyframes: KeyframeMap) -> bool:
+        """Search for loops from the newest keyframe; True if a closure has moved the poses."""
+        newest = len(keyframes) - 1
+        own = keyframes.around(newest, QUERY_KEYS, QUERY_REACH)
+        query = _surroundings(keyframes, own, newest)
         while len(self._fingerprints) < newest:
             self._fingerprints.append(np.zeros_like(describe(query.points)))
         self._fingerprints.append(describe(query.points))
-        covariances, far = keymap.drift(newest)
-        self._hits = [hit for hit in self._hits if newest - hit.target < FORGET]
-        self._tried = {place: when for place, when in self._tried.items() if newest - when < REST}
-        for candidate in self._candidates(keymap, newest, covariances, far):
+        covariances, far = keyframes.drift(newest)
+        self._hits = [hit for hit in self._hits if newest - hit.target < MAX_AGE]
+        self._tried = {place: when for place, when in self._tried.items() if newest - when < SEARCH_INTERVAL}
+        for candidate in self._candidates(keyframes, newest, covariances, far):
             self._tried[candidate] = newest
             window = _window(covariances[candidate])
-            hit = self._search(keymap, query, own, newest, candidate, window)
-            sure = window[0] <= SURE[0] and window[1] <= SURE[1]
-            if hit is not None and self._believed(keymap, hit, sure=sure):
+            hit = self._search(keyframes, query, own, newest, candidate, window)
+            sure = window[0] <= SMALL_WINDOW[0] and window[1] <= SMALL_WINDOW[1]
+            if hit is not None and self._accepted(keyframes, hit, sure=sure):
                 return True
         return False
 
-    def review(self, keymap: KeyMap) -> bool:
-        """Search from everywhere (seconds of work) for places of which only a part was seen before.
+    def review(self, keyframes: KeyframeMap) -> bool:
+        """Search from all keyframes (seconds of work) for places of which only a part was seen before.
 
-        For the end of a run: what came after a place belongs to its surroundings then, too. True if a closure has moved
-        the poses.
+        For the end of a run, when the surroundings of a place include what came later. True if a closure has moved the
+        poses.
         """
         self._tried.clear()
-        count = len(keymap)
+        count = len(keyframes)
         places = np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist()
-        hits = [hit for at in places if (hit := self._seen_in_part(keymap, at)) is not None]
+        hits = [hit for at in places if (hit := self._partial_match(keyframes, at)) is not None]
         closed = False
-        while group := agreed(keymap, hits):
-            closed |= self._added(keymap, group)
+        while group := consistent_group(keyframes, hits):
+            closed |= self._added(keyframes, group)
             hits = [hit for hit in hits if hit not in group]
         return closed
 
     def forget(self, kept: NDArray[np.bool_]) -> None:
-        """Only the marked key scans are left, with new numbers."""
+        """Only the marked keyframes are kept, with new numbers."""
         self._hits.clear()
         self._tried.clear()
         self._fingerprints = [one for one, left in zip(self._fingerprints, kept.tolist(), strict=False) if left]
 
-    def _seen_in_part(self, keymap: KeyMap, at: int) -> Hit | None:
-        """Key scan ``at`` found near the likeliest place before it, if little else is possible."""
-        covariances, far = keymap.drift(at)
-        numbers = self._possible(keymap, at, covariances, far)
+    def _partial_match(self, keyframes: KeyframeMap, at: int) -> LoopMatch | None:
+        """Keyframe ``at`` found near the likeliest place before it, if little else is possible."""
+        covariances, far = keyframes.drift(at)
+        numbers = self._possible(keyframes, at, covariances, far)
         if not len(numbers):
             return None
         place, turn = _window(covariances[numbers[0]])
-        if place > SURE[0] or turn > SURE[1]:
+        if place > SMALL_WINDOW[0] or turn > SMALL_WINDOW[1]:
             return None
-        own = keymap.around(at, QUERY_KEYS, QUERY_REACH)
-        query = _surroundings(keymap, own, at)
+        own = keyframes.around(at, QUERY_KEYS, QUERY_REACH)
+        query = _surroundings(keyframes, own, at)
         tries = (
-            self._search(keymap, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True)
+            self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True)
             for wider in PART_WIDER
         )
         return next((hit for hit in tries if hit is not None), None)
 
-    def _candidates(self, keymap: KeyMap, newest: int, covariances: Array, far: Array) -> list[int]:
-        """At most two key scans: the likeliest by place, and one elsewhere that looks most alike."""
-        numbers = self._possible(keymap, newest, covariances, far)
+    def _candidates(self, keyframes: KeyframeMap, newest: int, covariances: Array, far: Array) -> list[int]:
+        """At most two keyframes: the likeliest by place, and one elsewhere that looks most alike."""
+        numbers = self._possible(keyframes, newest, covariances, far)
         if not len(numbers):
             return []
         first = int(numbers[0])
-        elsewhere = np.sort(numbers[_distance(keymap, first)[numbers] > VIEW])
+        elsewhere = np.sort(numbers[_distance(keyframes, first)[numbers] > VIEW])
         if not len(elsewhere):
             return [first]
         alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
         best = int(np.argmax(alike))
-        return [first, int(elsewhere[best])] if alike[best] > LEAST_LIKENESS else [first]
+        return [first, int(elsewhere[best])] if alike[best] > MIN_LIKENESS else [first]
 
-    def _possible(self, keymap: KeyMap, at: int, covariances: Array, far: Array) -> NDArray[np.intp]:
-        """Key scans before ``at`` that may be near it, though the graph is not sure of them, the likeliest first."""
-        off = between(keymap.poses[at], keymap.poses)
+    def _possible(self, keyframes: KeyframeMap, at: int, covariances: Array, far: Array) -> NDArray[np.intp]:
+        """Keyframes before ``at`` that may be near it within the drift, the likeliest first."""
+        off = between(keyframes.poses[at], keyframes.poses)
         distance = np.hypot(off[:, 0], off[:, 1])
-        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), WIDEST[0])
-        possible = (far > keymap.config.local_spread**2) & (distance < VIEW + reach)
+        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), MAX_WINDOW[0])
+        possible = (far > keyframes.config.local_spread**2) & (distance < VIEW + reach)
         possible[at:] = False
         for place in self._tried:
-            possible &= _distance(keymap, place) > VIEW
+            possible &= _distance(keyframes, place) > VIEW
         numbers = np.flatnonzero(possible)
         cost = distance[numbers] / (VIEW + reach[numbers]) + 0.15 * np.abs(off[numbers, 2])
         return np.asarray(numbers[np.argsort(cost, kind="stable")])
 
     def _search(
         self,
-        keymap: KeyMap,
+        keyframes: KeyframeMap,
         query: Scan,
         own: NDArray[np.intp],
         at: int,
@@ -216,111 +216,113 @@ class LoopCloser:
         window: tuple[float, float],
         *,
         part: bool = False,
-    ) -> Hit | None:
-        """Look for ``query``, the surroundings of key scan ``at``, or a part of it, in those of ``candidate``."""
+    ) -> LoopMatch | None:
+        """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``."""
         self.searches += 1
-        window = min(window[0], WIDEST[0]), min(window[1], WIDEST[1])
+        window = min(window[0], MAX_WINDOW[0]), min(window[1], MAX_WINDOW[1])
         # All of the window, not only what is round the candidate: a place that looks alike must not win by default.
-        numbers = keymap.sure(candidate)
+        numbers = keyframes.well_known(candidate)
         numbers = numbers[~np.isin(numbers, own)]
-        numbers = numbers[_distance(keymap, at)[numbers] < window[0] + keymap.config.local_reach]
+        numbers = numbers[_distance(keyframes, at)[numbers] < window[0] + keyframes.config.local_reach]
         if not len(numbers):
             return None
         numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
-        submap = keymap.submap(numbers)
+        submap = keyframes.submap(numbers)
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
-        guess = keymap.poses[at]
-        least = PART_SCORE if part else LEAST_SCORE
-        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, least, APART)
-        if peak is None or peak.rival > RIVAL * peak.score:
+        guess = keyframes.poses[at]
+        least = PART_SCORE if part else MIN_SCORE
+        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, least, MIN_SEPARATION)
+        if peak is None or peak.rival > MAX_RIVAL * peak.score:
             return None
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
-        if ratio < LEAST_RATIO or math.hypot(moved[0], moved[1]) > FARTHEST:
+        if ratio < MIN_RATIO or math.hypot(moved[0], moved[1]) > MAX_CORRECTION:
             return None
-        off = keymap.poses[numbers, :2] - fit.pose[:2]
+        off = keyframes.poses[numbers, :2] - fit.pose[:2]
         near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
-        overlap = _overlap_in_view(keymap, near, query, submap, fit.pose) if part else fit.overlap
-        if overlap < (PART_OVERLAP if part else LEAST_OVERLAP):
+        overlap = _overlap_in_view(keyframes, near, query, submap, fit.pose) if part else fit.overlap
+        if overlap < (PART_OVERLAP if part else MIN_OVERLAP):
             return None
-        if _contradiction(keymap, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
+        if _contradiction(keyframes, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
             return None
         origin = int(near[0])
         # The information is about x, y in map; the relation is in the frame of its origin.
         turn = np.eye(3)
-        turn[:2, :2] = rotation(keymap.poses[origin, 2])
+        turn[:2, :2] = rotation(keyframes.poses[origin, 2])
         covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
-        return Hit(origin, at, between(keymap.poses[origin], fit.pose), np.linalg.inv(covariance))
+        return LoopMatch(origin, at, between(keyframes.poses[origin], fit.pose), np.linalg.inv(covariance))
 
-    def _believed(self, keymap: KeyMap, hit: Hit, *, sure: bool) -> bool:
-        """Add ``hit`` and what agrees with it to the graph if that is enough, and if the graph bears it."""
-        agreeing, against = _compared(keymap, hit, self._hits)
+    def _accepted(self, keyframes: KeyframeMap, hit: LoopMatch, *, sure: bool) -> bool:
+        """Add ``hit`` and the matches that agree with it to the graph if they are enough and the graph accepts them."""
+        agreeing, against = _split_by_consistency(keyframes, hit, self._hits)
         witnesses = [hit, *agreeing]
         self._hits.append(hit)
-        enough = len(witnesses) >= WITNESSES * (1 + len(against)) and _way(keymap, witnesses) >= BASELINE
+        enough = len(witnesses) >= MIN_SUPPORT * (1 + len(against)) and _way(keyframes, witnesses) >= BASELINE
         if not sure and not enough:
             return False
-        if not self._added(keymap, witnesses):
+        if not self._added(keyframes, witnesses):
             return False
         self._hits = [other for other in self._hits if other not in witnesses]
         return True
 
-    def _added(self, keymap: KeyMap, hits: list[Hit]) -> bool:
-        """Add the hits and optimise; take them back if they do not hold or break what held."""
-        before, count = keymap.poses, len(keymap.edges)
-        edges = keymap.edges.edges()
+    def _added(self, keyframes: KeyframeMap, hits: list[LoopMatch]) -> bool:
+        """Add the matches and optimise; remove them if they, or edges that fitted before, become outliers."""
+        before, count = keyframes.poses, len(keyframes.edges)
+        edges = keyframes.edges.edges()
         _, squares = residuals(before, edges)
-        held = trust(squares, edges.loop) > 0.5
+        held = robust_weights(squares, edges.loop) > 0.5
         for hit in hits:
             spread = (FLOOR[0] ** 2, FLOOR[2] ** 2)
-            keymap.edges.add(hit.origin, hit.target, hit.measured, hit.information, spread, loop=True)
-        edges = keymap.edges.edges()
+            keyframes.edges.add(hit.origin, hit.target, hit.measured, hit.information, spread, loop=True)
+        edges = keyframes.edges.edges()
         poses = optimise(before, edges)
         _, squares = residuals(poses, edges)
-        holds = trust(squares, edges.loop) > 0.5
-        if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > BROKEN * count:
-            keymap.edges.cut(count)
+        holds = robust_weights(squares, edges.loop) > 0.5
+        if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > MAX_STRAINED * count:
+            keyframes.edges.cut(count)
             self.refused += len(hits)
             return False
-        keymap.poses = poses
+        keyframes.poses = poses
         return True
 
 
-def _compared(keymap: KeyMap, hit: Hit, others: list[Hit]) -> tuple[list[Hit], list[Hit]]:
-    """Which of ``others`` form a consistent loop with ``hit``, and which contradict it; of neither nothing is known."""
-    agreeing: list[Hit] = []
-    against: list[Hit] = []
+def _split_by_consistency(
+    keyframes: KeyframeMap, hit: LoopMatch, others: list[LoopMatch]
+) -> tuple[list[LoopMatch], list[LoopMatch]]:
+    """Which of ``others`` form a consistent loop with ``hit``, and which contradict it; others are undecided."""
+    agreeing: list[LoopMatch] = []
+    against: list[LoopMatch] = []
     others = [other for other in others if other.target != hit.target]
     if not others:
         return agreeing, against
-    at_target, _ = keymap.drift(hit.target)
-    at_origin, _ = keymap.drift(hit.origin)
+    at_target, _ = keyframes.drift(hit.target)
+    at_origin, _ = keyframes.drift(hit.origin)
     for other in others:
         # Origin to target to the other's target to its origin, against the graph's own way from origin to origin.
-        step = between(keymap.poses[hit.target], keymap.poses[other.target])
+        step = between(keyframes.poses[hit.target], keyframes.poses[other.target])
         there = compose(compose(hit.measured, step), inverse(other.measured))
-        off = between(between(keymap.poses[hit.origin], keymap.poses[other.origin]), there)
+        off = between(between(keyframes.poses[hit.origin], keyframes.poses[other.origin]), there)
         drifts = at_target[other.target] + at_origin[other.origin]
         place, turn = deviations(drifts + np.linalg.inv(hit.information) + np.linalg.inv(other.information))
-        if place <= VAGUE:
+        if place <= MAX_DRIFT:
             agrees = (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT
             (agreeing if agrees else against).append(other)
     return agreeing, against
 
 
-def agreed(keymap: KeyMap, hits: list[Hit]) -> list[Hit]:
-    """The most of ``hits`` from one stretch of the way that agree with one of them.
+def consistent_group(keyframes: KeyframeMap, hits: list[LoopMatch]) -> list[LoopMatch]:
+    """The largest group of ``hits`` from one stretch of the trajectory that agree with one of them.
 
-    None if they are not at least ``WITNESSES`` more than those of the same stretch that contradict it. What is further
-    away on the way says nothing: both may be right, and the drift more than the graph thinks.
+    Empty if they are not at least ``MIN_SUPPORT`` more than those of the same stretch that contradict it. Matches from
+    further away are not compared: both may be right, and the drift larger than its bound.
     """
-    best: list[Hit] = []
+    best: list[LoopMatch] = []
     for hit in hits:
-        near = [other for other in hits if _way(keymap, [hit, other]) < STRETCH]
-        agreeing, against = _compared(keymap, hit, near)
+        near = [other for other in hits if _way(keyframes, [hit, other]) < STRETCH]
+        agreeing, against = _split_by_consistency(keyframes, hit, near)
         group = [hit, *agreeing]
-        enough = len(group) >= len(against) + WITNESSES and _way(keymap, group) >= BASELINE
+        enough = len(group) >= len(against) + MIN_SUPPORT and _way(keyframes, group) >= BASELINE
         if enough and len(group) > len(best):
             best = group
     return best
@@ -332,36 +334,38 @@ def _window(covariance: Array) -> tuple[float, float]:
     return WINDOW * place + MARGIN[0], WINDOW * turn + MARGIN[1]
 
 
-def _contradiction(keymap: KeyMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array) -> float:
+def _contradiction(
+    keyframes: KeyframeMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array
+) -> float:
     """Share of the points of ``own`` and ``near`` looked through by the others, were ``newest`` at ``pose``."""
-    placed = compose(pose, between(keymap.poses[newest], keymap.poses[own]))
-    mine, theirs = ([keymap.keys[k].scan for k in numbers] for numbers in (own, near))
-    return contradiction(mine, placed, theirs, keymap.poses[near])
+    placed = compose(pose, between(keyframes.poses[newest], keyframes.poses[own]))
+    mine, theirs = ([keyframes.frames[k].scan for k in numbers] for numbers in (own, near))
+    return contradiction(mine, placed, theirs, keyframes.poses[near])
 
 
-def _overlap_in_view(keymap: KeyMap, near: NDArray[np.intp], query: Scan, submap: Submap, pose: Array) -> float:
+def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan, submap: Submap, pose: Array) -> float:
     """Share of the points of ``query`` at ``pose`` that fit, of those that ``near`` would have seen; 0 if few."""
-    seen = in_view([keymap.keys[k].scan for k in near], keymap.poses[near], transform(pose, query.points))
+    seen = in_view([keyframes.frames[k].scan for k in near], keyframes.poses[near], transform(pose, query.points))
     if np.count_nonzero(seen) < PART_POINTS:
         return 0.0
     return measure(query.chosen(seen), submap.cloud, pose).overlap
 
 
-def _surroundings(keymap: KeyMap, numbers: NDArray[np.intp], centre: int) -> Scan:
-    """What the numbered key scans saw, in the frame of ``centre``."""
-    poses = between(keymap.poses[centre], keymap.poses[numbers])
-    return merged([keymap.keys[k].scan for k in numbers], poses).thinned(QUERY_CELL, QUERY_POINTS)
+def _surroundings(keyframes: KeyframeMap, numbers: NDArray[np.intp], centre: int) -> Scan:
+    """The numbered keyframes merged in the frame of ``centre``."""
+    poses = between(keyframes.poses[centre], keyframes.poses[numbers])
+    return merged([keyframes.frames[k].scan for k in numbers], poses).downsampled(QUERY_CELL, QUERY_POINTS)
 
 
-def _distance(keymap: KeyMap, place: int) -> Array:
-    off = keymap.poses[:, :2] - keymap.poses[place, :2]
+def _distance(keyframes: KeyframeMap, place: int) -> Array:
+    off = keyframes.poses[:, :2] - keyframes.poses[place, :2]
     return np.asarray(np.hypot(off[:, 0], off[:, 1]))
 
 
-def _way(keymap: KeyMap, hits: list[Hit]) -> float:
-    """Way between the places the hits were made from, m."""
+def _way(keyframes: KeyframeMap, hits: list[LoopMatch]) -> float:
+    """Length of the trajectory between the targets of the matches, m."""
     first, last = min(hit.target for hit in hits), max(hit.target for hit in hits)
-    steps = np.diff(keymap.poses[first : last + 1, :2], axis=0)
+    steps = np.diff(keyframes.poses[first : last + 1, :2], axis=0)
     return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
 

@@ -18,43 +18,43 @@ class MapperConfig(Schema):
     """
 
     key_distance: Positive = 0.3
-    """Way after which a scan joins the map, m."""
+    """Distance after which a scan becomes a keyframe, m."""
     key_turn: Positive = 0.35
-    """Turn after which a scan joins the map, rad."""
+    """Turn after which a scan becomes a keyframe, rad."""
     key_points: Count = 360
-    """Points kept of a key scan at most."""
+    """Most points of a keyframe."""
     key_cell: Positive = 0.04
-    """About one point of a key scan is kept per square of this edge, m."""
+    """About one point of a keyframe is kept per square of this edge, m."""
     longest: Positive = 30.0
     """Longer ranges are not used, m."""
     odometry_floor: tuple[Positive, Positive] = (0.02, 0.05)
-    """Standard deviation of any odometry step, m and rad."""
+    """Least standard deviation of an odometry step, m and rad."""
     odometry_distance: Positive = 0.1
-    """Standard deviation of a way per metre, and of its sideways part."""
+    """Standard deviation of a displacement per metre, forward and sideways."""
     odometry_turn: tuple[Positive, Positive] = (0.2, 0.1)
     """Standard deviation of a turn per radian turned and per metre driven, rad."""
     blind_speed: tuple[Positive, Positive] = (0.5, 0.6)
     """Standard deviation of the motion predicted without odometry, m/s and rad/s."""
     drift_distance: tuple[Positive, Positive] = (0.01, 0.01)
-    """Standard deviation of the position of a matched key scan against its neighbour, m and per metre between them."""
+    """Standard deviation of the position of a matched keyframe against its neighbour, m and per metre between them."""
     drift_turn: tuple[Positive, Positive] = (0.003, 0.005)
     """The same of its yaw, rad and per radian between them."""
     local_spread: Positive = 0.15
-    """Key scans surer than this to each other, m, are mapped as one submap."""
+    """Keyframes whose drift against each other is less than this, m, belong to one submap."""
     local_reach: Positive = 5.0
-    """Key scans up to this far from the robot make its submap, m."""
+    """Keyframes up to this far from the robot belong to its submap, m."""
     local_keys: Count = 20
-    """Key scans of a submap at most."""
+    """Most keyframes of a submap."""
     neighbours: Count = 4
-    """Relations from a new key scan to those it overlaps."""
+    """Most edges from a new keyframe to those it overlaps."""
     fastest: tuple[Positive, Positive] = (5.0, 1.0)
-    """Odometry that claims a greater way is not believed, m/s and m besides (stamps come in bursts)."""
+    """Odometry that moves faster is ignored, m/s, with an allowance in m (stamps come in bursts)."""
     most_keys: Count = 4000
-    """Key scans at most; then the most dispensable go."""
+    """Most keyframes; beyond, the most redundant are pruned."""
     thinning: Positive = 0.1
-    """Share of them that goes at once."""
+    """Share of the keyframes that one pruning removes."""
     most_scans: Count = 200_000
-    """Scans of the trajectory at most; then every second one is forgotten."""
+    """Most scans of the trajectory; beyond, every second one is dropped."""
 
 
 class GridConfig(Schema):
@@ -67,15 +67,15 @@ class GridConfig(Schema):
     miss: Annotated[float, Field(gt=0, lt=0.5)] = 0.4
     """Probability that a cell a beam has passed is occupied."""
     limit: Annotated[float, Field(gt=0.5, lt=1)] = 0.98
-    """No cell becomes surer than this, so that what moves away is forgotten."""
+    """No cell becomes more certain than this, so that objects that move away disappear."""
     spacing: Positive = 0.1
-    """Scans join the grid after so much way, m,"""
+    """A scan is integrated after so much distance, m,"""
     turn: Positive = 0.1
     """or turn, rad,"""
     pause: Positive = 1.0
     """or seconds."""
     remembered: Annotated[int, Field(ge=16)] = 6000
-    """Scans kept to draw the grid anew after a loop closure; of more, every other old one is forgotten."""
+    """Scans stored to rebuild the grid after a loop closure; beyond, every other old one is dropped."""
 
 
 class SlamConfig(Schema):
@@ -88,7 +88,7 @@ class SlamConfig(Schema):
     """Folder the map is saved to at the end and every ``save_period`` seconds; null = nowhere"""
     save_period: Positive = 60.0
     front: Literal["planar", "kiss"] = "planar"
-    """Scan front end"""
+    """Scan matcher"""
     mapper: MapperConfig = MapperConfig()
     grid: GridConfig = GridConfig()
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
@@ -100,7 +100,7 @@ class SlamConfig(Schema):
     map_period: Positive = 10.0
     """Seconds after which a changed map is published whole, at the latest"""
     slew: tuple[Positive, Positive] = (0.3, 0.5)
-    """The pose in map follows corrections no faster than this, m/s and rad/s, so that trackers see no jump,"""
+    """The pose in map follows corrections no faster than this, m/s and rad/s, so that it does not jump,"""
     jump: Positive = 1.0
     """unless they are greater than this, m: then at once"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.03

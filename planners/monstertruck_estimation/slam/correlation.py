@@ -29,7 +29,7 @@ MARGIN: Final = math.ceil(LONGEST / RESOLUTION) + 5
 SMEAR: Final = 0.08
 """Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search."""
 DOUBT: Final = 0.002
-"""What a squared standard deviation from the guess costs, as share of the score."""
+"""Penalty of a squared standard deviation from the guess, as share of the score."""
 WORK: Final = 400_000
 """Blocks looked at before the search ends with what it has."""
 

@@ -1,4 +1,4 @@
-"""Pose graph in the plane: sparse Levenberg-Marquardt over relative poses, robust where a relation may be wrong.
+"""Pose graph in the plane: sparse Levenberg-Marquardt over relative poses, robust against false loop closures.
 
 Residual of an edge: the pose of ``target`` in the frame of ``origin`` minus its measurement. Loop edges are weighted by
 dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): switchable constraints in closed form.
@@ -32,7 +32,7 @@ SETTLED: Final = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Relations between poses, as arrays with one row per edge."""
+    """Edges between poses, as arrays with one row per edge."""
 
     origin: Index
     """Shape (n,)."""
@@ -49,15 +49,15 @@ class Edges:
         return len(self.origin)
 
     def chosen(self, kept: NDArray[np.bool_]) -> "Edges":
-        """The marked relations."""
+        """The marked edges."""
         return Edges(self.origin[kept], self.target[kept], self.measured[kept], self.information[kept], self.loop[kept])
 
     def renumbered(self, number: Index) -> "Edges":
-        """The same between poses that are now called ``number[k]``."""
+        """The same edges with pose k renumbered to ``number[k]``."""
         return Edges(number[self.origin], number[self.target], self.measured, self.information, self.loop)
 
     def joined(self, other: "Edges") -> "Edges":
-        """The relations of both."""
+        """The edges of both."""
         return Edges(
             np.concatenate((self.origin, other.origin)),
             np.concatenate((self.target, other.target)),
@@ -74,8 +74,8 @@ def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
     return off, np.einsum("ni,nij,nj->n", off, edges.information, off)
 
 
-def trust(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Array:
-    """Weight in (0, 1] of every edge by its squared residual: 1 for those that cannot be wrong."""
+def robust_weights(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Array:
+    """Weight in (0, 1] of every edge by its squared residual; 1 for those that are no loop closures."""
     scale = np.minimum(1.0, 2 * switch / (switch + squares))
     return np.where(loop, scale**2, 1.0)
 
@@ -83,8 +83,9 @@ def trust(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Ar
 def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -> Array:
     """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; number ``fixed`` stays where it is.
 
-    Loop edges are first taken at their word, however far off, and doubted step by step (graduated non-convexity: Yang,
-    Antonante, Tzoumas, Carlone 2020): a true closure of a long loop starts as far off as a false one.
+    Loop edges first count in full, however large their residual, then are down-weighted step by step (graduated
+    non-convexity: Yang, Antonante, Tzoumas, Carlone 2020): a true closure of a long loop starts as far off as a
+    false one.
     """
     if not len(edges):
         return poses
@@ -94,7 +95,7 @@ def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -
     switch = SWITCH * max(1.0, float(squares[edges.loop].max(initial=0.0)) / SWITCH)
     cost = _cost(squares, edges.loop, switch)
     for _ in range(iterations):
-        step = pattern.solve(poses, edges, off, trust(squares, edges.loop, switch), damping)
+        step = pattern.solve(poses, edges, off, robust_weights(squares, edges.loop, switch), damping)
         moved = poses + step
         moved[:, 2] = wrap(moved[:, 2])
         off_now, squares_now = residuals(moved, edges)
@@ -115,7 +116,7 @@ def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -
 
 
 def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
-    """Sum of the robust costs belonging to ``trust``."""
+    """Sum of the robust costs belonging to ``robust_weights``."""
     scale = np.minimum(1.0, 2 * switch / (switch + squares))
     robust = scale**2 * squares + switch * (1 - scale) ** 2
     return float(np.where(loop, robust, squares).sum())
@@ -207,9 +208,9 @@ def _assemble(  # type: ignore[no-untyped-def] # noqa: ANN202
 
 
 def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array, Array]:
-    """Covariance of every pose in the frame of ``source``, carried along the surest path of the graph.
+    """Covariance of every pose in the frame of ``source``, along the path of least variance through the graph.
 
-    An upper bound: what other paths know is left out.
+    An upper bound: other paths are ignored.
 
     Args:
         poses: shape (n, 3).

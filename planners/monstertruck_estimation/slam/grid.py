@@ -1,4 +1,4 @@
-"""Occupancy grid by the beam model: log odds of every cell, growing, with its changes by tiles.
+"""Occupancy grid by the beam model: log odds of every cell, growing, its changes published as tiles.
 
 Inverse sensor model with constant log odds for the end of a beam and for what it passed (Thrun, Burgard, Fox:
 Probabilistic Robotics, table 9.2). A scan counts once per cell, and an end outweighs passes: otherwise walls seen at a
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import between, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.worker_io import UNKNOWN, Patch, Vector
+from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch, Vector
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class OccupancyGrid:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything that was seen; what was published stays known to ``changes``."""
+        """Empty the grid; ``changes`` still compares with what was published."""
         self._corner = np.zeros(2, np.int64)
         self._odds = np.zeros((0, 0), np.int16)
         self._marks = np.zeros((0, 0), np.uint16)
@@ -56,7 +56,7 @@ class OccupancyGrid:
         self._redrawn = True
 
     def add(self, sensor: Array, points: Array) -> None:
-        """Take in one scan.
+        """Integrate one scan.
 
         Args:
             sensor: shape (2,), where the beams began, in map, m.
@@ -81,18 +81,18 @@ class OccupancyGrid:
             (self._hit, self._miss, self._limit),
         )
 
-    def patch(self) -> Patch:
+    def patch(self) -> GridPatch:
         """The whole grid, without unknown margins; without cells before the first scan."""
         cells = self._percent[self._odds + self._limit]
         rows, columns = np.flatnonzero((cells != UNKNOWN).any(axis=1)), np.flatnonzero((cells != UNKNOWN).any(axis=0))
         if not len(rows):
-            return Patch(np.zeros((0, 0), np.int8), (0.0, 0.0), self.config.resolution)
+            return GridPatch(np.zeros((0, 0), np.int8), (0.0, 0.0), self.config.resolution)
         cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         corner = self._corner + np.array((columns[0], rows[0]))
-        return Patch(np.ascontiguousarray(cells), self._metres(corner), self.config.resolution)
+        return GridPatch(np.ascontiguousarray(cells), self._metres(corner), self.config.resolution)
 
-    def changes(self) -> list[Patch]:
-        """The tiles that differ from what the last call told, ordered by row and column."""
+    def changes(self) -> list[GridPatch]:
+        """The tiles that differ from the last call's, ordered by row and column."""
         result = []
         known = self._published if self._redrawn else ()
         for key in sorted({*known, *self._candidates()}):
@@ -103,7 +103,7 @@ class OccupancyGrid:
                 continue
             self._published[key] = cells
             row, column = key
-            result.append(Patch(cells, self._metres(np.array((column, row)) * TILE), self.config.resolution))
+            result.append(GridPatch(cells, self._metres(np.array((column, row)) * TILE), self.config.resolution))
         self._touched, self._redrawn = None, False
         return result
 
@@ -216,11 +216,11 @@ PAGE_POINTS: Final = 1 << 16
 LONGEST_POINT: Final = 32.7
 """Points are kept as 16-bit millimetres, m."""
 REDRAW_MOTION: Final = (0.5, 0.01)
-"""Poses that moved by less (cells, rad) are not worth drawing anew."""
+"""The grid is rebuilt when a pose moved by more than this (cells, rad)."""
 
 
-class Pages:
-    """Points of many scans in pages that are never given back: scans that come and go leave no holes in the heap."""
+class PointPages:
+    """Points of many scans in pages that are never freed, so that the heap does not fragment."""
 
     def __init__(self) -> None:
         self._pages: list[NDArray[np.int16]] = []
@@ -229,7 +229,7 @@ class Pages:
         """Page, first row and number of rows of each scan."""
 
     def append(self, points: NDArray[np.int16]) -> None:
-        """Remember a scan, shape (n, 2)."""
+        """Store a scan, shape (n, 2)."""
         while self._page < len(self._pages) and self._row + len(points) > len(self._pages[self._page]):
             self._page, self._row = self._page + 1, 0
         if self._page == len(self._pages):
@@ -239,7 +239,7 @@ class Pages:
         self._places.append((self._page, first, len(points)))
 
     def keep(self, chosen: Iterable[int]) -> None:
-        """Forget all but the ``chosen`` scans, which rise; they move together."""
+        """Drop all but the ``chosen`` scans (rising numbers) and compact the pages."""
         kept = [self._places[index] for index in chosen]
         self._page, self._row, self._places = 0, 0, []
         for page, first, count in kept:  # never behind its own place, so nothing is overwritten before it has moved
@@ -253,11 +253,11 @@ class Pages:
         return self._pages[page][first : first + count]
 
 
-class Painter:
-    """Grid of the scans it was given and still remembers.
+class GridBuilder:
+    """Occupancy grid of stored scans, rebuilt when optimisation moves their poses.
 
     Args:
-        config: grid, and which scans join it.
+        config: the grid, and which scans are integrated.
     """
 
     def __init__(self, config: GridConfig) -> None:
@@ -265,14 +265,14 @@ class Painter:
         self._config = config
         self._stamps: list[int] = []
         self._poses: list[Array] = []
-        self._points = Pages()
+        self._points = PointPages()
         self._mounts: list[Vector] = []
 
     def __len__(self) -> int:
         return len(self._stamps)
 
     def add(self, scan: Scan, stamp: int, pose: Array, mount: Vector) -> bool:
-        """Take a scan in if it is due; tells whether it was.
+        """Integrate a scan if the robot moved far enough since the last one; returns whether it did.
 
         Args:
             scan: points in base.
@@ -289,14 +289,14 @@ class Painter:
         self._mounts.append(mount)
         self._draw(len(self._stamps) - 1)
         if len(self._stamps) > self._config.remembered:
-            self._thin()
+            self._prune()
         return True
 
-    def follow(self, stamps: NDArray[np.int64], poses: Array) -> bool:
-        """Draw anew if the trajectory puts remembered scans elsewhere; tells whether it did.
+    def update_poses(self, stamps: NDArray[np.int64], poses: Array) -> bool:
+        """Rebuild the grid if the trajectory moved the stored scans; returns whether it did.
 
         Args:
-            stamps: shape (n,), ns, rising; between them the way is taken as straight.
+            stamps: shape (n,), ns, rising; poses between them are interpolated.
             poses: shape (n, 3), base in map.
         """
         if not self._stamps or not len(stamps):
@@ -327,8 +327,8 @@ class Painter:
         sensor = transform(self._poses[i], np.array([self._mounts[i][:2]]))[0]
         self.grid.add(sensor, transform(self._poses[i], self._points[i] / MILLIMETRES))
 
-    def _thin(self) -> None:
-        """Forget every other scan but the newest quarter."""
+    def _prune(self) -> None:
+        """Drop every other scan but the newest quarter."""
         count = len(self._stamps)
         kept = [i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4]
         self._stamps = [self._stamps[i] for i in kept]

@@ -1,4 +1,4 @@
-"""Key scans and the relations between them: arrays that grow, and forget when told to."""
+"""The keyframe map: keyframes with their pose graph, the trajectory, pruning, and joint registration at the end."""
 
 import itertools
 import math
@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse, wrap
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
-from monstertruck_estimation.slam.frontend import deviations
 from monstertruck_estimation.slam.graph import Edges, drift, optimise
 from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equations, register
+from monstertruck_estimation.slam.scan_matcher import deviations
 from monstertruck_estimation.slam.scans import Scan
 
 Array = NDArray[np.float64]
 
 INITIAL_ROWS: Final = 64
-"""Rows at the beginning."""
+"""Rows allocated at first."""
 
 
-class Rows:
-    """Rows of one shape, appended in constant time."""
+class GrowingArray:
+    """Rows of one shape, appended in amortised constant time."""
 
     def __init__(self, *shape: int, dtype: type = float) -> None:
         self._data: NDArray[Any] = np.zeros((INITIAL_ROWS, *shape), dtype)
@@ -37,7 +37,7 @@ class Rows:
         self._count += 1
 
     def set(self, rows: NDArray[Any]) -> None:
-        """Have these rows and no others."""
+        """Replace all rows."""
         data = np.zeros((max(INITIAL_ROWS, len(rows)), *self._data.shape[1:]), self._data.dtype)
         data[: len(rows)] = rows
         self._data, self._count = data, len(rows)
@@ -52,27 +52,27 @@ class Rows:
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
-    """A scan that the map is made of."""
+class Keyframe:
+    """A scan that is part of the map."""
 
     stamp: int
     """ns."""
     scan: Scan
-    """Thinned points in base."""
+    """Downsampled points in base."""
     cloud: Cloud
-    """The same, hashed."""
+    """The same with a hash for neighbour search."""
 
 
-class EdgeStore:
-    """Growing ``Edges``."""
+class EdgeList:
+    """``Edges`` that grow."""
 
     def __init__(self) -> None:
-        self._ends = Rows(2, dtype=np.int64)
-        self._measured = Rows(3)
-        self._information = Rows(3, 3)
-        self._spread = Rows(2)
-        self._loop = Rows(dtype=bool)
-        self._odometry = Rows(dtype=bool)
+        self._ends = GrowingArray(2, dtype=np.int64)
+        self._measured = GrowingArray(3)
+        self._information = GrowingArray(3, 3)
+        self._spread = GrowingArray(2)
+        self._loop = GrowingArray(dtype=bool)
+        self._odometry = GrowingArray(dtype=bool)
 
     def add(
         self,
@@ -85,7 +85,7 @@ class EdgeStore:
         loop: bool = False,
         odometry: bool = False,
     ) -> None:
-        """One relation; ``spread`` are the variances (m^2, rad^2) with which it takes part in drift bounds."""
+        """Add an edge; ``spread`` are its variances (m^2, rad^2) in the bound of the drift."""
         self._ends.append((origin, target))
         self._measured.append(measured)
         self._information.append(information)
@@ -94,12 +94,12 @@ class EdgeStore:
         self._odometry.append(odometry)
 
     def cut(self, count: int) -> None:
-        """Forget all relations after the first ``count``."""
+        """Remove all edges after the first ``count``."""
         for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
             rows.set(rows.view[:count])
 
     def replace(self, edges: Edges, spread: Array, odometry: NDArray[np.bool_]) -> None:
-        """Have these relations and no others."""
+        """Replace all edges."""
         self._ends.set(np.stack((edges.origin, edges.target), axis=1))
         self._measured.set(edges.measured)
         self._information.set(edges.information)
@@ -108,7 +108,7 @@ class EdgeStore:
         self._odometry.set(odometry)
 
     def edges(self) -> Edges:
-        """Views of all relations."""
+        """Views of all edges."""
         ends = self._ends.view
         return Edges(ends[:, 0], ends[:, 1], self._measured.view, self._information.view, self._loop.view)
 
@@ -119,31 +119,31 @@ class EdgeStore:
 
     @property
     def odometry(self) -> NDArray[np.bool_]:
-        """Shape (n,): whether odometry gave the relation."""
+        """Shape (n,): whether the edge is from odometry."""
         return self._odometry.view
 
     def __len__(self) -> int:
         return len(self._ends)
 
 
-class Trail:
-    """Every scan's place relative to a key scan, so that the whole trajectory moves with the graph.
+class Trajectory:
+    """Every scan's pose relative to a keyframe, so that the whole trajectory moves with the graph.
 
-    A scan that becomes a key scan is there twice: where the key scan before it saw it, and as itself. What the graph
-    has moved the one against the other is spread over the scans between, or every key scan would be a jolt.
+    A scan that becomes a keyframe is stored twice: relative to the keyframe before it, and as itself. What optimisation
+    moved the one against the other is distributed over the scans between, or the trajectory would jump at keyframes.
 
     Args:
-        most: scans remembered; beyond that every second one is forgotten.
+        most: scans stored; beyond that every second one is dropped.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._stamps = Rows(dtype=np.int64)
-        self._keys = Rows(dtype=np.int64)
-        self._relative = Rows(3)
+        self._stamps = GrowingArray(dtype=np.int64)
+        self._keys = GrowingArray(dtype=np.int64)
+        self._relative = GrowingArray(3)
 
     def append(self, stamp: int, key: int, relative: Array) -> None:
-        """One more scan."""
+        """Add a scan."""
         self._stamps.append(stamp)
         self._keys.append(key)
         self._relative.append(relative)
@@ -152,13 +152,13 @@ class Trail:
                 rows.set(rows.view[::2])
 
     def move(self, stand_in: NDArray[np.int64], offset: Array) -> None:
-        """Key k is now known as ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
+        """Keyframe k is replaced by ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
         keys = self._keys.view
         self._relative.set(compose(offset[keys], self._relative.view))
         self._keys.set(stand_in[keys])
 
     def poses(self, keys: Array) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and poses (n, 3), given those of the key scans."""
+        """Stamps (n,) and poses (n, 3) of all scans, given the poses of the keyframes."""
         stamps = self._stamps.view.copy()
         poses = compose(keys[self._keys.view], self._relative.view)
         joints = np.flatnonzero(stamps[1:] == stamps[:-1])
@@ -174,19 +174,19 @@ class Trail:
 Numbers = NDArray[np.intp]
 
 RECENT: Final = 5
-"""Key scans this few apart are neighbours in time: their relation is no loop."""
+"""Keyframes this few apart are neighbours in time: an edge between them is no loop closure."""
 LINK_OVERLAP: Final = 0.4
 LINK_PAIRS: Final = 20
-LINK_FARTHEST: Final = (0.15, 0.1)
-"""Two key scans that the submap put right do not move further than this against each other, m and rad."""
+LINK_MAX_CORRECTION: Final = (0.15, 0.1)
+"""Greatest correction of an edge between keyframes that were matched to one submap, m and rad."""
 LINK_FLOOR: Final = (0.005, 0.005, 0.002)
-"""Standard deviation of any relation between scans, m and rad."""
+"""Least standard deviation of an edge between scans, m and rad."""
 VIEW: Final = 0.7
-"""A radian between two views counts as this many metres."""
+"""Metres that one radian between two views counts as."""
 
 
-class KeyMap:
-    """Key scans with poses in map, and the graph between them.
+class KeyframeMap:
+    """Keyframes with their poses in map and the pose graph between them.
 
     Args:
         config: noise and limits.
@@ -194,28 +194,28 @@ class KeyMap:
 
     def __init__(self, config: MapperConfig) -> None:
         self.config = config
-        self.keys: list[Key] = []
+        self.frames: list[Keyframe] = []
         self.poses: Array = np.zeros((0, 3))
-        self.edges = EdgeStore()
+        self.edges = EdgeList()
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return len(self.frames)
 
     def add(self, scan: Scan, stamp: int, pose: Array) -> None:
-        """A new key scan, without relations."""
-        kept = scan.thinned(self.config.key_cell, self.config.key_points)
-        self.keys.append(Key(stamp, kept, Cloud.of(kept)))
+        """Add a keyframe, without edges."""
+        kept = scan.downsampled(self.config.key_cell, self.config.key_points)
+        self.frames.append(Keyframe(stamp, kept, Cloud.of(kept)))
         self.poses = np.vstack((self.poses, pose))
 
-    def relate_by_odometry(self, delta: Array, covariance: Array) -> None:
-        """The way from the last key scan but one to the last."""
+    def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
+        """Add the edge from the last keyframe but one to the last."""
         new = len(self) - 1
         place, turn = deviations(covariance)
         information: Array = np.asarray(np.linalg.inv(covariance + 1e-6 * np.eye(3)), dtype=np.float64)
         self.edges.add(new - 1, new, delta, information, (place**2, turn**2), odometry=True)
 
-    def relate_by_scans(self, local: Numbers) -> None:
-        """Relations of the newest key scan to those of ``local`` that it overlaps, the nearest first."""
+    def add_scan_edges(self, local: Numbers) -> None:
+        """Add edges from the newest keyframe to those of ``local`` that it overlaps, the nearest first."""
         new = len(self) - 1
         order = local[np.argsort(self._closeness(local, self.poses[new]), kind="stable")]
         linked = 0
@@ -225,12 +225,12 @@ class KeyMap:
                 break
 
     def _link(self, origin: int, target: int) -> bool:
-        """Relate two key scans that overlap where they are now; False if they do not fit."""
+        """Register two keyframes from their present poses and add the edge; False if they do not fit."""
         config = self.config
         guess = between(self.poses[origin], self.poses[target])
-        fit = register(self.keys[target].scan, self.keys[origin].cloud, guess)
+        fit = register(self.frames[target].scan, self.frames[origin].cloud, guess)
         off = between(guess, fit.pose)
-        far = math.hypot(off[0], off[1]) > LINK_FARTHEST[0] or abs(off[2]) > LINK_FARTHEST[1]
+        far = math.hypot(off[0], off[1]) > LINK_MAX_CORRECTION[0] or abs(off[2]) > LINK_MAX_CORRECTION[1]
         if far or fit.overlap < LINK_OVERLAP or fit.pairs < LINK_PAIRS:
             return False
         place = config.drift_distance[0] + config.drift_distance[1] * math.hypot(guess[0], guess[1])
@@ -246,52 +246,52 @@ class KeyMap:
         """Bound of the drift against ``source``: covariances in its frame, and summed variances."""
         return drift(self.poses, self.edges.edges(), self.edges.spread, source)
 
-    def sure(self, source: int) -> Numbers:
-        """Numbers, rising, of the key scans that are sure against ``source``."""
+    def well_known(self, source: int) -> Numbers:
+        """Numbers, rising, of the keyframes whose drift against ``source`` is below ``local_spread``."""
         _, far = self.drift(source)
         return np.asarray(np.flatnonzero(far <= self.config.local_spread**2))
 
     def around(self, source: int, most: int, reach: float | None = None) -> Numbers:
-        """Numbers of the key scans near ``source`` that are sure against it, nearest first."""
-        near, centre = self.sure(source), self.poses[source]
+        """Numbers of the well-known keyframes near ``source``, nearest first."""
+        near, centre = self.well_known(source), self.poses[source]
         off = self.poses[near, :2] - centre[:2]
         near = near[np.hypot(off[:, 0], off[:, 1]) <= (reach or self.config.local_reach)]
         order = np.argsort(self._closeness(near, centre), kind="stable")
         return np.asarray(near[order][:most])
 
     def local(self) -> Numbers:
-        """Numbers, rising, of the key scans that make the submap around the newest one."""
+        """Numbers, rising, of the keyframes of the submap around the newest one."""
         newest = len(self) - 1
         return np.union1d(self.around(newest, self.config.local_keys), np.arange(max(newest - 2, 0), newest + 1))
 
     def submap(self, numbers: Numbers) -> Submap:
-        """Cloud of the numbered key scans in map."""
-        return Submap(Cloud.of(merged([self.keys[k].scan for k in numbers], self.poses[numbers])))
+        """The numbered keyframes merged in map."""
+        return Submap(Cloud.of(merged([self.frames[k].scan for k in numbers], self.poses[numbers])))
 
     def optimise(self) -> None:
-        """Fit all poses to all relations; the first stays."""
+        """Optimise the pose graph; the first pose is fixed."""
         self.poses = optimise(self.poses, self.edges.edges())
 
     def refine(self) -> None:
-        """Register all key scans jointly: seconds of work."""
+        """Register all keyframes jointly: seconds of work."""
         if len(self) > 1:
             edges = self.edges.edges()
-            self.poses = refine(self.keys, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
+            self.poses = refine(self.frames, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
 
-    def thin(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-        """Leave out key scans that others stand in for.
+    def prune(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
+        """Remove the keyframes that others make redundant.
 
         Returns:
-            For every former key scan whether it is kept, (n,), the number by which it is known now, (n,), and its pose
-            in the frame of the key scan of that number, (n, 3).
+            For every former keyframe whether it is kept, (n,), the number of the keyframe that represents it, (n,), and
+            its pose in the frame of that one, (n, 3).
         """
-        gone, stand_in, edges, spread, odometry = thinned(
+        gone, stand_in, edges, spread, odometry = pruned(
             self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.thinning
         )
         offset = between(self.poses[stand_in], self.poses)
         number = np.cumsum(~gone) - 1
         self.edges.replace(edges.renumbered(number), spread, odometry)
-        self.keys = [key for key, left_out in zip(self.keys, gone.tolist(), strict=True) if not left_out]
+        self.frames = [key for key, left_out in zip(self.frames, gone.tolist(), strict=True) if not left_out]
         self.poses = self.poses[~gone]
         return ~gone, number[stand_in], offset
 
@@ -301,12 +301,12 @@ class KeyMap:
 
 
 PRUNE_SPARED: Final = 60
-"""The newest key scans are never left out."""
-"""A radian between two views counts as this many metres."""
+"""The newest keyframes are never removed."""
+"""Metres that one radian between two views counts as."""
 
 
 def redundancy(poses: Array) -> Array:
-    """Distance, m, from every pose to the nearest view of the same; shape (n,). Small means dispensable."""
+    """Distance, m, from every pose to the most similar view, shape (n,): small means redundant."""
     result = np.full(len(poses), np.inf)
     for k in range(1, len(poses)):
         off = between(poses[k], poses)
@@ -316,17 +316,17 @@ def redundancy(poses: Array) -> Array:
     return result
 
 
-def thinned(
+def pruned(
     poses: Array, edges: Edges, spread: Array, odometry: NDArray[np.bool_], share: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], Edges, Array, NDArray[np.bool_]]:
-    """Leave out the most dispensable ``share`` of the poses, no two of them related, never the first.
+    """Prune: remove the most redundant ``share`` of the poses, no two of them neighbours in the graph, never the first.
 
-    Every relation of one left out is composed with its surest relation, so that it holds for the neighbour at that
-    one's other end: marginalisation along one edge.
+    Every edge of a removed pose is composed with its most certain edge, so that it holds for the neighbour at the other
+    end of that: marginalisation along one edge.
 
     Returns:
-        Marks of those left out (n,), the neighbour that stands in for each (itself if it stays) (n,), and the relations
-        of the rest with their ``spread`` and ``odometry`` marks, in the old numbering.
+        Marks of the removed poses (n,), the neighbour that represents each (itself if it stays) (n,), and the edges of
+        the rest with their ``spread`` and ``odometry`` marks, in the old numbering.
     """
     count = len(poses)
     surest = np.linalg.det(edges.information)
@@ -385,10 +385,10 @@ def _handed_over(
 def _surest(
     origin: NDArray[np.int64], target: NDArray[np.int64], odometry: NDArray[np.bool_], sureness: Array
 ) -> NDArray[np.bool_]:
-    """Marks of the best relation of each kind between two key scans.
+    """Marks of the most certain edge of each kind between two keyframes.
 
-    Relations handed over share what they were composed with: taken together they would claim more than they know, and
-    their number would grow with the way.
+    Composed edges share an edge and so are correlated: together they would be overconfident, and their number would
+    grow with the length of the run.
     """
     low, high = np.minimum(origin, target), np.maximum(origin, target)
     order = np.lexsort((-sureness, odometry, high, low))
@@ -412,23 +412,23 @@ def _seen_from(edges: Edges, k: int, node: int) -> tuple[Array, Array]:
 
 
 REFINE_NEIGHBOURS: Final = 2
-"""Key scans before it that each is paired with anyway."""
+"""Preceding keyframes that each is always paired with."""
 REFINE_PARTNERS: Final = 12
-"""Earlier key scans each is paired with, at most."""
+"""Most earlier keyframes that each is paired with."""
 REFINE_REACH: Final = 4.5
-"""Distance of a partner at most, m; an angle of view counts as REFINE_TURN metres per radian."""
+"""Greatest distance of a partner, m; an angle of view counts as REFINE_TURN metres per radian."""
 REFINE_TURN: Final = 1.0
 REFINE_SPACING: Final = 1.0
-"""Of the key scans on this much way one at most is a partner, beside the neighbours in time, m."""
+"""At most one keyframe per this length of the trajectory is a partner, besides the neighbours in time, m."""
 REFINE_STRETCH: Final = 4
-"""Key scans within which a pair takes the place of a loop's relation."""
+"""Keyframes within which a registered pair replaces the edge of a loop closure."""
 REFINE_OVERLAP: Final = 0.4
-REFINE_FARTHEST: Final = 0.2
-"""A pair that wishes to move further than this, m, is not believed in this round."""
+REFINE_MAX_STEP: Final = 0.2
+"""A pair whose Gauss-Newton step is longer than this, m, is left out of this round."""
 
 
 def partners(poses: Array) -> NDArray[np.int64]:
-    """Pairs (earlier, later), shape (n, 2): the two before in time, and the nearest of every stretch of the past."""
+    """Pairs (earlier, later), shape (n, 2): the two preceding, and the nearest of every stretch of the trajectory."""
     result: list[tuple[int, int]] = []
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
     stretch = np.floor(np.cumsum(steps) / REFINE_SPACING).astype(np.int64)
@@ -443,23 +443,23 @@ def partners(poses: Array) -> NDArray[np.int64]:
     return np.array(result, dtype=np.int64).reshape(-1, 2)
 
 
-def refine(keys: list[Key], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:
+def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:
     """Poses, shape (n, 3), at which all scans fit each other best.
 
     Args:
-        keys: the key scans.
+        keys: the keyframes.
         poses: shape (n, 3), where they are.
-        steady: relations that hold anyway (odometry).
-        loops: relations that hold where no pair of scans takes their place: two views of one place from opposite sides
-            overlap too little to be a pair, and without their closure what follows it would drift away again.
-        rounds: at most.
+        steady: edges that are always used (odometry).
+        loops: edges of loop closures, used where no registered pair replaces them: two views of one place from opposite
+            sides overlap too little to be a pair.
+        rounds: greatest number of rounds.
     """
     pairs = partners(poses)
     for turn in range(rounds):
         reach = CELL if turn < rounds // 2 else CELL / 2
-        wishes = _linearised(keys, poses, pairs, reach)
-        missed = loops.chosen(~_covered(loops, wishes))
-        moved = optimise(poses, steady.joined(missed).joined(wishes), iterations=3)
+        pair_edges = _linearised(keys, poses, pairs, reach)
+        missed = loops.chosen(~_covered(loops, pair_edges))
+        moved = optimise(poses, steady.joined(missed).joined(pair_edges), iterations=3)
         change = float(np.abs(between(poses, moved)[:, :2]).max())
         poses = moved
         if change < 5e-4 and reach < CELL:
@@ -467,9 +467,9 @@ def refine(keys: list[Key], poses: Array, steady: Edges, loops: Edges, rounds: i
     return poses
 
 
-def _covered(loops: Edges, wishes: Edges) -> NDArray[np.bool_]:
-    """Which of ``loops`` have a wish between key scans within about ``REFINE_STRETCH`` of both ends."""
-    known = np.unique(_stretches(wishes.origin, wishes.target, 0, 0))
+def _covered(loops: Edges, pair_edges: Edges) -> NDArray[np.bool_]:
+    """Which of ``loops`` have a registered pair within about ``REFINE_STRETCH`` keyframes of both ends."""
+    known = np.unique(_stretches(pair_edges.origin, pair_edges.target, 0, 0))
     result = np.zeros(len(loops), bool)
     for i, j in itertools.product((-1, 0, 1), repeat=2):
         result |= np.isin(_stretches(loops.origin, loops.target, i, j), known)
@@ -477,12 +477,12 @@ def _covered(loops: Edges, wishes: Edges) -> NDArray[np.bool_]:
 
 
 def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: int) -> NDArray[np.int64]:
-    """One number for the two stretches that a relation joins, each that many further."""
+    """One number for the two stretches that an edge joins, shifted by ``i`` and ``j``."""
     return np.asarray((origin // REFINE_STRETCH + i) * (1 << 32) + target // REFINE_STRETCH + j)
 
 
-def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
-    """One relation per overlapping pair: where a Gauss-Newton step would take it, and how sure that is."""
+def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
+    """One edge per overlapping pair: its pose after a Gauss-Newton step, and the information."""
     places = between(poses[pairs[:, 0]], poses[pairs[:, 1]])
     measured, information, kept = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs.tolist()):
@@ -490,7 +490,7 @@ def _linearised(keys: list[Key], poses: Array, pairs: NDArray[np.int64], reach: 
         if found < REFINE_OVERLAP * len(keys[j].scan):
             continue
         step = -np.linalg.solve(h + np.diag((1.0, 1.0, 1.0)), g)
-        if np.hypot(step[0], step[1]) > REFINE_FARTHEST:
+        if np.hypot(step[0], step[1]) > REFINE_MAX_STEP:
             continue
         measured[k], information[k], kept[k] = places[k] + step, h, True
     measured[:, 2] = wrap(measured[:, 2])

@@ -1,4 +1,4 @@
-"""The mapper: scans and odometry in, poses, map and events out. Deterministic; no clock, no I/O."""
+"""Mapping: scans and odometry in; poses, keyframe map and occupancy grid out. Deterministic; no clock, no I/O."""
 
 import math
 from collections.abc import Callable
@@ -14,31 +14,39 @@ from monstertruck_estimation.se2 import between, compose, compose_jacobians, inv
 from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
-from monstertruck_estimation.slam.frontend import DOUBTFUL, LEAST_PAIRS, FrontEnd, Match, Planar, Verdict, rejected
-from monstertruck_estimation.slam.grid import Painter
-from monstertruck_estimation.slam.keyframes import KeyMap, Trail
-from monstertruck_estimation.slam.motion import Increments, MotionModel, OffsetWatch, velocity
-from monstertruck_estimation.slam.scans import Scan, prepared
-from monstertruck_estimation.slam.storage import Graph, graph_of
-from monstertruck_estimation.slam.worker_io import Estimate, Moved, Patch, ScanInput, Vector
+from monstertruck_estimation.slam.grid import GridBuilder
+from monstertruck_estimation.slam.keyframes import KeyframeMap, Trajectory
+from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionModel, ScanOdometry, velocity
+from monstertruck_estimation.slam.scan_matcher import (
+    LOW_OVERLAP,
+    MIN_PAIRS,
+    MatchStatus,
+    PlanarMatcher,
+    ScanMatch,
+    ScanMatcher,
+    rejected,
+)
+from monstertruck_estimation.slam.scans import Scan, prepare_input
+from monstertruck_estimation.slam.storage import SavedGraph, saved_graph
+from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, ScanInput, SlamEstimate, Vector
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 
 Array = NDArray[np.float64]
 
-SWIFT: Final = (0.02, 0.5)
-"""Scans this far apart tell the velocity during a scan, s."""
+DESKEW_PERIOD: Final = (0.02, 0.5)
+"""Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing)."""
 PATIENCE: Final = 3
-"""A doubtful scan joins the map only if this many in a row are: a single one may have a wrong stamp or odometry."""
+"""A scan of low overlap becomes a keyframe only if this many in a row are: one may have a wrong stamp or odometry."""
 
 
-class Event(StrEnum):
-    """What happened at a step, beside its pose."""
+class MappingEvent(StrEnum):
+    """What happened at a step."""
 
     KEY = "key"
     REJECTED = "rejected"
     CLOSED = "closed"
-    THINNED = "thinned"
+    PRUNED = "pruned"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +56,16 @@ class Step:
     stamp: int
     """ns, the scan's."""
     pose: Array
-    """Shape (3,): base in map. Jumps with a closure; for what must not jump use odom, and this transform:"""
+    """Shape (3,): base in map. It jumps at a loop closure; use odom and the next field where it must not."""
     map_from_odom: Array | None
     """Shape (3,): pose of odom in map; None without odometry."""
     covariance: Array
     """Shape (3, 3): of ``pose`` against the map around it."""
-    match: Match
-    """How the scan fitted; its pose is that before a closure at this step."""
+    match: ScanMatch
+    """Result of scan matching; its pose is that before a closure at this step."""
     scan: Scan
-    """The points as they were used last."""
-    events: tuple[Event, ...] = ()
+    """The points as matched, deskewed."""
+    events: tuple[MappingEvent, ...] = ()
 
 
 class Mapper:
@@ -65,19 +73,19 @@ class Mapper:
 
     Args:
         config: noise models and limits.
-        front: the scan front end; ``Planar`` if not given.
+        front: the scan front end; ``PlanarMatcher`` if not given.
         start: base in map at the first scan.
     """
 
     def __init__(
-        self, config: MapperConfig | None = None, front: FrontEnd | None = None, start: Vector = (0.0, 0.0, 0.0)
+        self, config: MapperConfig | None = None, front: ScanMatcher | None = None, start: Vector = (0.0, 0.0, 0.0)
     ) -> None:
         self.config = config or MapperConfig()
-        self.map = KeyMap(self.config)
-        self._front: FrontEnd = front or Planar()
+        self.map = KeyframeMap(self.config)
+        self._front: ScanMatcher = front or PlanarMatcher()
         self._motion = MotionModel(self.config)
         self._closer = LoopCloser()
-        self._trail = Trail(self.config.most_scans)
+        self._trajectory = Trajectory(self.config.most_scans)
         self._stamp: int | None = None
         self._pose = np.array(start, dtype=np.float64)
         self._covariance = np.zeros((3, 3))
@@ -88,7 +96,7 @@ class Mapper:
 
     @property
     def twist(self) -> Vector:
-        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), for the next one's motion distortion."""
+        """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), to deskew the next one."""
         return self._motion.twist
 
     def step(
@@ -103,10 +111,10 @@ class Mapper:
 
         Args:
             scan: points in base at ``stamp``, their motion distortion undone by odometry or by ``twist``.
-            stamp: ns; a scan that is not later than the one before is left out (None).
+            stamp: ns; a scan that is not later than the one before is ignored (None).
             odom: shape (3,), pose of base in odom at ``stamp``; None predicts from the motion so far.
-            again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): where odometry does
-                not tell it, the scan is matched a second time by the motion that the first match found.
+            again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): without odometry
+                the scan is deskewed by the motion of its first match and matched a second time.
             period: seconds of a revolution of a sensor that turns evenly, however unevenly its scans are stamped (by a
                 busy host, say); 0 = take stamps as they are.
         """
@@ -117,29 +125,29 @@ class Mapper:
         guess, covariance = _moved(self._pose, self._covariance, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is None:
-            match = rejected(guess, covariance, Verdict.EMPTY)
+            match = rejected(guess, covariance, MatchStatus.EMPTY)
         else:
-            match = self._front.locate(scan, delta, guess, covariance, self._submap)
-            if again is not None and match.accepted and SWIFT[0] <= dt <= SWIFT[1]:
+            match = self._front.match(scan, delta, guess, covariance, self._submap)
+            if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
                 scan = again(velocity(between(self._pose, match.pose), dt))
-                match = self._front.locate(scan, delta, guess, covariance, self._submap)
-        doubtful = not match.accepted or match.overlap < DOUBTFUL
+                match = self._front.match(scan, delta, guess, covariance, self._submap)
+        doubtful = not match.accepted or match.overlap < LOW_OVERLAP
         self._doubts = self._doubts + 1 if doubtful else 0
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
-        events: tuple[Event, ...] = () if match.accepted or not len(self.map) else (Event.REJECTED,)
+        events: tuple[MappingEvent, ...] = () if match.accepted or not len(self.map) else (MappingEvent.REJECTED,)
         if self._key_is_due(scan):
             if len(self.map):
-                self._append_to_trail(stamp)
+                self._append_to_trajectory(stamp)
             events += self._extend(scan, stamp, match)
         if len(self.map):
-            self._append_to_trail(stamp)
+            self._append_to_trajectory(stamp)
         odom_now = self._motion.odom
         correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
         return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, scan, events)
 
     def finish(self) -> None:
-        """Register all key scans jointly (seconds of work): for the end of a run, or a robot that stands."""
+        """Search for remaining loop closures and register all keyframes jointly: seconds of work."""
         if len(self.map):
             place = between(self.map.poses[-1], self._pose)
             self._closer.review(self.map)
@@ -149,10 +157,10 @@ class Mapper:
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans, as the graph has them now."""
-        return self._trail.poses(self.map.poses)
+        return self._trajectory.poses(self.map.poses)
 
     def _key_is_due(self, scan: Scan) -> bool:
-        if len(scan) < LEAST_PAIRS:
+        if len(scan) < MIN_PAIRS:
             return False
         if not len(self.map):
             return True
@@ -161,29 +169,29 @@ class Mapper:
         moved = between(self.map.poses[-1], self._pose)
         return math.hypot(moved[0], moved[1]) >= self.config.key_distance or abs(moved[2]) >= self.config.key_turn
 
-    def _extend(self, scan: Scan, stamp: int, match: Match) -> tuple[Event, ...]:
-        """Make the scan a key scan, relate it, look for a loop, and keep the map bounded."""
-        events: tuple[Event, ...] = (Event.KEY,)
+    def _extend(self, scan: Scan, stamp: int, match: ScanMatch) -> tuple[MappingEvent, ...]:
+        """Add the scan as a keyframe with its edges, search for a loop closure, prune the map."""
+        events: tuple[MappingEvent, ...] = (MappingEvent.KEY,)
         self.map.add(scan, stamp, self._pose)
         if len(self.map) > 1:
-            self.map.relate_by_odometry(*self._since_key)
+            self.map.add_odometry_edge(*self._since_key)
             if match.accepted:
-                self.map.relate_by_scans(self._local)
+                self.map.add_scan_edges(self._local)
             if self._closer.close(self.map):
-                events += (Event.CLOSED,)
+                events += (MappingEvent.CLOSED,)
                 self._pose = self.map.poses[-1].copy()
         if len(self.map) > self.config.most_keys:
-            events += (Event.THINNED,)
-            kept, stand_in, offset = self.map.thin()
-            self._trail.move(stand_in, offset)
+            events += (MappingEvent.PRUNED,)
+            kept, stand_in, offset = self.map.prune()
+            self._trajectory.move(stand_in, offset)
             self._closer.forget(kept)
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._look_around()
         return events
 
-    def _append_to_trail(self, stamp: int) -> None:
+    def _append_to_trajectory(self, stamp: int) -> None:
         newest = len(self.map) - 1
-        self._trail.append(stamp, newest, between(self.map.poses[newest], self._pose))
+        self._trajectory.append(stamp, newest, between(self.map.poses[newest], self._pose))
 
     def _look_around(self) -> None:
         self._local = self.map.local()
@@ -206,34 +214,34 @@ LOST_AFTER: Final = 10
 
 
 class Estimator(Protocol):
-    """What the worker drives: mapping, or localisation in a saved map."""
+    """Mapping, or localisation in a saved map, as the worker runs it."""
 
     counts: dict[str, int]
-    """Scans, key scans, closures, rejected matches."""
+    """Scans, keyframes, closures, rejected matches."""
 
     @property
     def twist(self) -> Vector:
         """Velocity of base by the last scans, m/s and rad/s."""
         ...
 
-    def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
+    def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
         """Take a scan; None if it is not later than the one before."""
         ...
 
-    def changes(self) -> tuple[list[Patch], bool]:
-        """Tiles that have changed since the last call, and whether the grid was drawn anew."""
+    def changes(self) -> tuple[list[GridPatch], bool]:
+        """Tiles that have changed since the last call, and whether the grid was rebuilt."""
         ...
 
-    def patch(self) -> Patch:
+    def patch(self) -> GridPatch:
         """The whole grid."""
         ...
 
-    def graph(self) -> Graph | None:
-        """What can be saved beside the grid."""
+    def graph(self) -> SavedGraph | None:
+        """The pose graph to save with the grid; None without one."""
         ...
 
     def finish(self) -> None:
-        """Fit everything jointly."""
+        """Optimise everything jointly."""
         ...
 
 
@@ -248,69 +256,73 @@ class MappingEstimator:
     """
 
     def __init__(
-        self, mapper: MapperConfig, grid: GridConfig, front: FrontEnd | None = None, start: Vector = (0.0, 0.0, 0.0)
+        self, mapper: MapperConfig, grid: GridConfig, front: ScanMatcher | None = None, start: Vector = (0.0, 0.0, 0.0)
     ) -> None:
         self.mapper = Mapper(mapper, front, start)
-        self.painter = Painter(grid)
+        self.builder = GridBuilder(grid)
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0}
         self._moved = False
         self._redrawn = False
         self._misfits = 0
-        self._offset = OffsetWatch()
-        self._increments = Increments()
+        self._offset = ClockOffsetEstimator()
+        self._scan_odometry = ScanOdometry()
 
     @property
     def twist(self) -> Vector:
         """See ``Estimator``."""
         return self.mapper.twist
 
-    def step(self, scan: Scan, inputs: ScanInput) -> Estimate | None:
+    def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
         """See ``Estimator``."""
         odom = None if inputs.odom is None else np.array(inputs.odom)
         swept = odom is None and inputs.time_increment > 0
-        again = partial(prepared, inputs, self.mapper.config.longest) if swept else None
+        again = partial(prepare_input, inputs, self.mapper.config.longest) if swept else None
         period = inputs.time_increment * math.tau / inputs.angle_increment if swept else 0.0
         step = self.mapper.step(scan, inputs.stamp, odom, again, period)
         if step is None:
             return None
-        accepted = step.match.accepted or (Event.KEY in step.events and len(self.mapper.map) == 1)
+        accepted = step.match.accepted or (MappingEvent.KEY in step.events and len(self.mapper.map) == 1)
         self._misfits = 0 if accepted else self._misfits + 1
         self.counts["scans"] += 1
         self.counts["keys"] = len(self.mapper.map)
-        self.counts["closures"] += Event.CLOSED in step.events
-        self.counts["rejected"] += Event.REJECTED in step.events
-        self._moved |= Event.CLOSED in step.events
+        self.counts["closures"] += MappingEvent.CLOSED in step.events
+        self.counts["rejected"] += MappingEvent.REJECTED in step.events
+        self._moved |= MappingEvent.CLOSED in step.events
         if accepted:
-            self.painter.add(step.scan, step.stamp, step.pose, inputs.mount)
+            self.builder.add(step.scan, step.stamp, step.pose, inputs.mount)
             if inputs.odom is not None:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
-        closed = Event.CLOSED in step.events
-        moved = self._increments.take(step.stamp, step.match, step.pose, alone=inputs.odom is None, corrected=closed)
-        standing = Standing.LOST if self._misfits >= LOST_AFTER else standing_of(step.match, Standing.MAPPING)
+        closed = MappingEvent.CLOSED in step.events
+        moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=inputs.odom is None, corrected=closed)
+        status = (
+            LocalisationStatus.LOST
+            if self._misfits >= LOST_AFTER
+            else status_of(step.match, LocalisationStatus.MAPPING)
+        )
         return estimate(
             step.stamp,
             (step.pose, step.covariance, step.map_from_odom),
             step.match,
-            standing,
+            status,
             tuple(map(str, step.events)),
             self._offset.offset,
             moved,
         )
 
-    def changes(self) -> tuple[list[Patch], bool]:
+    def changes(self) -> tuple[list[GridPatch], bool]:
         """See ``Estimator``."""
         self._follow()
         redrawn, self._redrawn = self._redrawn, False
-        return self.painter.grid.changes(), redrawn
+        return self.builder.grid.changes(), redrawn
 
-    def patch(self) -> Patch:
+    def patch(self) -> GridPatch:
         """See ``Estimator``."""
         self._follow()
-        return self.painter.grid.patch()
+        return self.builder.grid.patch()
 
-    def graph(self) -> Graph | None:
+    def graph(self) -> SavedGraph | None:
         """See ``Estimator``."""
-        return graph_of(self.mapper.map)
+        return saved_graph(self.mapper.map)
 
     def finish(self) -> None:
         """See ``Estimator``."""
@@ -320,31 +332,31 @@ class MappingEstimator:
     def _follow(self) -> None:
         if self._moved:
             self._moved = False
-            self._redrawn |= self.painter.follow(*self.mapper.trajectory())
+            self._redrawn |= self.builder.update_poses(*self.mapper.trajectory())
 
 
-def standing_of(match: Match, good: Standing) -> Standing:
-    """``good``, unless the match says nothing along one direction."""
-    return Standing.DEGENERATE if match.accepted and match.degenerate else good
+def status_of(match: ScanMatch, good: LocalisationStatus) -> LocalisationStatus:
+    """``good``, or DEGENERATE if the match does not constrain one direction."""
+    return LocalisationStatus.DEGENERATE if match.accepted and match.degenerate else good
 
 
 def estimate(
     stamp: int,
     placed: tuple[Array, Array, Array | None],
-    match: Match,
-    standing: Standing,
+    match: ScanMatch,
+    status: LocalisationStatus,
     events: tuple[str, ...],
     offset: float | None,
-    moved: Moved | None = None,
-) -> Estimate:
+    moved: ScanIncrement | None = None,
+) -> SlamEstimate:
     """Plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
     pose, covariance, correction = placed
-    return Estimate(
+    return SlamEstimate(
         stamp=stamp,
         pose=plain(pose),
         covariance=tuple(float(value) for value in covariance.ravel()),
         map_from_odom=None if correction is None else plain(correction),
-        standing=standing,
+        status=status,
         overlap=match.overlap,
         residual=match.residual,
         degeneracy=match.degeneracy,

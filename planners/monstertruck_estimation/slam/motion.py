@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, rotation
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.frontend import DOUBTFUL, Match
-from monstertruck_estimation.slam.worker_io import Moved
+from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch
+from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_runtime.clock import SECOND
 
 Array = NDArray[np.float64]
 
 TRUST_MEMORY: Final = 40
-"""Scans over which the trust in odometry is learned."""
+"""Scans over which the robust_weights in odometry is learned."""
 MAX_INNOVATION: Final = 4.0
 """Normalised innovations count as this at most."""
 TRUST_LIMITS: Final = (1.0, 3.0)
-"""Factor on the standard deviation of the way, at least and at most."""
+"""Limits of the factor on the standard deviation of the odometry."""
 CLEAR_MATCH: Final = (0.15, 0.75)
-"""Degeneracy and overlap from which a match can tell the odometry's error."""
+"""Least degeneracy and overlap of a match that is compared with odometry."""
 FIT_NOISE: Final = 0.01
 """Standard deviation of a match itself, m."""
 
@@ -36,13 +36,13 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
 
 
 class MotionModel:
-    """Predicts the motion between two scans, and learns from the matches how good odometry is.
+    """Predicts the motion between two scans, and adapts the noise of odometry to the matches.
 
-    Wheels slip, and many logs stamp odometry and scans by clocks that disagree; no constant covers both a good and a
-    bad one. The factor follows the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972).
+    Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factor
+    follows the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972).
 
     Args:
-        config: noise before anything is learned.
+        config: initial noise.
     """
 
     def __init__(self, config: MapperConfig) -> None:
@@ -89,8 +89,8 @@ class MotionModel:
             self._odom = np.array(odom, dtype=float)
         return delta, np.diag((place**2, place**2, turn**2))
 
-    def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: Match) -> None:
-        """Take what a match made of the prediction ``delta`` (covariance ``noise``): the base moved by ``moved``."""
+    def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
+        """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""
         self._dt, self._delta = dt, moved
         if (
             self._odom is None
@@ -106,45 +106,47 @@ class MotionModel:
 
 
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
-"""Added to every information: what a scan does not tell has a standard deviation of 100 m, or of 10 rad."""
+"""Added to every information: an unconstrained direction has a standard deviation of 100 m, or of 10 rad."""
 MATCH_FLOOR: Final = (0.002, 0.001)
-"""Standard deviation of any match, m and rad: the cells of the map are not finer."""
+"""Least standard deviation of a match, m and rad."""
 OVERLAP_DROP: Final = 0.15
-"""So much less than usual a match may overlap to count again after a misfit."""
+"""After a rejected match the overlap must return to the running mean less this."""
 OVERLAP_GAIN: Final = 0.05
-"""Weight of one match in the usual overlap."""
+"""Weight of one match in the running mean of the overlap."""
 
 
-class Increments:
-    """Relates every match to the one before it.
+class ScanOdometry:
+    """Scan odometry: the motion between successive matches, by the scans alone.
 
-    Beside odometry only matches that overlap well tell a motion, and none tells it across a misfit: the robot may have
-    been carried, and what fits half at a wrong place does not count before the overlap is as usual again. Where
-    nothing else tells any motion, misfits are stepped over, and what was accepted counts.
+    With odometry only matches of good overlap give a motion, and none is given across a rejected match: the robot may
+    have been carried, and a half fit at a wrong place must not count before the overlap is back to its mean. Without
+    odometry rejected matches are skipped, and every accepted one counts.
     """
 
     def __init__(self) -> None:
         self._last: tuple[int, Array] | None = None
         self._usual = 0.0
-        """Overlap of the matches that counted, their running mean; 0 before the first."""
-        self._least = DOUBTFUL
+        """Running mean of the overlap of the matches used; 0 before the first."""
+        self._least = LOW_OVERLAP
 
-    def take(self, stamp: int, match: Match, pose: Array, *, alone: bool, corrected: bool = False) -> Moved | None:
-        """The motion since the last match that counts.
+    def take(
+        self, stamp: int, match: ScanMatch, pose: Array, *, alone: bool, corrected: bool = False
+    ) -> ScanIncrement | None:
+        """The motion since the last match that was used; None if this one is not.
 
         Args:
             stamp: of the scan, ns.
-            match: the scan's place; its covariance contains the guess, its information does not.
-            pose: shape (3,), the same place after the step, when a loop may have been closed.
+            match: result of scan matching; its covariance includes the prediction, its information does not.
+            pose: shape (3,), pose after the step, in which a loop may have been closed.
             alone: there is no odometry.
-            corrected: the map was changed at this step: the next motion begins at ``pose``.
+            corrected: a loop closure moved the map at this step: the next motion begins at ``pose``.
         """
         if match.information is None or not (alone or match.overlap >= self._least):
-            self._least = max(DOUBTFUL, self._usual - OVERLAP_DROP)
+            self._least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP)
             if corrected or not alone:
                 self._last = None
             return None
-        self._least = DOUBTFUL
+        self._least = LOW_OVERLAP
         self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
         last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose)
         if last is None:
@@ -157,17 +159,17 @@ class Increments:
             np.square((MATCH_FLOOR[0], MATCH_FLOOR[0], MATCH_FLOOR[1]))
         )
         x, y, yaw = between(origin, match.pose).tolist()
-        return Moved(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
+        return ScanIncrement(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def forget(self) -> None:
-        """What was before cannot be compared with what comes."""
-        self._last, self._least = None, DOUBTFUL
+        """Start anew: the next match has no predecessor."""
+        self._last, self._least = None, LOW_OVERLAP
 
 
-def _known(match: Match, information: Array) -> Array:
-    """Information without what a degenerate match says along its weak direction.
+def _known(match: ScanMatch, information: Array) -> Array:
+    """Information without its component along the weak direction of a degenerate match.
 
-    That comes from no wall, but from the ends of the walls in sight, which go along with the robot.
+    That component comes from the ends of the visible walls, which move along with the robot.
     """
     if not match.degenerate:
         return information
@@ -177,25 +179,29 @@ def _known(match: Match, information: Array) -> Array:
 
 
 OFFSET_SCANS: Final = 300
-"""Scans looked at."""
+"""Scans compared."""
 OFFSET_LEAST_SCANS: Final = 120
-"""Scans needed."""
+"""Fewest scans."""
 OFFSET_PERIOD: Final = 40
-"""Scans between two looks."""
+"""Scans between two estimates."""
 OFFSET_LAGS: Final = np.arange(-12, 13) * 0.05
 """Offsets tried, s."""
 LEAST_OFFSET: Final = 0.09
 """Smaller offsets are within the noise, s."""
 LEAST_EXCITATION: Final = 0.05
-"""Standard deviation of the turning without which nothing can be told, rad/s."""
+"""Least standard deviation of the yaw rate, rad/s."""
 LEAST_CORRELATION: Final = 0.8
 """Least correlation at the offset."""
 CORRELATION_GAIN: Final = 0.08
 """How much better it must be than at zero."""
 
 
-class OffsetWatch:
-    """Collects matched and wheel headings of one run."""
+class ClockOffsetEstimator:
+    """Estimates a constant offset between the clocks of odometry and scans, as logs with badly stamped wheels have it.
+
+    The yaw rate by the matches is correlated with that of odometry at shifted times; the lag of the best correlation is
+    the offset. Only the yaw takes part: both measure it best.
+    """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, float, float]] = deque(maxlen=OFFSET_SCANS)

@@ -23,10 +23,10 @@ CELL: Final = 0.3
 KERNEL: Final = 3.0
 """Mahalanobis distance at which a pair's influence is a quarter."""
 CORRELATION: Final = 0.2
-"""Share of independent pairs: neighbouring beams err alike, so the information is scaled by this."""
+"""Factor on the information: errors of neighbouring beams are correlated."""
 
 TAILS: Final = 4.0
-"""Squared Mahalanobis distance at which the prior pulls half as much: wheels slip further than any covariance says."""
+"""Squared Mahalanobis distance at which the prior's weight is half: wheels slip further than their covariance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Fit:
     pose: Array
     """Shape (3,): the scan's frame in the cloud's, m and rad."""
     information: Array
-    """Shape (3, 3): what the pairs alone know about ``pose`` (x, y in the cloud's frame, yaw)."""
+    """Shape (3, 3): of ``pose`` by the pairs alone (x, y in the cloud's frame, yaw)."""
     overlap: float
     """Share of the scan's points that found a fitting partner."""
     residual: float
@@ -70,7 +70,7 @@ class Fit:
     pairs: int
     """Their number."""
     cost: float
-    """Twice the negative logarithm of the posterior: what the pairs and the prior leave."""
+    """Twice the negative logarithm of the posterior of pairs and prior."""
 
 
 NO_PRIOR: Final = np.zeros((3, 3))
@@ -85,11 +85,11 @@ def register(
     reach: float = CELL,
     start: Array | None = None,
 ) -> Fit:
-    """Fit ``scan`` into ``cloud``.
+    """Register ``scan`` to ``cloud``.
 
     Args:
         scan: points with normals in the moving frame.
-        cloud: where they should come to lie.
+        cloud: the map, fixed.
         guess: shape (3,), mean of the prior and, without ``start``, first pose.
         prior: information, shape (3, 3), of the guess in the cloud's frame.
         iterations: Gauss-Newton steps at most.
@@ -117,7 +117,7 @@ def register(
 
 
 def measure(scan: Scan, cloud: Cloud, pose: Array) -> Fit:
-    """How ``scan`` fits at ``pose``, without moving it."""
+    """Overlap, residual and information of ``scan`` at ``pose``, without moving it."""
     return register(scan, cloud, pose, iterations=0)
 
 

@@ -1,8 +1,8 @@
-"""From ranges to points that know how well they lie on a surface.
+"""From ranges to surface elements: deskewing, levelling, and points with normals.
 
 Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor)
-and the variances along and across it: a point among neighbours on a line says nothing along that line, a lone point
-says the same in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
+and the variances along and across it: a point among neighbours on a line is not constrained along that line, a lone
+point equally in all directions (generalised ICP: Segal, Haehnel, Thrun 2009).
 """
 
 import math
@@ -28,7 +28,7 @@ GRAZING: Final = 0.12
 SLANTED: Final = 3.0
 """Two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant."""
 SLIDE: Final = 5.0
-"""Standard deviation along a line, m: none of what a scan knows."""
+"""Standard deviation along a line, m: unconstrained."""
 GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0
 """Multiples of it, less their whole part, are an even mixture of early and late beams."""
 
@@ -72,9 +72,9 @@ class Scan:
     def __len__(self) -> int:
         return len(self.points)
 
-    def thinned(self, cell: float, most: int) -> "Scan":
+    def downsampled(self, cell: float, most: int) -> "Scan":
         """About one point per square of ``cell``, and at most ``most``, spread evenly."""
-        kept = spread(self.points, cell)
+        kept = downsample_indices(self.points, cell)
         if len(kept) > most:
             kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
         return self.chosen(kept)
@@ -114,13 +114,13 @@ def prepare(
     return Scan(*elements)
 
 
-def prepared(inputs: ScanInput, longest: float, twist: Vector = (0.0, 0.0, 0.0)) -> Scan:
-    """Points of a scan in base: motion undone, levelled, without what hit the ground or the ceiling.
+def prepare_input(inputs: ScanInput, longest: float, twist: Vector = (0.0, 0.0, 0.0)) -> Scan:
+    """Points of a scan in base: motion undone, level_ranges, without what hit the ground or the ceiling.
 
     Args:
         inputs: the scan.
         longest: longer ranges are not used, m.
-        twist: of the base, m/s and rad/s, if odometry does not tell it.
+        twist: of the base, m/s and rad/s, used without odometry.
     """
     geometry = ScanGeometry(
         inputs.start_angle,
@@ -130,10 +130,10 @@ def prepared(inputs: ScanInput, longest: float, twist: Vector = (0.0, 0.0, 0.0))
         inputs.time_increment,
         inputs.mount,
     )
-    return prepare(levelled(inputs), geometry, twist if inputs.odom is None else inputs.twist, longest)
+    return prepare(level_ranges(inputs), geometry, twist if inputs.odom is None else inputs.twist, longest)
 
 
-def levelled(inputs: ScanInput) -> Array:
+def level_ranges(inputs: ScanInput) -> Array:
     """Ranges in the horizontal; NaN where a beam met the ground or the ceiling.
 
     A beam at angle a rises by cos(a) sx + sin(a) sy a metre, with the ``slopes`` (sx, sy) of the sensor's axes.
@@ -270,11 +270,11 @@ def _cells(points, cell):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     return keys
 
 
-def spread(points: Array, cell: float) -> NDArray[np.intp]:
+def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
     """Indices, rising, of one point in every square of ``cell`` m.
 
-    Which one must not hang on where its noise took it: the first in beam order would be the one that noise took over
-    the edge ahead of the others, and every wall would be turned a little.
+    Which one must not depend on its noise: the first in beam order would be the one that noise moved across the edge,
+    and every wall would be rotated a little.
     """
     order = np.argsort(np.arange(len(points)) * GOLDEN % 1.0, kind="stable")
     _, first = np.unique(_cells(points[order], cell), return_index=True)

@@ -1,4 +1,4 @@
-"""Localisation and mapping in the daemon: feeds the estimation worker, tells pose, map and how well the scans fit."""
+"""SLAM in the daemon: sends scans to the worker, publishes pose, map, scan motion and health."""
 
 import asyncio
 from bisect import bisect_left
@@ -9,15 +9,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_estimation.correction import Correction
-from monstertruck_estimation.scan_tilt import Track, plane_slopes
+from monstertruck_estimation.correction import SmoothedCorrection
+from monstertruck_estimation.scan_tilt import AngleHistory, plane_slopes
 from monstertruck_estimation.se2 import between, interpolate
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker_io import (
-    Estimate,
-    Moved,
-    Patch,
+    GridPatch,
+    ScanIncrement,
     ScanInput,
+    SlamEstimate,
     Start,
     Vector,
     WorkerInput,
@@ -32,38 +32,38 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import SlamHealth, Standing
+from monstertruck_schemas.health import LocalisationStatus, SlamHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
-TARGET: Final = "monstertruck_estimation.slam.worker:EstimationWorker"
+TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
 PATIENCE: Final = 180.0
-"""Real seconds the worker may take to start: the first time it compiles."""
+"""Real seconds the worker may take to start: numba compiles at the first start."""
 HISTORY: Final = 128
-"""Poses of odometry remembered: 2.5 s at 50 Hz."""
+"""Poses of odometry kept: 2.5 s at 50 Hz."""
 STALE: Final = SECOND // 5
-"""Odometry older than the scan by more than this does not count, ns."""
-FITTING: Final = frozenset({Standing.MAPPING, Standing.LOCALISED, Standing.DEGENERATE})
+"""Odometry older than the scan by more than this is not used, ns."""
+MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
 
 
 class SlamService:
-    """Every scan goes to the worker with odometry at its stamp; between scans the pose follows odometry.
+    """Sends every scan to the worker with odometry at its stamp; between scans the pose follows odometry.
 
     Args:
         config: what is mapped, how, and where it is saved.
         mount: of the lidar.
         clock: time.
         scan: lidar, bounded and counted.
-        odometry: pose in odom; None = the robot has none, the pose is then told once a scan.
-        compass: tilt of the body, to discard what hit the ground.
+        odometry: pose in odom; None = the robot has none, the pose is then published once a scan.
+        compass: tilt of the body, to discard hits of the ground.
         joints: of the lidar's mount.
         pose: ``state/pose``.
         whole: ``state/map``.
         tiles: ``state/map_tiles``.
         motion: ``state/scan_motion``.
         health: ``health/slam``.
-        events: where closures, losses and unusable scans are told.
+        events: where closures, losses and unusable scans are reported.
     """
 
     name = "slam"
@@ -90,22 +90,22 @@ class SlamService:
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
         self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
-        self._body, self._angles = Track(), Track()
-        self._correction = Correction(config.slew, config.jump)
-        self._newest: Estimate | None = None
-        self._standing: Standing | None = None
+        self._body, self._angles = AngleHistory(), AngleHistory()
+        self._correction = SmoothedCorrection(config.slew, config.jump)
+        self._newest: SlamEstimate | None = None
+        self._status: LocalisationStatus | None = None
         self._refused: str | None = None
         self._left_out = 0
-        self._offset_told = False
+        self._offset_reported = False
         self._due = {"tiles": 0, "whole": 0, "save": clock.now() + round(config.save_period * SECOND)}
         self._changed = False
         self._under_way: asyncio.Task[Any] | None = None
 
     def frames(self) -> Iterable[Transform]:
-        """Odom in map as it is shown; without odometry, base in map."""
+        """Odom in map as published; without odometry, base in map."""
         if self._odometry is not None:
             stamp = self._history[-1][0] if self._history else 1
-            return (planar("map", "odom", stamp, self._correction.shown),)
+            return (planar("map", "odom", stamp, self._correction.value),)
         if self._newest is None:
             return ()
         stamp = self._newest.stamp
@@ -155,7 +155,7 @@ class SlamService:
                 update["sources"] = (*message.sources, "lidar")
             self._pose.put(message.model_copy(update=update))
 
-    def _tell_pose(self, estimate: Estimate, scan: LaserScan) -> None:
+    def _publish_pose(self, estimate: SlamEstimate, scan: LaserScan) -> None:
         """Of a robot without odometry."""
         x, y, yaw = estimate.pose
         self._pose.put(
@@ -180,7 +180,7 @@ class SlamService:
         async for scan in self._scan:
             reason = self._unusable(scan)
             if reason is not None:
-                self._leave_out(reason)
+                self._skip(reason)
                 continue
             inputs = self._inputs(scan)
             start = None if started else Start(self._config, self._start(inputs.odom))
@@ -189,7 +189,7 @@ class SlamService:
             self._take(outputs, scan)
 
     async def _step(self, worker: WorkerActor, work: WorkerInput) -> WorkerOutput:
-        """Shielded: a step that is cancelled kills the worker, and with it the map that is still to be saved."""
+        """Shielded: cancelling a step kills the worker, and the map that is still to be saved with it."""
         self._under_way = asyncio.ensure_future(worker.step(work))
         outputs: WorkerOutput = await asyncio.shield(self._under_way)
         return outputs
@@ -202,8 +202,8 @@ class SlamService:
             await task
         if self._config.save is not None and self._config.mode == "mapping" and task.exception() is None:
             # First as it is, for the joint fit takes seconds that there may not be.
-            self._told_saved(await worker.step(WorkerInput(save=self._config.save)))
-            self._told_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
+            self._report_saved(await worker.step(WorkerInput(save=self._config.save)))
+            self._report_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
 
     def _unusable(self, scan: LaserScan) -> str | None:
         if scan.tilt is not None and scan.tilt > self._config.max_tilt:
@@ -255,7 +255,7 @@ class SlamService:
         return None if body is None or angles is None else plane_slopes(*body, *angles, yaw=self._mount.yaw)
 
     def _start(self, odom: Vector | None) -> Vector:
-        """Where a new map begins: where the robot is believed to be."""
+        """Where a new map begins: the present pose in map."""
         if odom is not None:
             return self._correction.pose(odom, 0.0)
         return (0.0, 0.0, 0.0) if self._newest is None else self._newest.pose
@@ -279,8 +279,8 @@ class SlamService:
 
     def _take(self, outputs: WorkerOutput, scan: LaserScan) -> None:
         if outputs.refused is not None:
-            self._leave_out(outputs.refused)
-        self._told_saved(outputs)
+            self._skip(outputs.refused)
+        self._report_saved(outputs)
         now = self._clock.now()
         self._changed |= bool(outputs.tiles)
         if outputs.whole is not None and outputs.whole.cells.size:
@@ -292,17 +292,17 @@ class SlamService:
         if estimate is None:
             return
         self._refused = None
-        found = self._standing is not None and self._standing not in FITTING and estimate.standing in FITTING
-        if estimate.map_from_odom is not None and estimate.standing is not Standing.SEARCHING:
-            self._correction.aim(estimate.map_from_odom, at_once=found or self._newest is None)
+        found = self._status is not None and self._status not in MATCHED and estimate.status in MATCHED
+        if estimate.map_from_odom is not None and estimate.status is not LocalisationStatus.SEARCHING:
+            self._correction.set_target(estimate.map_from_odom, at_once=found or self._newest is None)
         self._newest = estimate
         if estimate.moved is not None:
             self._motions.put(scan_motion(estimate.stamp, estimate.moved, now, self._motions.next_seq()))
         self._report(estimate, outputs)
         if self._odometry is None:
-            self._tell_pose(estimate, scan)
+            self._publish_pose(estimate, scan)
 
-    def _report(self, estimate: Estimate, outputs: WorkerOutput) -> None:
+    def _report(self, estimate: SlamEstimate, outputs: WorkerOutput) -> None:
         self._health.put(
             slam_health(
                 estimate, outputs.counts, (self._left_out, self._scan.drops), self._clock.now(), self._health.next_seq()
@@ -310,36 +310,36 @@ class SlamService:
         )
         if "closed" in estimate.events:
             self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, f"closure {outputs.counts['closures']}")
-        if estimate.offset is not None and not self._offset_told:
-            self._offset_told = True
+        if estimate.offset is not None and not self._offset_reported:
+            self._offset_reported = True
             text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"
             self._events(Reason.TIME_OFFSET, Severity.WARNING, self.name, text, offset=estimate.offset)
-        if estimate.standing is self._standing:
+        if estimate.status is self._status:
             return
-        before, self._standing = self._standing, estimate.standing
-        if estimate.standing is Standing.DEGENERATE:
+        before, self._status = self._status, estimate.status
+        if estimate.status is LocalisationStatus.DEGENERATE:
             text = f"along {estimate.direction:.2f} rad in map"
             self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)
-        elif estimate.standing not in FITTING:
-            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, str(estimate.standing))
+        elif estimate.status not in MATCHED:
+            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, str(estimate.status))
         elif before is not None:
-            self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.standing))
+            self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.status))
 
-    def _leave_out(self, why: str) -> None:
+    def _skip(self, why: str) -> None:
         self._left_out += 1
         kind = why.partition(" ")[0]
         if kind != self._refused:
             self._refused = kind
             self._events(Reason.SCAN_LEFT_OUT, Severity.WARNING, self.name, why)
 
-    def _told_saved(self, outputs: WorkerOutput) -> None:
+    def _report_saved(self, outputs: WorkerOutput) -> None:
         if outputs.saved is not None:
             self._events(Reason.MAP_SAVED, Severity.INFO, self.name, outputs.saved)
         if outputs.error is not None:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")
 
 
-def grid_message(patch: Patch, now: int, seq: int) -> Grid:
+def grid_message(patch: GridPatch, now: int, seq: int) -> Grid:
     """A patch of the map as a grid of its own."""
     rows, columns = patch.cells.shape
     cells = np.ascontiguousarray(patch.cells).reshape(-1)
@@ -358,7 +358,7 @@ def grid_message(patch: Patch, now: int, seq: int) -> Grid:
     )
 
 
-def scan_motion(stamp: int, moved: Moved, now: int, seq: int) -> ScanMotion:
+def scan_motion(stamp: int, moved: ScanIncrement, now: int, seq: int) -> ScanMotion:
     """Motion of base between two scans."""
     x, y, yaw = moved.motion
     return ScanMotion(
@@ -372,14 +372,16 @@ def scan_motion(stamp: int, moved: Moved, now: int, seq: int) -> ScanMotion:
     )
 
 
-def slam_health(estimate: Estimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int) -> SlamHealth:
+def slam_health(
+    estimate: SlamEstimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int
+) -> SlamHealth:
     """How the newest scan fitted; ``lost`` are the scans left out and those dropped."""
     return SlamHealth(
         stamp=estimate.stamp,
         received=now,
         seq=seq,
         frame="map",
-        standing=estimate.standing,
+        standing=estimate.status,
         accepted=estimate.verdict == "accepted",
         overlap=min(max(estimate.overlap, 0.0), 1.0),
         residual=estimate.residual,

@@ -1,7 +1,7 @@
-"""Saved maps: a folder with the grid for everybody (map_server: ``map.yaml``, ``map.png``) and our ``graph.npz``.
+"""Saved maps: a folder with the grid (map_server: ``map.yaml``, ``map.png``) and the pose graph (``graph.npz``).
 
-The graph holds key scans, their poses and the relations between them as plain arrays, no pickles. Every file is
-replaced whole, the YAML last.
+The graph holds keyframes, their poses and the edges between them as plain arrays, no pickles. Every file is replaced
+atomically, the YAML last.
 """
 
 import dataclasses
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from monstertruck_estimation.slam.keyframes import KeyMap
+from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.scans import SLIDE, Scan
-from monstertruck_estimation.slam.worker_io import Patch
+from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_runtime.small_files import replace_file
@@ -46,8 +46,8 @@ _SHAPES: Final[dict[str, tuple[int, ...]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Graph:
-    """Key scans and the relations between them."""
+class SavedGraph:
+    """Keyframes and the edges between them."""
 
     stamps: NDArray[np.int64]
     """Shape (n,), ns."""
@@ -64,8 +64,8 @@ class SavedMap:
     """What a folder holds."""
 
     grid: WorldMap
-    graph: Graph | None
-    """None for a map of others: grid only."""
+    graph: SavedGraph | None
+    """None for a map of another program: grid only."""
 
 
 def elements(points: Array, **known: Array) -> Scan:
@@ -74,13 +74,13 @@ def elements(points: Array, **known: Array) -> Scan:
     return Scan(points=points, **every)
 
 
-def graph_of(known: KeyMap) -> Graph:
+def saved_graph(known: KeyframeMap) -> SavedGraph:
     """The graph as it is now, to be saved."""
     edges = known.edges.edges()
-    return Graph(
-        np.array([key.stamp for key in known.keys], np.int64),
+    return SavedGraph(
+        np.array([key.stamp for key in known.frames], np.int64),
         known.poses.copy(),
-        tuple(key.scan for key in known.keys),
+        tuple(key.scan for key in known.frames),
         {
             "edge_ends": np.stack((edges.origin, edges.target), axis=-1),
             "edge_measured": np.array(edges.measured),
@@ -91,7 +91,7 @@ def graph_of(known: KeyMap) -> Graph:
     )
 
 
-def trinary(patch: Patch) -> WorldMap:
+def trinary(patch: GridPatch) -> WorldMap:
     """Free, occupied, unknown."""
     cells = np.full(patch.cells.shape, UNKNOWN, np.int8)
     cells[patch.cells >= OCCUPIED_FROM] = OCCUPIED
@@ -99,7 +99,7 @@ def trinary(patch: Patch) -> WorldMap:
     return WorldMap(cells, patch.resolution, patch.origin)
 
 
-def save(folder: Path, patch: Patch, graph: Graph | None) -> None:
+def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
     """Write a map.
 
     Raises:
@@ -130,7 +130,7 @@ def save(folder: Path, patch: Patch, graph: Graph | None) -> None:
 
 
 def load(place: Path) -> SavedMap:
-    """Read a saved map: its folder, or the YAML file of anybody's.
+    """Read a saved map: its folder, or the YAML file of a map_server map.
 
     Raises:
         InputError: file, key and expectation of whatever is wrong.
@@ -141,7 +141,7 @@ def load(place: Path) -> SavedMap:
     return SavedMap(load_map(place / YAML), _read_graph(graph) if graph.exists() else None)
 
 
-def _read_graph(path: Path) -> Graph:
+def _read_graph(path: Path) -> SavedGraph:
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -166,7 +166,7 @@ def _read_graph(path: Path) -> Graph:
         elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)
     )
     edges = {name: values for name, values in arrays.items() if name.startswith("edge_")}
-    return Graph(arrays["stamps"], arrays["poses"], scans, edges)
+    return SavedGraph(arrays["stamps"], arrays["poses"], scans, edges)
 
 
 NORMAL_REACH: Final = 0.2
@@ -181,8 +181,8 @@ WALL_NOISE: Final = 0.02
 """Least standard deviation of a drawn wall, m."""
 
 
-def surfaces_of(grid: WorldMap) -> Scan:
-    """Elements in map of all walls beside free cells; none if there are none."""
+def surface_elements(grid: WorldMap) -> Scan:
+    """Surface elements in map of all walls next to free cells."""
     step = grid.resolution
     cells, towards = _faces(grid.cells)
     if not len(cells):
@@ -208,7 +208,7 @@ def _faces(cells: NDArray[np.int8]) -> tuple[Array, Array]:
     x = 2 * (beside(-1, 0) - beside(1, 0)) + sum(beside(-1, k) - beside(1, k) for k in (-1, 1))
     y = 2 * (beside(0, -1) - beside(0, 1)) + sum(beside(k, -1) - beside(k, 1) for k in (-1, 1))
     length = np.hypot(x, y)
-    # In a gap one cell wide both sides cancel: nobody looks into it.
+    # In a gap one cell wide both sides cancel; it is left out.
     at = np.nonzero((cells == FREE) & touching & (length > 0))
     free: Array = np.stack(at[::-1], axis=-1).astype(np.float64)
     return free, np.stack((x[at], y[at]), axis=-1) / length[at][:, None]

@@ -1,4 +1,4 @@
-"""Worker that maps or localises: ``monstertruck_estimation.slam.worker:EstimationWorker``.
+"""SLAM worker: maps or localises: ``monstertruck_estimation.slam.worker:SlamWorker``.
 
 A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
 """
@@ -7,20 +7,20 @@ import numpy as np
 
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
-from monstertruck_estimation.slam.frontend import FrontEnd
-from monstertruck_estimation.slam.localisation import LocalisingEstimator
-from monstertruck_estimation.slam.mapping import Estimator, Event, MappingEstimator
-from monstertruck_estimation.slam.scans import prepared
+from monstertruck_estimation.slam.localisation import LocalisationEstimator
+from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, MappingEvent
+from monstertruck_estimation.slam.scan_matcher import ScanMatcher
+from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 
-FEWEST = 3
-"""Points without which a scan is left out."""
+MIN_POINTS = 3
+"""A scan with fewer points is left out."""
 
 
-class EstimationWorker:
-    """Keeps the map; compiled once it is built."""
+class SlamWorker:
+    """Holds the map; building it compiles all numba functions."""
 
     def __init__(self) -> None:
         self._estimator: Estimator | None = None
@@ -30,7 +30,7 @@ class EstimationWorker:
         _warm_up()
 
     def step(self, inputs: WorkerInput) -> WorkerOutput:
-        """Do what is asked for.
+        """Do one step's work.
 
         Raises:
             InputError: the saved map is not readable, or no start came first.
@@ -45,12 +45,12 @@ class EstimationWorker:
         if inputs.scan is not None:
             refused = self._refusal(inputs.scan)
             if refused is None:
-                scan = prepared(inputs.scan, self._longest, estimator.twist)
-                if len(scan) < FEWEST:
+                scan = prepare_input(inputs.scan, self._longest, estimator.twist)
+                if len(scan) < MIN_POINTS:
                     refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
                 else:
                     made = estimator.step(scan, inputs.scan)
-                    if made is not None and Event.THINNED in made.events:
+                    if made is not None and MappingEvent.PRUNED in made.events:
                         give_back()
         if inputs.finish:
             estimator.finish()
@@ -65,12 +65,12 @@ class EstimationWorker:
         self._longest = settings.longest
         if config.mode == "localisation":
             assert config.map is not None
-            self._estimator = LocalisingEstimator(storage.load(config.map), settings)
+            self._estimator = LocalisationEstimator(storage.load(config.map), settings)
         else:
-            self._estimator = MappingEstimator(settings, config.grid, front_of(config.front), start.pose)
+            self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose)
 
     def _refusal(self, scan: ScanInput) -> str | None:
-        """Why a scan is not for this map; None = it is."""
+        """Why a scan cannot be used; None if it can."""
         geometry = (len(scan.ranges), scan.start_angle, scan.angle_increment, *scan.mount)
         if self._geometry is None:
             self._geometry = geometry
@@ -92,13 +92,13 @@ class EstimationWorker:
         return str(inputs.save), None
 
 
-def front_of(kind: str) -> FrontEnd | None:
-    """The scan front end of this name; None = the mapper's own."""
+def matcher_of(kind: str) -> ScanMatcher | None:
+    """The scan matcher of this name; None = the default one."""
     if kind == "planar":
         return None
-    from monstertruck_estimation.slam.kiss import Kiss  # noqa: PLC0415  # its library is for this kind only
+    from monstertruck_estimation.slam.kiss_matcher import KissMatcher  # noqa: PLC0415  # its library is for this kind only
 
-    return Kiss()
+    return KissMatcher()
 
 
 def _warm_up() -> None:
@@ -116,5 +116,5 @@ def _warm_up() -> None:
             range_max=5.6,
             odom=(0.2 * i, 0.0, 0.0),
         )
-        estimator.step(prepared(inputs, 30.0), inputs)
+        estimator.step(prepare_input(inputs, 30.0), inputs)
     estimator.changes()

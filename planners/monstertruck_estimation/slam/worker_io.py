@@ -1,4 +1,4 @@
-"""What goes into the estimation worker and what comes out; light, so that the daemon can hold it."""
+"""Inputs and outputs of the SLAM worker; without numba, so that the daemon can import them."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.sensor import LaserScan
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ UNKNOWN: Final = -1
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class GridPatch:
     """A rectangle of a grid."""
 
     cells: NDArray[np.int8]
@@ -32,7 +32,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class ScanInput:
-    """One scan with everything known about it."""
+    """One scan with odometry, tilt and mount."""
 
     stamp: int
     """ns, of the first beam."""
@@ -51,15 +51,15 @@ class ScanInput:
     twist: Vector = (0.0, 0.0, 0.0)
     """The base's velocity during the scan, m/s and rad/s."""
     slopes: tuple[float, float] | None = None
-    """Rise per metre along the sensor's x and y axis; None = not known, taken as level."""
+    """Rise per metre along the sensor's x and y axis; None = not known, assumed level."""
     height: float | None = None
-    """Of the sensor over the ground, m; None = not known, no ground is looked for."""
+    """Of the sensor over the ground, m; None = not known, hits of the ground are not removed."""
     ceiling: float | None = None
     """Of the ceiling over the ground, m."""
 
     @classmethod
     def of(cls, scan: LaserScan, mount: Vector) -> Self:
-        """What the scan itself says."""
+        """From the message alone."""
         return cls(
             stamp=scan.stamp,
             ranges=scan.ranges,
@@ -74,7 +74,7 @@ class ScanInput:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How a worker begins."""
+    """Start of a worker."""
 
     config: SlamConfig
     pose: Vector = (0.0, 0.0, 0.0)
@@ -83,35 +83,35 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class WorkerInput:
-    """One step's work; what is None or False is not asked for."""
+    """One step's work; None and False = not requested."""
 
     start: Start | None = None
     scan: ScanInput | None = None
     tiles: bool = False
-    """Tell the changed tiles."""
+    """Return the changed tiles."""
     whole: bool = False
-    """Tell the whole grid."""
+    """Return the whole grid."""
     save: Path | None = None
     """Folder to save the map to."""
     finish: bool = False
-    """First fit all key scans jointly (seconds of work)."""
+    """First optimise all keyframes jointly (seconds of work)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
-    """How base moved between two scans that fitted, by the scans alone."""
+class ScanIncrement:
+    """Motion of base between two accepted matches, by the scans alone."""
 
     since: int
     """Stamp of the earlier scan, ns."""
     motion: Vector
     """Base at the later one in base at the earlier one."""
     covariance: tuple[float, ...]
-    """Row-major (3, 3), of the later scan's place on the map, in base's axes: the earlier one's came with its own."""
+    """Row-major (3, 3), of the later scan's pose in the map, in base's axes; the earlier one's came with its own."""
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """What one scan told."""
+class SlamEstimate:
+    """Pose and quality of match of one scan."""
 
     stamp: int
     pose: Vector
@@ -120,7 +120,7 @@ class Estimate:
     """Row-major (3, 3)."""
     map_from_odom: Vector | None
     """Odom in map; None without odometry."""
-    standing: Standing
+    status: LocalisationStatus
     overlap: float
     residual: float
     degeneracy: float
@@ -128,24 +128,24 @@ class Estimate:
     verdict: str
     events: tuple[str, ...] = ()
     offset: float | None = None
-    """Seconds by which odometry runs ahead of the scans, as far as that was found."""
-    moved: Moved | None = None
-    """None for the first scan, and those that do not fit."""
+    """Seconds by which odometry runs ahead of the scans; None = none found."""
+    moved: ScanIncrement | None = None
+    """None for the first scan, and after rejected matches."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerOutput:
-    """What one step gave."""
+    """Result of one step."""
 
-    estimate: Estimate | None = None
+    estimate: SlamEstimate | None = None
     refused: str | None = None
     """Why the scan was left out."""
-    tiles: tuple[Patch, ...] = ()
-    whole: Patch | None = None
+    tiles: tuple[GridPatch, ...] = ()
+    whole: GridPatch | None = None
     redrawn: bool = False
-    """The grid was drawn anew since the last step: whoever holds tiles should take the whole."""
+    """The grid was rebuilt since the last step: tiles received before are obsolete."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Scans, key scans, closures, rejected matches since the start."""
+    """Scans, keyframes, closures, rejected matches since the start."""
     saved: str | None = None
     error: str | None = None
     """Why the map could not be saved."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.scan_tilt import UNKNOWN, TiltStamper, Track, plane_tilt
+from monstertruck_estimation.scan_tilt import UNKNOWN, AngleHistory, TiltStamper, plane_tilt
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback, StabiliserJoint, TorqueState
@@ -67,7 +67,7 @@ def test_the_tilt_is_that_of_the_composed_rotations():
 
 
 def test_a_track_goes_straight_between_its_readings_and_a_little_beyond():
-    track = Track()
+    track = AngleHistory()
     assert track.at(0) is None
     track.extend([(0, (0.0, 1.0))])
     assert track.at(100 * MS) == (0.0, 1.0)

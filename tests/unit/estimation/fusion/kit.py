@@ -59,7 +59,7 @@ class Rig:
         self.seen = 1.0
         """Share of the way that scans show."""
         self.crooked, self.count, self.last, self.waiting = 0.0, 0, None, []
-        self.shown, self.truths, self.changes = [], [], []
+        self.estimates, self.truths, self.changes = [], [], []
         self._observe(0.0, 0.0)
 
     def drive(self, speed, front, rear, seconds):
@@ -88,7 +88,7 @@ class Rig:
             self.fusion.observe_scan(self.waiting.pop(0))
         self.changes += self.fusion.changes()
         if self.count % 2 == 0 and (estimate := self.fusion.estimate(self.now)) is not None:
-            self.shown.append(estimate)
+            self.estimates.append(estimate)
             self.truths.append(self.pose)
 
     def _scan(self):
@@ -113,7 +113,7 @@ class Rig:
 
     @property
     def estimate(self):
-        return self.shown[-1]
+        return self.estimates[-1]
 
     def error(self):
         """Position, m, and yaw, rad."""
@@ -123,7 +123,7 @@ class Rig:
     def nees(self):
         """Normalised error squared of the pose of every published estimate."""
         values = []
-        for estimate, truth in zip(self.shown, self.truths, strict=True):
+        for estimate, truth in zip(self.estimates, self.truths, strict=True):
             off = np.array(estimate.pose) - truth
             off[2] = math.remainder(off[2], math.tau)
             values.append(float(off @ np.linalg.solve(estimate.pose_covariance.reshape(3, 3) + 1e-9 * np.eye(3), off)))
@@ -131,7 +131,7 @@ class Rig:
 
     def steps(self):
         """Way between neighbouring published poses, m."""
-        places = np.array([estimate.pose[:2] for estimate in self.shown])
+        places = np.array([estimate.pose[:2] for estimate in self.estimates])
         return np.hypot(*np.diff(places, axis=0).T)
 
 

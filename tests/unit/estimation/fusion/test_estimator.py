@@ -6,7 +6,7 @@ import pytest
 
 from monstertruck_estimation.fusion import estimator
 from monstertruck_estimation.fusion.config import SlipConfig
-from monstertruck_estimation.fusion.estimator import REDONE, Fusion
+from monstertruck_estimation.fusion.estimator import MAX_RECOMPUTED, Fusion
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, scan_motion, wander
 from tests.unit.estimation.kit import CHASSIS, drive_feedback, servo_feedback
@@ -60,7 +60,7 @@ def test_a_trim_of_the_steering_is_learned():
     for rig in (learned, blind):
         rig.crooked = 0.01
         rig.drive(0.3, 0.0, 0.0, 15.0)
-    assert learned.fusion.standing().trim == pytest.approx(2 * math.tan(0.01) / 0.32, abs=0.02)
+    assert learned.fusion.status().trim == pytest.approx(2 * math.tan(0.01) / 0.32, abs=0.02)
     learned.sensors = {"wheels"}
     turned, off = learned.error()[1], blind.error()[1]
     for rig in (learned, blind):
@@ -95,8 +95,10 @@ def test_slip_that_the_scans_show_costs_little():
 def test_no_call_redoes_more_than_a_few_readings(trouble, monkeypatch):
     """At the onset of slip, or of a disturbance, a second and a half of readings is redone: over several estimates."""
     calls, spent, waited = [], [], []
-    advance = estimator.advanced
-    monkeypatch.setattr(estimator, "advanced", lambda *given, **more: calls.append(1) or advance(*given, **more))
+    advance = estimator.apply_measurement
+    monkeypatch.setattr(
+        estimator, "apply_measurement", lambda *given, **more: calls.append(1) or advance(*given, **more)
+    )
     rig = Rig(ALL)
     for name in ("observe_drive", "observe_attitude", "observe_scan", "estimate"):
         call = getattr(rig.fusion, name)
@@ -112,16 +114,16 @@ def test_no_call_redoes_more_than_a_few_readings(trouble, monkeypatch):
     rig.drive(0.3, 0.0, 0.0, 3.0)
     setattr(rig, trouble, 1.8)
     rig.drive(0.3, 0.0, 0.0, 2.0)
-    assert max(waited) > 2 * REDONE, "there was more to redo than one call may"
-    assert max(spent) <= REDONE
-    assert waited[-1] <= REDONE
+    assert max(waited) > 2 * MAX_RECOMPUTED, "there was more to redo than one call may"
+    assert max(spent) <= MAX_RECOMPUTED
+    assert waited[-1] <= MAX_RECOMPUTED
 
 
 def test_wheels_that_slip_do_not_count_as_a_source():
     rig = Rig(ALL).drive(0.3, 0.0, 0.0, 4.0)
     rig.slip = 1.8
     rig.drive(0.3, 0.0, 0.0, 2.5)
-    assert rig.fusion.standing().slipping
+    assert rig.fusion.status().slipping
     assert "drive" not in rig.estimate.sources
     assert "lidar" in rig.estimate.sources
 
@@ -155,7 +157,7 @@ def test_scans_that_go_along_with_the_robot_after_they_were_blind_are_doubted(bl
     rig.drive(0.3, 0.0, 0.0, 3.0)
     assert rig.changes == []
     assert rig.error()[0] < 0.15
-    assert rig.fusion.standing().left_out["lidar: against the wheels when it has just been blind"] > 20
+    assert rig.fusion.status().left_out["lidar: against the wheels when it has just been blind"] > 20
     rig.seen = 1.0
     rig.drive(0.3, 0.0, 0.0, 2.0)
     rig.slip = 1.8
@@ -201,7 +203,7 @@ def test_tilt_shortens_the_way_over_a_ramp():
             fusion.observe_steering(servo_feedback(now, 0.0, 0.0))
             fusion.observe_attitude(attitude(now - 1, 0.0, pitch=pitch))
             fusion.observe_drive(drive_feedback(now, k * 100.0))
-        return fusion.belief.mean[0]
+        return fusion.state.mean[0]
 
     assert way(-0.3) == pytest.approx(way(0.0) * math.cos(0.3), rel=1e-3)
 
@@ -218,28 +220,28 @@ def test_late_measurements_give_what_punctual_ones_give():
             rig.fusion.observe_scan(motion)
         rig.waiting.clear()
         rig.settle()
-    assert late.fusion.belief.mean == pytest.approx(early.fusion.belief.mean, abs=1e-9)
-    assert late.fusion.belief.covariance == pytest.approx(early.fusion.belief.covariance, abs=1e-12)
+    assert late.fusion.state.mean == pytest.approx(early.fusion.state.mean, abs=1e-9)
+    assert late.fusion.state.covariance == pytest.approx(early.fusion.state.covariance, abs=1e-12)
 
 
 def test_what_is_too_late_is_left_out():
     rig = Rig(("wheels", "compass")).drive(0.3, 0.0, 0.0, 6.0)
-    before = rig.fusion.belief
+    before = rig.fusion.state
     rig.fusion.observe_scan(scan_motion(SECOND, SECOND + 10 * TICK, (0.05, 0.0, 0.0), np.eye(3) * 1e-6))
-    assert rig.fusion.belief.mean == pytest.approx(before.mean)
-    assert rig.fusion.standing().left_out == {"lidar: too late": 1}
+    assert rig.fusion.state.mean == pytest.approx(before.mean)
+    assert rig.fusion.status().left_out == {"lidar: too late": 1}
 
 
 @pytest.mark.parametrize("step", [0, -SECOND // 2])
 def test_duplicates_and_time_that_goes_back_change_nothing(step):
     rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
-    before = rig.fusion.belief
+    before = rig.fusion.state
     stamp = rig.fusion._last["lidar"] + step
     rig.fusion.observe_drive(drive_feedback(rig.now + step, rig.motor + 100.0))
     rig.fusion.observe_attitude(attitude(rig.fusion._last["compass"] + step, 2.0))
     rig.fusion.observe_scan(scan_motion(stamp - 10 * TICK, stamp, (1.0, 0.0, 0.0), np.eye(3) * 1e-6))
-    assert rig.fusion.belief is before
-    assert sum(rig.fusion.standing().left_out.values()) == 3
+    assert rig.fusion.state is before
+    assert sum(rig.fusion.status().left_out.values()) == 3
 
 
 def test_an_estimate_for_an_earlier_instant_does_not_move_the_pose():
@@ -251,7 +253,7 @@ def test_an_estimate_for_an_earlier_instant_does_not_move_the_pose():
 
 def test_what_is_no_number_is_left_out():
     rig = Rig(ALL).drive(0.3, 0.0, 0.0, 3.0)
-    before, now = rig.fusion.belief, rig.now + TICK
+    before, now = rig.fusion.state, rig.now + TICK
     nan = math.nan
     rig.fusion.observe_drive(drive_feedback(now, 0.0).model_copy(update={"position": nan}))
     rig.fusion.observe_steering(servo_feedback(now, 0.0, 0.0).model_copy(update={"front": nan}))
@@ -262,8 +264,8 @@ def test_what_is_no_number_is_left_out():
         rig.fusion.observe_scan(good.model_copy(update={"covariance": covariance}))
     rig.fusion.observe_scan(good.model_copy(update={"motion": good.motion.model_copy(update={"x": nan})}))
     rig.fusion.observe_scan(good.model_copy(update={"since": now}))
-    assert rig.fusion.belief is before
-    assert sum(rig.fusion.standing().left_out.values()) == 9
+    assert rig.fusion.state is before
+    assert sum(rig.fusion.status().left_out.values()) == 9
     rig.drive(0.3, 0.0, 0.0, 1.0)
     assert rig.error()[0] < 0.05
 
@@ -285,7 +287,7 @@ def test_a_drive_that_counts_anew_does_not_move_the_truck():
     rig.drive(0.3, 0.0, 0.0, 2.0)
     assert rig.error()[0] < 0.05
     assert rig.steps().max() < 0.02
-    assert rig.fusion.standing().left_out == {"drive: counts from a new origin": 1}
+    assert rig.fusion.status().left_out == {"drive: counts from a new origin": 1}
 
 
 def test_a_scan_motion_of_nowhere_makes_no_jump():
@@ -300,8 +302,8 @@ def test_a_scan_motion_of_nowhere_makes_no_jump():
 def test_nothing_is_known_before_the_first_reading():
     fusion = Fusion(config(), CHASSIS)
     assert fusion.estimate(SECOND) is None
-    assert fusion.belief is None
-    assert fusion.standing().north is None
+    assert fusion.state is None
+    assert fusion.status().north is None
 
 
 def test_sections_set_null_leave_sensors_out():

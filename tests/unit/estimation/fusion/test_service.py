@@ -5,7 +5,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from monstertruck_estimation.fusion.config import AnyOdometry, FusionConfig
 from monstertruck_estimation.fusion.service import FusionService
-from monstertruck_estimation.fusion.slip import Change
+from monstertruck_estimation.fusion.slip import SlipChange
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_schemas.reasons import Reason
@@ -60,7 +60,7 @@ def test_slip_and_a_disturbed_compass_are_events():
     rig = Rig().drive(0.3, 0.0, 0.0, 4.0)
     rig.field, rig.magnet = 2 * FIELD, 0.5
     rig.drive(0.3, 0.0, 0.0, 0.5)
-    rig.fusion._changes.extend((Change(True, 0, "apart"), Change(False, 0, "together")))
+    rig.fusion._changes.extend((SlipChange(True, 0, "apart"), SlipChange(False, 0, "together")))
     events, odometry = served(rig)
     assert [reason for reason, _ in events] == [Reason.WHEEL_SLIP, Reason.WHEEL_GRIP, Reason.HEADING_DISTURBED]
     assert events[0][1] == "apart"
@@ -87,9 +87,9 @@ def test_the_motion_between_scans_is_taken_from_the_bus():
     rig = Rig().drive(0.3, 0.0, 0.0, 2.0)
     rig.delay = 1000
     rig.drive(0.3, 0.0, 0.0, 0.5)
-    before = rig.fusion.belief.used["lidar"]
+    before = rig.fusion.state.used["lidar"]
     served(rig, Scans(list(rig.waiting)))
-    assert rig.fusion.belief.used["lidar"] > before
+    assert rig.fusion.state.used["lidar"] > before
 
 
 def test_the_section_is_dead_reckoning_unless_it_says_fusion():

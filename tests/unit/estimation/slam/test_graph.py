@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between, compose
-from monstertruck_estimation.slam.graph import Edges, drift, optimise, residuals, trust
-from monstertruck_estimation.slam.keyframes import thinned
+from monstertruck_estimation.slam.graph import Edges, drift, optimise, residuals, robust_weights
+from monstertruck_estimation.slam.keyframes import pruned
 from tests.unit.estimation.slam.kit import errors, rounds
 
-SURE = np.diag((1e4, 1e4, 4e4))
+SMALL_WINDOW = np.diag((1e4, 1e4, 4e4))
 
 
-def chain(poses, loops=(), information=SURE):
+def chain(poses, loops=(), information=SMALL_WINDOW):
     """Edges between successors and between ``loops`` = (origin, target, measured) of ``poses``."""
     pairs = [(k, k + 1, between(poses[k], poses[k + 1])) for k in range(len(poses) - 1)]
     rows = pairs + list(loops)
@@ -46,7 +46,7 @@ def test_a_false_closure_is_outvoted():
     edges = chain(bent, [*true, false])
     poses = optimise(bent, edges)
     assert errors(poses, truth).max() < 0.3
-    weights = trust(residuals(poses, edges)[1], edges.loop)
+    weights = robust_weights(residuals(poses, edges)[1], edges.loop)
     assert weights[-1] < 0.01
     assert weights[:-1].min() > 0.9
 
@@ -85,7 +85,7 @@ def test_thinning_hands_relations_over_so_that_the_optimum_stays():
     edges = chain(bent, [(k, k + 99, between(truth[k], truth[k + 99])) for k in range(100)])
     full = optimise(bent, edges)
     marks = np.zeros(len(edges), bool)
-    gone, stand_in, left, spread, odometry = thinned(full, edges, np.full((len(edges), 2), 1e-4), marks, 0.1)
+    gone, stand_in, left, spread, odometry = pruned(full, edges, np.full((len(edges), 2), 1e-4), marks, 0.1)
     assert gone.sum() == 20
     assert not gone[0]
     assert not gone[-60:].any()
@@ -102,7 +102,7 @@ def test_relations_handed_over_do_not_pile_up():
     edges = chain(truth, [(k, k + gap, between(truth[k], truth[k + gap])) for gap in (2, 3, 99) for k in range(100)])
     spread, marks, poses = np.full((len(edges), 2), 1e-4), np.zeros(len(edges), bool), truth
     for _ in range(5):
-        gone, _, edges, spread, marks = thinned(poses, edges, spread, marks, 0.1)
+        gone, _, edges, spread, marks = pruned(poses, edges, spread, marks, 0.1)
         edges, poses = edges.renumbered(np.cumsum(~gone) - 1), poses[~gone]
         ends = np.sort(np.stack((edges.origin, edges.target)), axis=0)
-        assert len(np.unique(ends, axis=1).T) == len(edges), "one relation between two key scans"
+        assert len(np.unique(ends, axis=1).T) == len(edges), "one relation between two keyframes"

@@ -1,10 +1,10 @@
-"""The occupancy grid: what a scan leaves in it, growth, changed tiles, redrawing."""
+"""The occupancy grid: what a scan leaves in it, growth, changed tiles, rebuilding, stored points."""
 
 import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.config import GridConfig
-from monstertruck_estimation.slam.grid import TILE, OccupancyGrid, Painter
+from monstertruck_estimation.slam.grid import PAGE_POINTS, TILE, GridBuilder, OccupancyGrid, PointPages
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.storage import elements
 
@@ -105,35 +105,72 @@ def test_tiles_put_together_are_the_grid():
 
 
 def test_after_a_closure_the_map_is_drawn_anew_and_old_places_are_told_unknown():
-    painter = Painter(GridConfig())
+    builder = GridBuilder(GridConfig())
     scan = scan_of((1.0, 0.0), (1.0, 0.2))
     poses = np.array([(float(i), 0.0, 0.0) for i in range(5)])
     for i, pose in enumerate(poses):
-        assert painter.add(scan, i + 1, pose, (0.0, 0.0, 0.0))
-    painter.grid.changes()
+        assert builder.add(scan, i + 1, pose, (0.0, 0.0, 0.0))
+    builder.grid.changes()
     stamps = np.arange(1, 6)
-    assert not painter.follow(stamps, poses + 0.001)
+    assert not builder.update_poses(stamps, poses + 0.001)
     moved = poses + np.array((0.0, 20.0, 0.0))
-    assert painter.follow(stamps, moved)
-    assert value(painter.grid, 5.0, 20.0) == 70
-    assert value(painter.grid, 5.0, 0.0) == -1
-    told = {patch.origin: patch.cells for patch in painter.grid.changes()}
+    assert builder.update_poses(stamps, moved)
+    assert value(builder.grid, 5.0, 20.0) == 70
+    assert value(builder.grid, 5.0, 0.0) == -1
+    told = {patch.origin: patch.cells for patch in builder.grid.changes()}
     assert (told[(0.0, 0.0)] == -1).all()
 
 
 def test_scans_join_by_way_turn_or_time():
-    painter = Painter(GridConfig(spacing=0.1, turn=0.1, pause=1.0))
+    builder = GridBuilder(GridConfig(spacing=0.1, turn=0.1, pause=1.0))
     scan, level = scan_of((1.0, 0.0)), (0.0, 0.0, 0.0)
-    assert painter.add(scan, 0, np.zeros(3), level)
-    assert not painter.add(scan, 10**8, np.array((0.05, 0, 0)), level)
-    assert painter.add(scan, 2 * 10**8, np.array((0.11, 0, 0)), level)
-    assert painter.add(scan, 3 * 10**8, np.array((0.11, 0, 0.15)), level)
-    assert painter.add(scan, 14 * 10**8, np.array((0.11, 0, 0.15)), level)
+    assert builder.add(scan, 0, np.zeros(3), level)
+    assert not builder.add(scan, 10**8, np.array((0.05, 0, 0)), level)
+    assert builder.add(scan, 2 * 10**8, np.array((0.11, 0, 0)), level)
+    assert builder.add(scan, 3 * 10**8, np.array((0.11, 0, 0.15)), level)
+    assert builder.add(scan, 14 * 10**8, np.array((0.11, 0, 0.15)), level)
 
 
 def test_memory_is_bounded():
-    painter = Painter(GridConfig(remembered=32))
+    builder = GridBuilder(GridConfig(remembered=32))
     for i in range(500):
-        painter.add(scan_of((1.0, 0.0)), i, np.array((0.2 * i, 0.0, 0.0)), (0.0, 0.0, 0.0))
-    assert len(painter) <= 32
-    assert value(painter.grid, 30.0, 0.0) != -1
+        builder.add(scan_of((1.0, 0.0)), i, np.array((0.2 * i, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    assert len(builder) <= 32
+    assert value(builder.grid, 30.0, 0.0) != -1
+
+
+def test_scans_are_remembered_as_they_came():
+    rng = np.random.default_rng(1)
+    scans = [rng.integers(-32000, 32000, (count, 2)).astype(np.int16) for count in rng.integers(1, 700, 900)]
+    pages = PointPages()
+    for scan in scans:
+        pages.append(scan)
+    assert len(pages) == len(scans)
+    assert all(np.array_equal(pages[k], scan) for k, scan in enumerate(scans))
+
+
+def test_what_is_forgotten_leaves_no_hole():
+    rng = np.random.default_rng(2)
+    pages, expected, most = PointPages(), [], 0
+    for _ in range(12):
+        for count in rng.integers(1, 5000, 120):
+            scan = rng.integers(-32000, 32000, (count, 2)).astype(np.int16)
+            pages.append(scan)
+            expected.append(scan)
+        kept = [k for k in range(len(expected)) if k % 2 == 0]
+        pages.keep(kept)
+        expected = [expected[k] for k in kept]
+        assert all(np.array_equal(pages[k], scan) for k, scan in enumerate(expected))
+        most = max(most, len(pages._pages))
+    assert most * PAGE_POINTS < 1.3 * 240 * 5000 / 2 + 2 * PAGE_POINTS
+
+
+def test_a_scan_may_be_larger_than_a_page():
+    pages = PointPages()
+    scans = [np.full((count, 2), k, np.int16) for k, count in enumerate((10, PAGE_POINTS + 5, 3, 2 * PAGE_POINTS, 7))]
+    for scan in scans:
+        pages.append(scan)
+    pages.keep([1, 3, 4])
+    assert [len(pages[k]) for k in range(3)] == [PAGE_POINTS + 5, 2 * PAGE_POINTS, 7]
+    assert [int(pages[k][0, 0]) for k in range(3)] == [1, 3, 4]
+    assert all((pages[k] == pages[k][0, 0]).all() for k in range(3))

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.scans import ScanGeometry, prepare, spread
+from monstertruck_estimation.slam.scans import ScanGeometry, downsample_indices, prepare
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges
 
 FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
@@ -64,10 +64,10 @@ def test_motion_during_the_scan_is_undone():
 
 def test_thinning_keeps_one_point_per_square_and_no_more_than_asked():
     scan = prepare(ranges(ROOM, (2.0, 0.0, 1.5)), LIDAR)
-    thinned = scan.thinned(0.2, 1000)
-    cells = np.floor(thinned.points / 0.2)
-    assert len(np.unique(cells, axis=0)) == len(thinned)
-    assert len(scan.thinned(0.01, 50)) == 50
+    pruned = scan.downsampled(0.2, 1000)
+    cells = np.floor(pruned.points / 0.2)
+    assert len(np.unique(cells, axis=0)) == len(pruned)
+    assert len(scan.downsampled(0.01, 50)) == 50
 
 
 @pytest.mark.parametrize("slope", [-0.3, 0.3])
@@ -77,5 +77,5 @@ def test_the_points_that_are_kept_of_a_wall_lie_on_it_on_average(slope):
     off = rng.normal(0.0, 0.012, len(along))
     wall = np.array((math.cos(slope), math.sin(slope)))
     points = along[:, None] * wall + off[:, None] * (-wall[1], wall[0])
-    kept = spread(points, 0.04)
+    kept = downsample_indices(points, 0.04)
     assert np.mean(off[kept]) == pytest.approx(0.0, abs=3 * 0.012 / math.sqrt(len(kept)))

@@ -23,17 +23,17 @@ def test_north_is_found_whatever_it_is():
     rig = Rig(SENSORS)
     rig.north = -2.0
     rig.drive(0.3, 0.0, 0.0, 3.0)
-    assert rig.fusion.standing().north == pytest.approx(-2.0, abs=0.02)
+    assert rig.fusion.status().north == pytest.approx(-2.0, abs=0.02)
 
 
 def test_a_magnet_that_changes_the_field_is_left_out_at_once_and_comes_back():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     disturbed(rig, 3.0, magnet=0.1, field=FIELD * 1.4)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
     assert "compass" not in rig.estimate.sources
     assert rig.error()[1] < 0.02
     rig.drive(0.3, 0.0, 0.0, 8.0)
-    assert not rig.fusion.standing().disturbed
+    assert not rig.fusion.status().disturbed
     assert "compass" in rig.estimate.sources
 
 
@@ -49,10 +49,10 @@ def test_a_field_that_fades_does_not_creep_in():
 def test_a_jump_of_the_heading_alone_is_left_out():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     disturbed(rig, 3.0, magnet=0.7)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
     assert rig.error()[1] < 0.02
     rig.drive(0.3, 0.0, 0.0, 8.0)
-    assert not rig.fusion.standing().disturbed
+    assert not rig.fusion.status().disturbed
 
 
 def test_a_heading_that_is_right_only_in_passing_is_not_believed_again():
@@ -60,7 +60,7 @@ def test_a_heading_that_is_right_only_in_passing_is_not_believed_again():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     for k in range(60):
         disturbed(rig, 0.1, magnet=0.6 - 1.2 * k / 60)
-        assert rig.fusion.standing().disturbed
+        assert rig.fusion.status().disturbed
     assert rig.error()[1] < 0.05
 
 
@@ -68,19 +68,19 @@ def test_headings_before_a_disturbance_was_noticed_are_not_believed():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     for k in range(12):
         disturbed(rig, 0.1, magnet=0.02 * k)
-    crept = rig.fusion.belief.mean[2]
-    assert not rig.fusion.standing().disturbed
+    crept = rig.fusion.state.mean[2]
+    assert not rig.fusion.status().disturbed
     disturbed(rig, 0.1, magnet=0.24, field=FIELD * 1.1)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
     rig.settle()
-    assert abs(rig.fusion.belief.mean[2]) < 0.5 * abs(crept)
+    assert abs(rig.fusion.state.mean[2]) < 0.5 * abs(crept)
 
 
 def test_a_magnet_that_is_approached_slowly_is_taken_back_to_where_it_began():
     """A dipole 2.4 m ahead and to the side: for two metres the field's strength hardly changes, the heading does."""
     rig = Rig(SENSORS, wheels=WheelTrust(trim=0.01)).drive(0.3, 0.0, 0.0, 3.0)
     crept = 0.0
-    while not rig.fusion.standing().disturbed:
+    while not rig.fusion.status().disturbed:
         share = 0.05 / (2.4 + 0.9 - rig.pose[0]) ** 3
         crept = rig.error()[1]
         disturbed(rig, 0.1, magnet=3.5 * share, field=FIELD * (1 + share))
@@ -95,13 +95,13 @@ def test_what_is_taken_back_still_tells_how_strong_the_field_is():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 2.0)
     disturbed(rig, 2.0, magnet=0.5, field=FIELD * 1.3)
     assert rig.fusion.waiting == 0
-    assert rig.fusion.belief.gate.field == pytest.approx(FIELD)
+    assert rig.fusion.state.gate.field == pytest.approx(FIELD)
 
 
 def test_headings_from_one_place_err_alike():
     """A minute of readings on one spot tells no more than that spot: 3 degrees."""
     rig = Rig(SENSORS).drive(0.0, 0.0, 0.0, 20.0)
-    assert math.sqrt(rig.fusion.belief.covariance[NORTH, NORTH]) > 0.045
+    assert math.sqrt(rig.fusion.state.covariance[NORTH, NORTH]) > 0.045
 
 
 def test_a_disturbance_that_the_strength_hides_moves_the_deviation_more_than_the_yaw():
@@ -115,21 +115,21 @@ def test_a_single_good_heading_is_not_enough_to_be_believed_again():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     disturbed(rig, 1.0, magnet=0.7)
     disturbed(rig, 0.06)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
 
 
 def test_a_lasting_change_becomes_a_new_north_and_the_old_one_is_known_again():
     # With scans, for by the wheels alone the yaw would become so uncertain that it might as well be wrong.
     rig = Rig(("wheels", "compass", "scans")).drive(0.3, 0.0, 0.0, 4.0)
     disturbed(rig, 9.0, magnet=0.7)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
     disturbed(rig, 3.0, magnet=0.7)
-    assert not rig.fusion.standing().disturbed
-    assert rig.fusion.standing().north == pytest.approx(0.0, abs=0.1)
+    assert not rig.fusion.status().disturbed
+    assert rig.fusion.status().north == pytest.approx(0.0, abs=0.1)
     assert rig.error()[1] < 0.05
     rig.drive(0.3, 0.0, 0.0, 8.0)
-    assert not rig.fusion.standing().disturbed
-    assert rig.fusion.standing().north == pytest.approx(0.7, abs=0.05)
+    assert not rig.fusion.status().disturbed
+    assert rig.fusion.status().north == pytest.approx(0.7, abs=0.05)
     assert rig.error()[1] < 0.05
 
 
@@ -137,17 +137,17 @@ def test_wild_headings_never_become_a_north():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     for _ in range(150):
         disturbed(rig, 0.1, magnet=float(rig.rng.uniform(0.5, 5.5)))
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.status().disturbed
     assert rig.error()[1] < 0.05
 
 
 def test_the_devices_own_word_counts():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
-    before = rig.fusion.belief.mean[2]
+    before = rig.fusion.state.mean[2]
     for k in range(40):
         rig.fusion.observe_attitude(attitude(rig.now + k + 1, math.pi / 2, heading_disturbed=True))
-    assert rig.fusion.belief.mean[2] == pytest.approx(before, abs=0.02)
-    assert rig.fusion.standing().disturbed
+    assert rig.fusion.state.mean[2] == pytest.approx(before, abs=0.02)
+    assert rig.fusion.status().disturbed
 
 
 def test_the_deviation_of_the_compass_does_not_count_as_slip():

@@ -8,8 +8,8 @@ import pytest
 
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.kiss import Kiss
-from monstertruck_estimation.slam.mapping import Event, Mapper
+from monstertruck_estimation.slam.kiss_matcher import KissMatcher
+from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
 from tests.unit.estimation.slam.kit import (
     BEAMS,
@@ -59,7 +59,7 @@ def test_drifting_wheels_are_put_right(lap):
     stamps, poses = mapper.trajectory()
     assert len(stamps) == len(truth)
     assert errors(poses, truth).max() < 0.12
-    assert not any(Event.REJECTED in step.events for step in steps)
+    assert not any(MappingEvent.REJECTED in step.events for step in steps)
 
 
 def test_the_loop_is_closed_and_related(lap):
@@ -153,7 +153,7 @@ def test_a_corridor_does_not_collapse():
 
 def test_kiss_serves_as_front_end():
     truth = rounds(100, 0.5)
-    mapper = Mapper(front=Kiss())
+    mapper = Mapper(front=KissMatcher())
     steps = drive(mapper, ROOM, truth, drifting(truth))
     assert errors(mapper.trajectory()[1], truth).max() < 0.15
     assert np.mean([step.match.accepted for step in steps[1:]]) > 0.9
@@ -235,7 +235,7 @@ def test_the_map_stays_bounded_and_right():
     truth = rounds(420, 3.0)
     mapper = Mapper(MapperConfig(most_keys=90, thinning=0.1, most_scans=300))
     steps = drive(mapper, ROOM, truth, drifting(truth))
-    assert any(Event.THINNED in step.events for step in steps)
+    assert any(MappingEvent.PRUNED in step.events for step in steps)
     assert len(mapper.map) <= 90
     stamps, poses = mapper.trajectory()
     assert len(stamps) <= 300

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_estimation.slam.storage import surfaces_of
-from monstertruck_estimation.slam.worker import EstimationWorker
+from monstertruck_estimation.slam.storage import surface_elements
+from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 
@@ -41,7 +41,7 @@ def test_both_sides_of_a_wall_face_their_own_side(degrees: int, thick: int):
     normal = np.array((math.cos(math.radians(degrees)), math.sin(math.radians(degrees))))
     off = x * normal[0] + y * normal[1]
     wall = np.abs(off - 0.01) < thick * STEP * np.abs(normal).max() / 2
-    surfaces = surfaces_of(_grid(wall, ~wall))
+    surfaces = surface_elements(_grid(wall, ~wall))
     inner = np.abs(surfaces.points).max(axis=1) < 1.7
     facing = surfaces.normals[inner] @ normal
     place = surfaces.points[inner] @ normal
@@ -56,10 +56,10 @@ def test_both_sides_of_a_wall_face_their_own_side(degrees: int, thick: int):
 
 def test_what_nobody_can_see_is_no_surface():
     x, y = _plane()
-    surfaces = surfaces_of(_grid(x > 1.0, (x < 1.0) & (y > 0)))
+    surfaces = surface_elements(_grid(x > 1.0, (x < 1.0) & (y > 0)))
     assert surfaces.points[:, 1].min() > -STEP
     assert np.all(surfaces.normals[:, 0] < -0.9)
-    assert not len(surfaces_of(_grid(x > 1.0, np.zeros_like(x, dtype=bool))))
+    assert not len(surface_elements(_grid(x > 1.0, np.zeros_like(x, dtype=bool))))
 
 
 @pytest.fixture(scope="module", params=["as drawn", "thin walls"])
@@ -106,25 +106,25 @@ PLACES = [(1.5, 3.95, 0.0), (6.85, 4.6, 1.6), (4.5, 6.4, 0.0)]
 
 @pytest.mark.parametrize("start", PLACES)
 def test_a_robot_that_knows_its_place_keeps_it(plain: Path, start: tuple[float, float, float]):
-    worker = EstimationWorker()
+    worker = SlamWorker()
     worker.step(WorkerInput(start=Start(SlamConfig(mode="localisation", map=plain), start)))
     for scan, truth in _scans(start, 20, odom=False):
         estimate = worker.step(WorkerInput(scan=scan)).estimate
         assert estimate is not None
-        assert estimate.standing is Standing.LOCALISED
+        assert estimate.status is LocalisationStatus.LOCALISED
         assert estimate.overlap > 0.85
         assert np.hypot(*(np.array(estimate.pose[:2]) - truth[:2])) < 0.05
 
 
 @pytest.mark.parametrize("start", PLACES)
 def test_a_kidnapped_robot_finds_itself(plain: Path, start: tuple[float, float, float]):
-    worker = EstimationWorker()
+    worker = SlamWorker()
     worker.step(WorkerInput(start=Start(SlamConfig(mode="localisation", map=plain))))
     found = False
     for scan, truth in _scans(start, 35, odom=True):
         estimate = worker.step(WorkerInput(scan=scan)).estimate
         assert estimate is not None
-        if estimate.standing is not Standing.SEARCHING:
+        if estimate.status is not LocalisationStatus.SEARCHING:
             found = True
             assert np.hypot(*(np.array(estimate.pose[:2]) - truth[:2])) < 0.08
     assert found

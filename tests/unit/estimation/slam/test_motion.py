@@ -3,21 +3,21 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.frontend import Match, Verdict, rejected
-from monstertruck_estimation.slam.motion import Increments
+from monstertruck_estimation.slam.motion import ScanOdometry
+from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))
 
 
 def match(pose, information=INFORMATION, degeneracy=0.5, direction=0.0, overlap=0.9):
-    return Match(
+    return ScanMatch(
         np.array(pose),
         np.eye(3),
         overlap,
         0.01,
         degeneracy,
         direction,
-        Verdict.ACCEPTED,
+        MatchStatus.ACCEPTED,
         np.asarray(information, float),
     )
 
@@ -28,7 +28,7 @@ def take(increments, stamp, pose, *, alone=False, **more):
 
 
 def test_the_motion_is_told_in_base_with_the_covariance_of_the_later_place():
-    increments = Increments()
+    increments = ScanOdometry()
     assert take(increments, 1, (1.0, 0.0, math.pi / 2)) is None
     moved = take(increments, 2, (1.0, 0.5, math.pi / 2))
     assert moved.since == 1
@@ -40,27 +40,27 @@ def test_the_motion_is_told_in_base_with_the_covariance_of_the_later_place():
 
 
 def test_without_odometry_rejected_matches_are_stepped_over():
-    increments = Increments()
+    increments = ScanOdometry()
     take(increments, 1, (0.0, 0.0, 0.0), alone=True)
-    lost = rejected(np.array((9.0, 9.0, 9.0)), np.eye(3), Verdict.OVERLAP)
+    lost = rejected(np.array((9.0, 9.0, 9.0)), np.eye(3), MatchStatus.OVERLAP)
     assert increments.take(2, lost, lost.pose, alone=True) is None
     assert take(increments, 3, (0.2, 0.0, 0.0), alone=True).motion == pytest.approx((0.2, 0.0, 0.0))
     assert take(increments, 4, (0.3, 0.0, 0.0), alone=True, overlap=0.4).motion == pytest.approx((0.1, 0.0, 0.0))
 
 
 def test_beside_odometry_no_motion_is_told_by_or_across_a_misfit():
-    increments = Increments()
+    increments = ScanOdometry()
     take(increments, 1, (0.0, 0.0, 0.0))
     assert take(increments, 2, (1.0, 1.0, 0.5), overlap=0.4) is None
     assert take(increments, 3, (1.1, 1.0, 0.5)) is None
     assert take(increments, 4, (1.2, 1.0, 0.5)) is not None
-    lost = rejected(np.array((9.0, 9.0, 9.0)), np.eye(3), Verdict.OVERLAP)
+    lost = rejected(np.array((9.0, 9.0, 9.0)), np.eye(3), MatchStatus.OVERLAP)
     assert increments.take(5, lost, lost.pose, alone=False) is None
     assert take(increments, 6, (5.0, 0.0, 0.0)) is None
 
 
 def test_after_a_misfit_the_overlap_must_be_as_usual():
-    increments = Increments()
+    increments = ScanOdometry()
     take(increments, 1, (0.0, 0.0, 0.0), overlap=0.95)
     assert take(increments, 2, (0.1, 0.0, 0.0), overlap=0.65) is not None
     take(increments, 3, (3.0, 0.0, 0.0), overlap=0.4)
@@ -74,11 +74,11 @@ def test_after_a_misfit_the_overlap_must_be_as_usual():
 
 
 def test_a_correction_of_the_map_is_no_motion():
-    increments = Increments()
+    increments = ScanOdometry()
     first = match((0.0, 0.0, 0.0))
     increments.take(1, first, np.array((5.0, 5.0, 0.0)), alone=True, corrected=True)
     assert take(increments, 2, (5.1, 5.0, 0.0)).motion == pytest.approx((0.1, 0.0, 0.0))
-    lost = rejected(np.zeros(3), np.eye(3), Verdict.FAR)
+    lost = rejected(np.zeros(3), np.eye(3), MatchStatus.FAR)
     increments.take(3, lost, lost.pose, alone=True, corrected=True)
     assert take(increments, 4, (7.0, 0.0, 0.0), alone=True) is None
     increments.forget()
@@ -86,7 +86,7 @@ def test_a_correction_of_the_map_is_no_motion():
 
 
 def test_a_corridor_says_nothing_along_itself():
-    increments = Increments()
+    increments = ScanOdometry()
     take(increments, 1, (0.0, 0.0, 0.3))
     moved = take(increments, 2, (0.0, 0.0, 0.3), degeneracy=0.01, direction=0.3)
     sizes = np.sqrt(np.diag(np.array(moved.covariance).reshape(3, 3)))

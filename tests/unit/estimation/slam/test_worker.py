@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_estimation.correction import Correction
+from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.scan_tilt import plane_slopes, plane_tilt
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam import worker as estimation
 from monstertruck_estimation.slam.config import MapperConfig, SlamConfig
 from monstertruck_estimation.slam.motion import find_offset
-from monstertruck_estimation.slam.scans import levelled
-from monstertruck_estimation.slam.worker import EstimationWorker
+from monstertruck_estimation.slam.scans import level_ranges
+from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.health import Standing
+from monstertruck_schemas.health import LocalisationStatus
 
 ANGLES = np.linspace(-2.1, 2.1, 400)
 WALLS = np.array(
@@ -65,7 +65,7 @@ def scan_at(i: int, rng: np.random.Generator, *, odom: bool = True) -> ScanInput
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("map") / "room"
-    worker, rng = EstimationWorker(), np.random.default_rng(1)
+    worker, rng = SlamWorker(), np.random.default_rng(1)
     start = tuple(pose_at(0).tolist())
     worker.step(WorkerInput(start=Start(SlamConfig(), start)))
     for i in range(130):
@@ -78,16 +78,16 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_worker_gives_memory_back_when_the_map_is_thinned(monkeypatch: pytest.MonkeyPatch):
     given = []
     monkeypatch.setattr(estimation, "give_back", lambda: given.append(True))
-    worker, rng = EstimationWorker(), np.random.default_rng(1)
+    worker, rng = SlamWorker(), np.random.default_rng(1)
     config = SlamConfig(mapper=MapperConfig(most_keys=10))
     worker.step(WorkerInput(start=Start(config, tuple(pose_at(0).tolist()))))
-    thinned = 0
+    pruned = 0
     for i in range(100):
         estimate = worker.step(WorkerInput(scan=scan_at(i, rng))).estimate
         assert estimate is not None
-        thinned += "thinned" in estimate.events
-        assert len(given) == thinned
-    assert thinned > 2
+        pruned += "pruned" in estimate.events
+        assert len(given) == pruned
+    assert pruned > 2
 
 
 def test_a_saved_map_reads_back(saved: Path):
@@ -95,7 +95,7 @@ def test_a_saved_map_reads_back(saved: Path):
     assert loaded.graph is not None
     assert len(loaded.graph.scans) == len(loaded.graph.poses) > 10
     again = saved.parent / "again"
-    patch = storage.Patch(loaded.grid.cells, loaded.grid.origin, loaded.grid.resolution)
+    patch = storage.GridPatch(loaded.grid.cells, loaded.grid.origin, loaded.grid.resolution)
     storage.save(again, patch, loaded.graph)
     assert np.array_equal(storage.load(again).grid.cells, loaded.grid.cells)
     other = storage.load(again).graph
@@ -122,14 +122,14 @@ def test_a_damaged_graph_is_refused_by_name(saved: Path, tmp_path: Path, harm: s
 @pytest.mark.parametrize("begin", [0, 40, 90])
 @pytest.mark.parametrize("odom", [True, False])
 def test_a_kidnapped_robot_finds_itself(saved: Path, begin: int, odom: bool):
-    worker, rng = EstimationWorker(), np.random.default_rng(2)
+    worker, rng = SlamWorker(), np.random.default_rng(2)
     worker.step(WorkerInput(start=Start(SlamConfig(mode="localisation", map=saved))))
     last: WorkerOutput | None = None
     for i in range(begin, begin + 30):
         last = worker.step(WorkerInput(scan=scan_at(i, rng, odom=odom)))
     assert last is not None
     assert last.estimate is not None
-    assert last.estimate.standing in (Standing.LOCALISED, Standing.DEGENERATE)
+    assert last.estimate.status in (LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE)
     assert np.hypot(*(np.array(last.estimate.pose[:2]) - pose_at(begin + 29)[:2])) < 0.08
 
 
@@ -148,7 +148,7 @@ def _bad(kind: str, good: ScanInput) -> ScanInput:
 
 @pytest.mark.parametrize("kind", ["empty", "no returns", "nan", "two points", "backwards", "twice", "geometry"])
 def test_bad_scans_are_left_out_with_a_reason_and_nothing_jumps(kind: str):
-    worker, rng = EstimationWorker(), np.random.default_rng(3)
+    worker, rng = SlamWorker(), np.random.default_rng(3)
     worker.step(WorkerInput(start=Start(SlamConfig(), tuple(pose_at(0).tolist()))))
     for i in range(20):
         worker.step(WorkerInput(scan=scan_at(i, rng)))
@@ -179,11 +179,11 @@ def test_ground_and_ceiling_are_discarded_and_the_rest_levelled():
     nose_down = replace(
         flat, ranges=np.full(400, 4.0), slopes=plane_slopes(0.0, math.radians(5)), height=0.2, ceiling=0.5
     )
-    ranges = levelled(nose_down)
+    ranges = level_ranges(nose_down)
     ahead, behind = np.argmin(np.abs(ANGLES)), np.argmin(np.abs(ANGLES - 2.1))
     assert np.isnan(ranges[ahead])
     assert ranges[behind] == pytest.approx(4.0, abs=0.02)
-    assert np.isnan(levelled(replace(nose_down, slopes=plane_slopes(0.0, -math.radians(5))))[ahead])
+    assert np.isnan(level_ranges(replace(nose_down, slopes=plane_slopes(0.0, -math.radians(5))))[ahead])
 
 
 def test_the_slopes_are_those_of_the_plane():
@@ -193,13 +193,13 @@ def test_the_slopes_are_those_of_the_plane():
 
 
 def test_a_correction_is_approached_without_a_jump_and_a_great_one_at_once():
-    correction = Correction((0.3, 0.5), 1.0)
+    correction = SmoothedCorrection((0.3, 0.5), 1.0)
     base = (10.0, 5.0, 1.0)
     assert correction.pose(base, 0.02) == pytest.approx(base)
-    correction.aim((0.1, 0.0, 0.02))
+    correction.set_target((0.1, 0.0, 0.02))
     poses = [correction.pose(base, 0.02) for _ in range(100)]
     steps = np.hypot(*np.diff(np.array([base, *poses])[:, :2], axis=0).T)
     assert 0 < steps.max() <= 0.3 * 0.02 + 1e-9
-    assert correction.shown == pytest.approx((0.1, 0.0, 0.02))
-    correction.aim((5.0, 0.0, 0.0))
+    assert correction.value == pytest.approx((0.1, 0.0, 0.02))
+    correction.set_target((5.0, 0.0, 0.0))
     assert correction.pose(base, 0.02) == pytest.approx((15.0, 5.0, 1.0))

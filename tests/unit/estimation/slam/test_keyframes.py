@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between
-from monstertruck_estimation.slam.keyframes import Trail
+from monstertruck_estimation.slam.keyframes import Trajectory
 
 
-def straight(count: int = 9, every: int = 4) -> tuple[Trail, np.ndarray]:
-    """Scans 1 m apart, every fourth one a key scan; and the key scans."""
+def straight(count: int = 9, every: int = 4) -> tuple[Trajectory, np.ndarray]:
+    """Scans 1 m apart, every fourth one a keyframe; and the keyframes."""
     poses = np.column_stack((np.arange(float(count)), np.zeros(count), np.zeros(count)))
     keys = poses[::every]
-    trail = Trail(1000)
+    trail = Trajectory(1000)
     for k, pose in enumerate(poses):
         if k and k % every == 0:
             trail.append(k, k // every - 1, between(keys[k // every - 1], pose))

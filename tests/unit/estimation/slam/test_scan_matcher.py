@@ -5,9 +5,9 @@ import pytest
 
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
-from monstertruck_estimation.slam.frontend import Planar, Verdict
-from monstertruck_estimation.slam.kiss import Kiss
+from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, register
+from monstertruck_estimation.slam.scan_matcher import MatchStatus, PlanarMatcher
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
 from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, scan
 
@@ -70,7 +70,7 @@ def test_nothing_scores_where_nothing_is():
 @pytest.mark.parametrize("off", [(0.3, -0.2, 0.25), (-0.5, 0.4, -0.3), (0.0, 0.0, 0.0)])
 def test_the_front_end_finds_the_scan_in_the_window_of_its_uncertainty(off):
     submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
-    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + off, WIDE, submap)
+    match = PlanarMatcher().match(scan(ROOM, PLACE), np.zeros(3), PLACE + off, WIDE, submap)
     assert match.accepted
     assert match.pose == pytest.approx(PLACE, abs=0.01)
     assert not match.degenerate
@@ -79,7 +79,7 @@ def test_the_front_end_finds_the_scan_in_the_window_of_its_uncertainty(off):
 def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
     submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
     tight = np.diag((0.03**2, 0.03**2, 0.08**2))
-    match = Planar().locate(scan(ROOM, PLACE), np.zeros(3), PLACE + np.array((0.02, 0.01, 0.45)), tight, submap)
+    match = PlanarMatcher().match(scan(ROOM, PLACE), np.zeros(3), PLACE + np.array((0.02, 0.01, 0.45)), tight, submap)
     assert match.accepted
     assert match.pose == pytest.approx(PLACE, abs=0.01)
 
@@ -87,7 +87,7 @@ def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
 def test_a_corridor_is_told_and_leaves_the_way_along_it_to_the_wheels():
     submap = seen_from(CORRIDOR, (0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
     guess = np.array((0.9, 0.0, 0.03))
-    match = Planar().locate(
+    match = PlanarMatcher().match(
         scan(CORRIDOR, (0.6, 0.1, 0.0)), np.zeros(3), guess, np.diag((0.05**2, 0.05**2, 0.05**2)), submap
     )
     assert match.accepted
@@ -101,8 +101,8 @@ def test_a_foreign_scan_is_rejected_and_the_guess_stands():
     submap = seen_from(ROOM, PLACE)
     hexagon = np.array([(math.cos(a), math.sin(a)) for a in np.arange(7) * math.pi / 3])
     walls = [(tuple(a), tuple(b)) for a, b in zip(0.4 * hexagon[:-1], 0.4 * hexagon[1:], strict=True)]
-    match = Planar().locate(scan(walls, (0.0, 0.0, 0.0)), np.zeros(3), PLACE, np.diag((1e-3, 1e-3, 1e-3)), submap)
-    assert match.verdict in {Verdict.OVERLAP, Verdict.EMPTY}
+    match = PlanarMatcher().match(scan(walls, (0.0, 0.0, 0.0)), np.zeros(3), PLACE, np.diag((1e-3, 1e-3, 1e-3)), submap)
+    assert match.verdict in {MatchStatus.OVERLAP, MatchStatus.EMPTY}
     assert match.pose == pytest.approx(PLACE)
 
 
@@ -111,21 +111,21 @@ def test_a_handful_of_points_is_no_scan(count):
     values = np.full(181, np.inf)
     values[:count] = 1.0
     few = prepare(values, ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0))
-    match = Planar().locate(few, np.zeros(3), PLACE, WIDE, seen_from(ROOM, PLACE))
-    assert match.verdict is Verdict.EMPTY
+    match = PlanarMatcher().match(few, np.zeros(3), PLACE, WIDE, seen_from(ROOM, PLACE))
+    assert match.verdict is MatchStatus.EMPTY
     assert match.pose == pytest.approx(PLACE)
     assert np.array_equal(match.covariance, WIDE)
 
 
 def test_kiss_is_judged_like_the_other():
-    front = Kiss()
+    front = KissMatcher()
     submap = seen_from(ROOM, PLACE, PLACE + np.array((0.0, 0.4, 0.3)))
-    first = front.locate(scan(ROOM, PLACE), np.zeros(3), PLACE, WIDE, submap)
+    first = front.match(scan(ROOM, PLACE), np.zeros(3), PLACE, WIDE, submap)
     assert first.accepted
     moved = np.array((0.1, 0.0, 0.05))
     wrong = moved + np.array((0.02, 0.01, -0.02))
-    second = front.locate(scan(ROOM, compose(PLACE, moved)), wrong, compose(PLACE, wrong), WIDE, submap)
+    second = front.match(scan(ROOM, compose(PLACE, moved)), wrong, compose(PLACE, wrong), WIDE, submap)
     assert second.accepted
     assert np.hypot(*between(PLACE, second.pose)[:2] - moved[:2]) < 0.03
-    away = front.locate(scan(CORRIDOR, (0.0, 0.5, 0.6)), moved, compose(PLACE, moved), WIDE / 100, submap)
+    away = front.match(scan(CORRIDOR, (0.0, 0.5, 0.6)), moved, compose(PLACE, moved), WIDE / 100, submap)
     assert not away.accepted

@@ -1,7 +1,7 @@
-"""Front end over kiss-icp: its point-to-point ICP on a voxel map, seeded by the wheels and judged by us.
+"""Scan matcher over kiss-icp: its point-to-point ICP on a voxel map, started at the predicted pose.
 
-All points are kept: the package's own second downsampling leaves too few of a planar scan. It tells neither a score nor
-a failure, so every result is registered once more by the common measure (overlap, residual, information) and gated.
+All points are kept: the package's own second downsampling leaves too few of a planar scan. It returns neither a score
+nor a failure, so every result is measured as ours are (overlap, residual, information) and passes the same gate.
 """
 
 from typing import Final
@@ -13,15 +13,15 @@ from kiss_icp.registration import get_registration
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.correlation import Submap
-from monstertruck_estimation.slam.frontend import LEAST_PAIRS, Match, Verdict, judge, rejected
 from monstertruck_estimation.slam.registration import measure
+from monstertruck_estimation.slam.scan_matcher import MIN_PAIRS, MatchStatus, ScanMatch, gated, rejected
 from monstertruck_estimation.slam.scans import Scan
 
 Array = NDArray[np.float64]
 
 VOXEL: Final = 0.1
 """Edge of the voxels of its map, m."""
-FARTHEST: Final = 100.0
+MAX_CORRECTION: Final = 100.0
 """Points of the map farther away are forgotten by the package, m."""
 PER_VOXEL: Final = 20
 REACH: Final = 0.5
@@ -30,20 +30,20 @@ KERNEL: Final = 0.1
 """Distance at which a pair's influence drops, m."""
 
 
-class Kiss:
-    """See ``FrontEnd``; the map it registers to is the mapper's submap, so that loop closures move it too."""
+class KissMatcher:
+    """See ``ScanMatcher``; the map it registers to is the mapper's submap, so that loop closures move it too."""
 
     def __init__(self) -> None:
         config = KISSConfig()
         config.registration.max_num_threads = 1
         self._registration = get_registration(config)
-        self._map = VoxelHashMap(VOXEL, FARTHEST, PER_VOXEL)
+        self._map = VoxelHashMap(VOXEL, MAX_CORRECTION, PER_VOXEL)
         self._submap: Submap | None = None
 
-    def locate(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> Match:
-        """See ``FrontEnd``."""
-        if len(scan) < LEAST_PAIRS or len(submap.cloud) < LEAST_PAIRS:
-            return rejected(guess, covariance, Verdict.EMPTY)
+    def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
+        """See ``ScanMatcher``."""
+        if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
+            return rejected(guess, covariance, MatchStatus.EMPTY)
         if submap is not self._submap:
             self._submap = submap
             self._map.clear()
@@ -57,8 +57,8 @@ class Kiss:
         )
         pose = np.array((found[0, 3], found[1, 3], np.arctan2(found[1, 0], found[0, 0])))
         if not np.isfinite(pose).all():
-            return rejected(guess, covariance, Verdict.FAR)
-        return judge(measure(scan, submap.cloud, pose), guess, covariance)
+            return rejected(guess, covariance, MatchStatus.FAR)
+        return gated(measure(scan, submap.cloud, pose), guess, covariance)
 
 
 def _spatial(points: Array) -> Array:

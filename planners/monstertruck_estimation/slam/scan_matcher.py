@@ -1,0 +1,179 @@
+"""Scan matchers: the pose of a scan in a submap, given a predicted pose; every result passes the same gate."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.correlation import Submap, correlate
+from monstertruck_estimation.slam.registration import Fit, register
+from monstertruck_estimation.slam.scans import Scan
+
+Array = NDArray[np.float64]
+
+MIN_PAIRS: Final = 12
+"""Fewest corresponding pairs of an accepted match."""
+MIN_OVERLAP: Final = 0.35
+"""Least share of a scan's points that fit the submap, of an accepted match."""
+MIN_SCORE: Final = 0.2
+"""Least mean likelihood of a result of the correlative search."""
+WINDOW: Final = 3.0
+"""Half width of the correlative search in standard deviations of the predicted pose."""
+MARGIN: Final = 0.15
+"""Added to it, m: stamps of odometry and scans disagree."""
+MAX_WINDOW: Final = (2.0, 1.6)
+"""Greatest half width of the search, m and rad."""
+GATE: Final = 6.0
+"""Gate: a match further from the predicted pose than this many standard deviations (Mahalanobis) is rejected."""
+GATE_LOW_OVERLAP: Final = 3.0
+"""The gate for matches that overlap less than ``LOW_OVERLAP``."""
+LOW_OVERLAP: Final = 0.6
+"""Matches that overlap less are compared with a result of the wide search."""
+WIDE_MIN_OVERLAP: Final = 0.5
+"""Least overlap of a result of the wide search,"""
+WIDE_OVERLAP_GAIN: Final = 0.15
+"""and how much more than the first match it must overlap."""
+WIDE_FACTOR: Final = 3.0
+"""Factor on the standard deviation of the predicted pose in the wide search."""
+COARSE_POINTS: Final = 160
+"""Points of a scan used in the correlative search."""
+LEVELS: Final = 4
+"""Levels of its likelihood pyramid."""
+DEGENERATE_RATIO: Final = 0.03
+"""A match is degenerate (a corridor) below this ratio of the eigenvalues of the information on the position."""
+
+
+class MatchStatus(StrEnum):
+    """Why a match was accepted or rejected."""
+
+    ACCEPTED = "accepted"
+    EMPTY = "empty"
+    OVERLAP = "overlap"
+    FAR = "far"
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMatch:
+    """Pose of a scan in a submap, with its uncertainty and quality."""
+
+    pose: Array
+    """Shape (3,), m and rad; the guess if the match is rejected."""
+    covariance: Array
+    """Shape (3, 3), of ``pose``; the guess's if the match is rejected."""
+    overlap: float
+    """Share of the points that fit, 0..1."""
+    residual: float
+    """Root mean square distance across the surfaces, m."""
+    degeneracy: float
+    """Smaller eigenvalue of the information on the position over the greater one, 0..1: near 0 in a corridor."""
+    direction: float
+    """Yaw of the weakest direction in the submap's frame, rad, in [-pi/2, pi/2]."""
+    verdict: MatchStatus
+    information: Array | None = None
+    """Shape (3, 3), inverse covariance by the scan alone, without the guess; None if the match is rejected."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the match passed the gate; otherwise its pose is the predicted one."""
+        return self.verdict is MatchStatus.ACCEPTED
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether the scan does not constrain the position along ``direction``."""
+        return self.degeneracy < DEGENERATE_RATIO
+
+
+class ScanMatcher(Protocol):
+    """Registers scans; may keep a map of its own."""
+
+    def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
+        """Pose of ``scan`` in the submap's frame.
+
+        Args:
+            scan: points in base.
+            delta: shape (3,), predicted motion of the base since the last scan.
+            guess: shape (3,), pose predicted by it in the submap's frame.
+            covariance: shape (3, 3), of ``guess``.
+            submap: the map around the predicted pose.
+        """
+        ...
+
+
+class PlanarMatcher:
+    """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
+
+    A match that is rejected or overlaps little is repeated in a window ``WIDE_FACTOR`` times as wide, because wheels
+    slip further than their covariance; its result must overlap more (``WIDE_MIN_OVERLAP``).
+    """
+
+    def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
+        """See ``ScanMatcher``."""
+        if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
+            return rejected(guess, covariance, MatchStatus.EMPTY)
+        match = self._match_in_window(scan, guess, covariance, submap)
+        if match.accepted and match.overlap >= LOW_OVERLAP:
+            return match
+        least = match.overlap + WIDE_OVERLAP_GAIN if match.accepted else 0.0
+        again = self._match_in_window(scan, guess, covariance * WIDE_FACTOR**2, submap)
+        if again.accepted and again.overlap >= max(WIDE_MIN_OVERLAP, least):
+            return again
+        return match
+
+    def _match_in_window(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
+        deviation = deviations(covariance)
+        window = min(WINDOW * deviation[0] + MARGIN, MAX_WINDOW[0]), min(WINDOW * deviation[1], MAX_WINDOW[1])
+        prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), COARSE_POINTS)).astype(np.intp)]
+        peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, MIN_SCORE)
+        fit = register(scan, submap.cloud, guess, prior)
+        if peak is not None:
+            other = register(scan, submap.cloud, guess, prior, start=peak.pose)
+            if other.cost < fit.cost:
+                fit = other
+        return gated(fit, guess, covariance)
+
+
+def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
+    """Accept or reject a fit whose predicted pose was ``guess``, of ``covariance`` (shape (3, 3))."""
+    ratio, direction = degeneracy(fit.information)
+    verdict = MatchStatus.ACCEPTED
+    off = fit.pose - guess
+    off[2] = math.remainder(off[2], math.tau)
+    if fit.pairs < MIN_PAIRS:
+        verdict = MatchStatus.EMPTY
+    elif fit.overlap < MIN_OVERLAP:
+        verdict = MatchStatus.OVERLAP
+    elif (
+        float(off @ np.linalg.solve(covariance, off)) > (GATE if fit.overlap >= LOW_OVERLAP else GATE_LOW_OVERLAP) ** 2
+    ):
+        verdict = MatchStatus.FAR
+    posterior = np.linalg.inv(fit.information + np.linalg.inv(covariance))
+    if verdict is not MatchStatus.ACCEPTED:
+        return ScanMatch(guess, covariance, fit.overlap, fit.residual, ratio, direction, verdict)
+    return ScanMatch(fit.pose, posterior, fit.overlap, fit.residual, ratio, direction, verdict, fit.information)
+
+
+def rejected(guess: Array, covariance: Array, verdict: MatchStatus) -> ScanMatch:
+    """A rejected match: its pose is the guess."""
+    return ScanMatch(guess, covariance, 0.0, 0.0, 0.0, 0.0, verdict)
+
+
+def deviations(covariance: Array) -> tuple[float, float]:
+    """Greatest standard deviation of the position (m) and that of the yaw (rad)."""
+    (a, b), (_, d) = covariance[:2, :2].tolist()
+    greatest = (a + d) / 2 + math.hypot((a - d) / 2, b)
+    return math.sqrt(max(greatest, 0.0)), math.sqrt(max(float(covariance[2, 2]), 0.0))
+
+
+def degeneracy(information: Array) -> tuple[float, float]:
+    """Ratio of the eigenvalues of the information on the position (the yaw unknown); yaw of the weakest direction."""
+    by_yaw = max(float(information[2, 2]), 1e-9)
+    position = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / by_yaw
+    values, vectors = np.linalg.eigh(position)
+    if values[1] <= 0:
+        return 0.0, 0.0
+    yaw = math.atan2(vectors[1, 0], vectors[0, 0])
+    return max(float(values[0] / values[1]), 0.0), math.remainder(yaw, math.pi)
