@@ -14,9 +14,8 @@ import heapq
 import selectors
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Coroutine
-from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
+from typing import Any, Final, NamedTuple, Protocol, TypeVar, TypeVarTuple
 
 import uvloop
 
@@ -30,9 +29,6 @@ MILLISECOND: Final = SECOND // 1000
 
 MANY_TIMERS: Final = 100
 """From so many on, cancelled timers are cleared away."""
-
-LONGEST_JUMP: Final = 86_400.0
-"""Seconds that a virtual loop waits at a time, as asyncio's own."""
 
 
 class Clock(Protocol):
@@ -108,33 +104,26 @@ class WallClock(_LoopClock):
 class VirtualLoop(asyncio.SelectorEventLoop):
     """Event loop whose time jumps to the next timer when nothing is ready.
 
-    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run. The
-    kernel is asked only when another thread has woken the loop, when files beside its own wake-up pipe are watched, or
-    when there is no timer to jump to.
+    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run.
 
     Args:
         start: first instant, ns.
         rate: greatest speed relative to real time; ``None`` runs as fast as it can.
     """
 
-    _ready: deque[asyncio.Handle]
-    _stopping: bool
-    _clock_resolution: float
-    _timer_cancelled_count: int
-
     def __init__(self, start: int = 0, rate: float | None = None) -> None:
         self.instant = start
         """Virtual nanoseconds."""
+        self.woken = False
+        """Another thread has added a callback."""
         self._real_start = time.monotonic_ns()
         self._start = start
         self._rate = rate
-        self._timers: list[tuple[float, int, asyncio.TimerHandle]] = []
-        """Heap of (when in s, number in the order of setting, handle)."""
+        self._timers: list[_Timer] = []
+        """A heap."""
         self._timers_set = 0
-        self._woken = False
-        """Another thread has something for the loop."""
-        self._watcher = _CountingSelector()
-        super().__init__(self._watcher)
+        self._most_timers = MANY_TIMERS
+        super().__init__(_VirtualSelector(self))
 
     def time(self) -> float:
         """Virtual seconds."""
@@ -144,52 +133,29 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.TimerHandle:
         """As in asyncio, but first set, first fired."""
-        timer = asyncio.TimerHandle(when, callback, args, self, context)
-        heapq.heappush(self._timers, (when, self._timers_set, timer))
+        if len(self._timers) > self._most_timers:
+            self._timers = [timer for timer in self._timers if not timer.handle.cancelled()]
+            heapq.heapify(self._timers)
+            self._most_timers = 2 * len(self._timers) + MANY_TIMERS
+        context = contextvars.copy_context() if context is None else context
+        handle = asyncio.TimerHandle(when, callback, args, self, context)
+        heapq.heappush(self._timers, _Timer(when, self._timers_set, handle, callback, args, context))
         self._timers_set += 1
-        timer._scheduled = True  # type: ignore[attr-defined]  # noqa: SLF001  # the loop's own mark: it counts those cancelled
-        return timer
+        return handle
 
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
         """As in asyncio; also notes that the kernel has to be asked."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
-        self._woken = True
+        self.woken = True
         return handle
 
-    def _run_once(self) -> None:
-        """One turn, in asyncio's order: events, timers, then all that is ready now."""
-        timers, ready = self._timers, self._ready
-        self._drop_cancelled()
-        idle = not ready and not self._stopping
-        events: list[tuple[selectors.SelectorKey, int]] = []
-        if self._woken or self._watcher.count > 1 or (idle and not timers):
-            self._woken = False
-            events = self._watcher.select(None if idle and not timers else 0)
-            self._process_events(events)  # type: ignore[attr-defined]
-        if idle and timers and not events and (wait := timers[0][0] - self.time()) > 0:
-            self.jump(min(wait, LONGEST_JUMP))
-        end = self.instant / SECOND + self._clock_resolution
-        while timers and timers[0][0] < end:
-            timer = heapq.heappop(timers)[2]
-            timer._scheduled = False  # type: ignore[attr-defined]  # noqa: SLF001
-            ready.append(timer)
-        for _ in range(len(ready)):
-            handle = ready.popleft()
-            if not handle._cancelled:  # noqa: SLF001
-                handle._run()  # noqa: SLF001
-
-    def _drop_cancelled(self) -> None:
-        """Forget cancelled timers that are next, or all once they are the majority of many."""
-        timers = self._timers
-        if len(timers) > MANY_TIMERS and self._timer_cancelled_count > len(timers) / 2:
-            timers[:] = [entry for entry in timers if not entry[2].cancelled()]
-            heapq.heapify(timers)
-            self._timer_cancelled_count = 0
-        while timers and timers[0][2]._cancelled:  # noqa: SLF001
-            heapq.heappop(timers)
-            self._timer_cancelled_count -= 1
+    def next_timer(self) -> float | None:
+        """Seconds until the next timer that is not cancelled; None without one."""
+        while self._timers and self._timers[0].handle.cancelled():
+            heapq.heappop(self._timers)
+        return self._timers[0].when - self.time() if self._timers else None
 
     def jump(self, seconds: float) -> None:
         """Advance by ``seconds``.
@@ -201,21 +167,53 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             due = self._real_start + int((self.instant - self._start) / self._rate)
             time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
 
+    def fire(self) -> None:
+        """Hand the timers that are due to this turn of the loop."""
+        end = self.time() + 1 / SECOND
+        while self._timers and self._timers[0].when < end:
+            timer = heapq.heappop(self._timers)
+            self.call_soon(timer.run, context=timer.context)
 
-class _CountingSelector(selectors.DefaultSelector):
-    """Knows how many files are watched."""
 
-    count = 0
+class _Timer(NamedTuple):
+    """Entry of a loop's heap, by instant and then by number in the order of setting."""
 
-    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
-        key = super().register(fileobj, events, data)
-        self.count += 1
-        return key
+    when: float
+    """Seconds."""
+    number: int
+    handle: asyncio.TimerHandle
+    callback: Callable[..., object]
+    args: tuple[Any, ...]
+    context: contextvars.Context
 
-    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
-        key = super().unregister(fileobj)
-        self.count -= 1
-        return key
+    def run(self) -> None:
+        if not self.handle.cancelled():
+            self.callback(*self.args)
+
+
+class _VirtualSelector(selectors.DefaultSelector):
+    """Where asyncio waits, once each turn of a loop: it knows of no timers, so for ever if nothing is ready.
+
+    The kernel is asked only when another thread has woken the loop, when files beside its own wake-up pipe are watched,
+    or when there is no timer to jump to.
+    """
+
+    def __init__(self, loop: VirtualLoop) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Events of files; without any, an idle loop's time jumps."""
+        loop = self._loop
+        idle, wait = timeout is None, loop.next_timer()
+        events: list[tuple[selectors.SelectorKey, int]] = []
+        if loop.woken or len(self.get_map()) > 1 or (idle and wait is None):
+            loop.woken = False
+            events = super().select(timeout if wait is None else 0)
+        if idle and wait is not None and not events and wait > 0:
+            loop.jump(wait)
+        loop.fire()
+        return events
 
 
 class VirtualClock(_LoopClock):

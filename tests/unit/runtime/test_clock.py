@@ -1,6 +1,8 @@
 """The virtual loop jumps; deadlines, ordering and determinism hold on it."""
 
 import asyncio
+import socket
+import weakref
 
 import pytest
 
@@ -89,3 +91,54 @@ def test_another_thread_reaches_the_loop_with_and_without_timers():
         return with_timers, await asyncio.to_thread(lambda: "b")
 
     assert run_virtual(main) == ("a", "b")
+
+
+def test_a_timer_cancelled_at_its_own_instant_does_not_fire():
+    async def main(clock: VirtualClock) -> list[str]:
+        fired: list[str] = []
+        loop = asyncio.get_running_loop()
+        due = loop.time() + 1
+        loop.call_at(due, lambda: second.cancel())
+        second = loop.call_at(due, fired.append, "second")
+        loop.call_at(due, fired.append, "third")
+        await clock.sleep(2)
+        return fired
+
+    assert run_virtual(main) == ["third"]
+
+
+def test_time_does_not_stop_at_cancelled_timers_and_they_are_let_go():
+    class Held:
+        pass
+
+    async def main(clock: VirtualClock) -> tuple[int, int]:
+        start = clock.now()
+        loop = asyncio.get_running_loop()
+        held: weakref.WeakSet[Held] = weakref.WeakSet()
+        for _ in range(1000):
+            thing = Held()
+            held.add(thing)
+            loop.call_later(1800, lambda thing: None, thing).cancel()
+        kept = len(held)
+        await clock.sleep(3600)
+        return clock.now() - start, kept
+
+    slept, kept = run_virtual(main)
+    assert 3600 * SECOND <= slept <= 3600 * SECOND + 1
+    assert kept < 200
+
+
+def test_watched_files_are_heard_while_timers_run():
+    async def main(clock: VirtualClock) -> bytes:
+        near, far = socket.socketpair()
+        with near, far:
+            near.setblocking(False)
+            ticking = asyncio.create_task(clock.sleep(1e6))
+            received = asyncio.create_task(asyncio.get_running_loop().sock_recv(near, 5))
+            await clock.sleep(1)
+            far.send(b"hello")
+            data = await received
+            ticking.cancel()
+            return data
+
+    assert run_virtual(main) == b"hello"
