@@ -24,7 +24,8 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_schemas.topics import BY_NAME, TOPICS
 from monstertruckd.config.load import load_config
-from monstertruckd.recorder import BlackBox, BlackBoxConfig
+from monstertruckd.recorder.black_box import BlackBox
+from monstertruckd.recorder.config import BlackBoxConfig
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.rig import VirtualRig

@@ -42,9 +42,9 @@ from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import CAMERA, POSE, SCAN, Topic
 from monstertruckd.recorder.config import Compression, RecorderConfig
-from monstertruckd.recorder.file import LogFile
+from monstertruckd.recorder.log_file import LogFile
 from monstertruckd.recorder.recorder import Recorder
-from monstertruckd.recorder.recover import recover
+from monstertruckd.recorder.repair import recover
 
 GOALS = {"cpu_over_rosbag": 1.0, "cpu_s_per_1000": 0.018, "stall_ms": 1.0, "unreadable": 0, "worst_loss_s": 1.0}
 RATES = {POSE: 100, SCAN: 10, CAMERA: 2}

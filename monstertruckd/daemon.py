@@ -52,8 +52,7 @@ from monstertruckd.host.notify import notify_from, status_line
 from monstertruckd.host.stall import StallWatch
 from monstertruckd.host.versions import running_versions
 from monstertruckd.recorder.black_box import BlackBox
-from monstertruckd.recorder.digest import LogDigest
-from monstertruckd.recorder.recorder import Recorder
+from monstertruckd.recorder.recorder import LogDigest, Recorder
 
 
 class Daemon:

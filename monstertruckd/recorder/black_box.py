@@ -1,8 +1,10 @@
-"""The black box: the minute before every trip of the gate, and a few seconds after it, as one MCAP file."""
+"""The folder of black boxes: names, listing, quota."""
 
 import asyncio
 import errno
 import logging
+import os
+import re
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,18 +22,104 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
-from monstertruckd.recorder.boxes import BoxFolder
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
-from monstertruckd.recorder.file import Entry, LogFile, disk_reason
-from monstertruckd.recorder.ring import Ring, Snapshot, Span
+from monstertruckd.recorder.log_file import Entry, LogFile, disk_reason
+from monstertruckd.recorder.ring import Retention, Ring, Snapshot
 
 log = logging.getLogger(__name__)
+
+PART: Final = ".part"
+"""Ends the name of a file that is being written."""
+
+_NAME: Final = re.compile(r"blackbox-(\d{6,})-([a-z_]+)\.mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBoxFile:
+    """One black box."""
+
+    path: Path
+    number: int
+    """Counts the folder's boxes over all runs."""
+    reason: str
+    """What tripped the gate."""
+    size: int
+    """Bytes."""
+
+
+def black_boxes(directory: Path) -> list[BlackBoxFile]:
+    """The finished black boxes of a folder, oldest first; none if it is not there.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    if not directory.exists():
+        return []
+    named = ((path, _NAME.fullmatch(path.name)) for path in directory.iterdir())
+    boxes = [BlackBoxFile(path, int(name[1]), name[2], path.stat().st_size) for path, name in named if name is not None]
+    return sorted(boxes, key=lambda box: box.number)
+
+
+class BlackBoxFolder:
+    """Names boxes and keeps their sum within a quota. Its methods that touch the disk raise ``OSError``.
+
+    Args:
+        directory: made when missing.
+        quota: bytes; the newest box of each reason stays even beyond them.
+    """
+
+    def __init__(self, directory: Path, quota: int) -> None:
+        self.directory = directory
+        self._quota = quota
+        self._number = 0
+
+    def scan(self) -> None:
+        """Go on with the numbers of earlier runs, and remove what they left unfinished."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for path in self.directory.glob(f"*{PART}"):
+            path.unlink(missing_ok=True)
+        self._number = max((box.number for box in black_boxes(self.directory)), default=0)
+
+    def next_name(self, reason: Reason) -> str:
+        """Name of the next box; touches nothing."""
+        self._number += 1
+        return f"blackbox-{self._number:06d}-{reason.value}.mcap"
+
+    def begin(self, name: str) -> Path:
+        """Where to write the box until it is complete."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        part = self.directory / (name + PART)
+        part.unlink(missing_ok=True)
+        return part
+
+    def finish(self, name: str) -> Path:
+        """Give the complete box its name, durably, and remove old ones beyond the quota."""
+        path = self.directory / name
+        (self.directory / (name + PART)).replace(path)
+        folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+        self._keep_quota()
+        return path
+
+    def _keep_quota(self) -> None:
+        boxes = black_boxes(self.directory)
+        newest = {box.reason: box.number for box in boxes}
+        excess = sum(box.size for box in boxes) - self._quota
+        for box in boxes:
+            if excess > 0 and newest[box.reason] != box.number:
+                box.path.unlink(missing_ok=True)
+                log.info("removed %s: black boxes exceed %d bytes", box.path, self._quota)
+                excess -= box.size
+
 
 BATCH: Final = 8
 """Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
 PAUSE: Final = 0.001
 """Seconds between two batches, for the control loop."""
-CHUNK: Final = 64 * 1024
+CHUNK_SIZE: Final = 64 * 1024
 """Bytes compressed at once; more takes longer."""
 
 
@@ -61,16 +149,16 @@ class _Pending:
 class BlackBox:
     """Keeps the newest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
 
-    Every trip lies in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
+    Every trip is in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
     less than ``interval`` ago, in one that is written later. A box that waits when the body ends is written before the
-    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow costs
-    the box, is told, and nothing else happens.
+    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses
+    the box, which is reported, and has no other effect.
 
     Args:
         config: spans and limits.
         directory: where the boxes go.
         clock: daemon time.
-        events: told of every box that was saved or lost.
+        events: where saved and lost boxes are reported.
         attachments: JSON-able values in every box, as ``<name>.json``.
         metadata: text about the run, in every box.
         offload: where boxes are written.
@@ -95,10 +183,10 @@ class BlackBox:
         self._attachments = attachments
         self._metadata = metadata
         self._offload = offload
-        self._folder = BoxFolder(directory, config.quota_bytes)
+        self._folder = BlackBoxFolder(directory, config.quota_bytes)
         window = config.before + config.after
         self.ring = Ring(
-            Span(window, max(window, config.journal), config.pictures + config.after, config.picture_period),
+            Retention(window, max(window, config.journal), config.pictures + config.after, config.picture_period),
             config.memory_bytes,
         )
         self._sequences = {topic.name: 0 for topic in TOPICS}
@@ -116,7 +204,7 @@ class BlackBox:
     async def __aenter__(self) -> Self:
         self._loop_thread = threading.get_ident()
         try:
-            await self._offload(self._folder.look)
+            await self._offload(self._folder.scan)
         except OSError as error:
             self._failed(error, "no black boxes yet")
         self._taking = asyncio.create_task(self._take(), name=f"{self.name} taking")
@@ -153,7 +241,7 @@ class BlackBox:
         """Remember one encoded message.
 
         Args:
-            topic: its row of the table.
+            topic: its entry of the topic table.
             stamp: the message's own stamp, ns.
             payload: its bytes on the wire.
             at: when it was published, ns; None = now.
@@ -257,7 +345,7 @@ class BlackBox:
         part = self._folder.begin(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
-            file = LogFile(part, Compression.ZSTD, CHUNK, self._attachments, metadata, start)
+            file = LogFile(part, Compression.ZSTD, CHUNK_SIZE, self._attachments, metadata, start)
             try:
                 for count, entry in enumerate(entries):
                     if self._given_up.is_set():

@@ -1,7 +1,9 @@
-"""Reading MCAP logs front to back, finished or not."""
+"""Reading MCAP logs front to back, finished or not, with every checksum verified."""
 
 import itertools
 import json
+import os
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,10 +12,11 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
+import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema, Statistics
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
@@ -21,15 +24,100 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.framing import CHECKSUM, DAMAGE, MAGIC, index_is_sound, read_frame, read_statistics
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+DAMAGE: Final = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    RuntimeError,
+    LookupError,
+    MemoryError,
+    OverflowError,
+    OSError,
+)
+"""What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
+
+_END: Final = struct.Struct("<BQQQI8s")
+"""Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
+
+_FOOTER_LENGTH: Final = struct.calcsize("<QQI")
+_UNSUMMED: Final = struct.calcsize("<I8s")
+_HEAD: Final = struct.Struct("<BQ")
+"""Of a record: opcode, length of the content."""
+CHECKSUM: Final = struct.Struct("<I")
+_PIECE: Final = 1 << 20
+
+
+def is_finished(path: Path) -> bool:
+    """Whether the file ends as a finished log does."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(-min(size, len(MAGIC)), os.SEEK_END)
+        return size > len(MAGIC) and file.read() == MAGIC
+
+
+def index_is_sound(file: BinaryIO) -> bool:
+    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
+
+    Args:
+        file: of the log; its position is another one afterwards.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(-min(size, _END.size), os.SEEK_END)
+    end = file.read()
+    if len(end) < _END.size:
+        return False
+    opcode, length, start, _, checksum, magic = _END.unpack(end)
+    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size - _END.size:
+        return False
+    return not (start and checksum) or _checksum(file, start, size - _UNSUMMED) == checksum
+
+
+def _checksum(file: BinaryIO, begin: int, end: int) -> int:
+    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
+    file.seek(begin)
+    value = 0
+    for at in range(begin, end, _PIECE):
+        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
+    return value
+
+
+def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
+    """Opcode, head and content of the next record of a file of ``size`` bytes.
+
+    Raises:
+        EndOfFile: it is not all there.
+    """
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise EndOfFile
+    opcode, length = _HEAD.unpack(head)
+    if length > size - file.tell():
+        raise EndOfFile
+    return opcode, head, file.read(length)
+
+
+def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
+    """Of a sound index that begins where ``file`` stands; None if it has none."""
+    while True:
+        opcode, _, content = read_frame(file, size)
+        if opcode == Opcode.STATISTICS:
+            found: Statistics = Statistics.read(ReadDataStream(BytesIO(content)))
+            return found
+        if opcode == Opcode.FOOTER:
+            return None
+
 
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
 DAMAGED: Final = ".damaged"
-"""Behind the name of an attachment whose checksum is wrong: nobody takes it for what it was, and nothing is lost."""
+"""Appended to the name of an attachment whose checksum is wrong, so that it is not mistaken for a valid one."""
 
 _PRIVATE: Final = 0x80
-"""Opcodes from here on are anybody's; below, those that are no part of the data section come of damage."""
+"""Opcodes from here on are private ones; unknown ones below are damage."""
 _PLAIN: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -39,7 +127,7 @@ _PLAIN: Final[dict[int, Any]] = {
 
 
 def spare_log(output: Path) -> None:
-    """Make sure that what is to be written does not take the place of a log.
+    """Refuse to overwrite a log.
 
     Raises:
         InputError: there is a log under that name.
@@ -93,7 +181,7 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After an iteration to the end: why it did not give every message; None if it did, as far as can be told."""
+        """After an iteration to the end: why messages are missing; None if none is known to be."""
         self.flaws: list[str] = []
         """What else an iteration to the end found damaged; it costs no message."""
         self.position = 0
@@ -165,7 +253,7 @@ class LogReader:
                 yield record
 
     def _opened(self, opcode: int, content: bytes) -> Iterable[McapRecord]:
-        """What a record of the data section holds."""
+        """Records of one record of the data section (those of a chunk)."""
         stream = ReadDataStream(BytesIO(content))
         match opcode:
             case Opcode.CHUNK:
@@ -181,7 +269,7 @@ class LogReader:
         return ()
 
     def _checked(self, record: Attachment, content: bytes) -> Attachment:
-        """An attachment, by another name if its checksum, which mcap skips, is wrong."""
+        """An attachment, renamed if its checksum, which mcap does not verify, is wrong."""
         (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
         if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
             return record
@@ -191,7 +279,7 @@ class LogReader:
     def _end(
         self, file: BinaryIO, size: int, content: bytes, summed: int, given: Mapping[type[McapRecord], int]
     ) -> None:
-        """Hold what was given against the end of the data section and the index behind it."""
+        """Compare what was read with the end of the data section and the index after it."""
         (expected,) = CHECKSUM.unpack(content)  # of another length it was another record before its first byte flipped
         if expected not in (0, summed):
             raise McapError("checksum of the data section")
@@ -200,12 +288,12 @@ class LogReader:
             self.flaws.append("has a damaged index")
             return
         file.seek(begin)
-        told = read_statistics(file, size)
-        if told is None:
+        statistics = read_statistics(file, size)
+        if statistics is None:
             return
-        if given[McapMessage] != told.message_count:
-            self.damage = f"holds {given[McapMessage]} of {told.message_count} messages"
-        if (given[Attachment], given[Metadata]) != (told.attachment_count, told.metadata_count):
+        if given[McapMessage] != statistics.message_count:
+            self.damage = f"holds {given[McapMessage]} of {statistics.message_count} messages"
+        if (given[Attachment], given[Metadata]) != (statistics.attachment_count, statistics.metadata_count):
             self.flaws.append("lacks an attachment or metadata")
 
     def preamble(self) -> Iterator[McapRecord]:
@@ -218,7 +306,7 @@ class LogReader:
 
     @property
     def fault(self) -> str | None:
-        """All that an iteration to the end found wrong, to be read behind the log's name; None for a sound log."""
+        """Everything an iteration to the end found wrong, to follow the log's name; None for a sound log."""
         return ", ".join([*self.flaws, *([] if self.damage is None else [self.damage])]) or None
 
     @property

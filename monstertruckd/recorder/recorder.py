@@ -1,8 +1,10 @@
-"""The recorder: takes encoded messages on the event loop, writes them in a thread of its own."""
+"""The recorder: takes encoded messages on the event loop; its thread writes, rotates and keeps the quota."""
 
 import asyncio
+import hashlib
 import logging
 import queue
+import struct
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
@@ -11,17 +13,135 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
-from monstertruckd.recorder.digest import LogDigest
-from monstertruckd.recorder.file import Entry, disk_reason
-from monstertruckd.recorder.repair import start_repair
-from monstertruckd.recorder.writer import LogWriter
+from monstertruckd.recorder.log_file import Entry, LogFile, LogFolder, disk_reason
+from monstertruckd.recorder.repair import in_use, start_repair
+
+_DIGEST_FRAME = struct.Struct("<qII")
+
+
+class LogDigest:
+    """SHA-256 over (key, stamp, payload) of every logged message, in order."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def update(self, key: str, stamp: int, payload: bytes) -> None:
+        """Add one message; lengths are part of the digest, so no two runs share one by shifted borders."""
+        name = key.encode()
+        self._hash.update(_DIGEST_FRAME.pack(stamp, len(name), len(payload)) + name + payload)
+
+    def hexdigest(self) -> str:
+        """64 hexadecimal digits of all messages so far."""
+        return self._hash.hexdigest()
+
 
 log = logging.getLogger(__name__)
+
+
+class LogWriter:
+    """Writes entries into numbered files; a context manager that finishes the last one.
+
+    Args:
+        config: sizes, durations and folder.
+        attachments: JSON-able values attached to every file, by name.
+        metadata: text about the run, in every file.
+        start: log time the first file starts at, ns.
+
+    Raises:
+        OSError: from every method: the disk is full or refuses.
+    """
+
+    def __init__(
+        self, config: RecorderConfig, attachments: Mapping[str, Any], metadata: Mapping[str, str], start: int
+    ) -> None:
+        self._config = config
+        self._attachments = attachments
+        self._metadata = metadata
+        self._folder = LogFolder(Path(config.directory))
+        self._retained: dict[str, Entry] = {}
+        """Newest of every retained topic: the head of the next file, so that each file stands alone."""
+        self._file = self._open(start)
+        self._synced = start
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._file.path
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is None:
+            self._file.finish()
+        else:
+            self._file.abandon()
+
+    def write(self, entry: Entry) -> None:
+        """Add one message; closes chunk and file when they are due."""
+        self.tick(entry.log_time)
+        age = entry.log_time - self._file.start
+        if self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
+            self._file.finish()
+            self._file = self._open(entry.log_time)
+            self._synced = entry.log_time
+            for kept in self._retained.values():
+                self._file.add(kept._replace(log_time=entry.log_time))
+        if entry.topic.retained:
+            self._retained[entry.topic.name] = entry
+        self._file.add(entry)
+
+    def tick(self, now: int) -> None:
+        """Close the chunk, sync the file and keep the quota if that is due at log time ``now``."""
+        since = self._file.open_since
+        if since is not None and now - since >= self._config.chunk_seconds * SECOND:
+            self._file.flush()
+        if now - self._synced >= self._config.fsync_seconds * SECOND:
+            self._file.sync()
+            self._synced = now
+            self._keep_quota()
+
+    def _open(self, start: int) -> LogFile:
+        while True:
+            path = self._folder.next_path()
+            try:
+                file = LogFile(
+                    path,
+                    self._config.compression,
+                    self._config.chunk_size,
+                    self._attachments,
+                    self._metadata,
+                    start,
+                )
+            except FileExistsError:
+                self._folder.next_run()
+                continue
+            log.info("recording to %s", path)
+            self._others = self._folder.finished(path)
+            self._file = file
+            self._keep_quota()
+            return file
+
+    def _keep_quota(self) -> None:
+        """Remove the oldest files that exceed the quota; never one that somebody is writing or repairing."""
+        excess = self._file.size + sum(self._others.values()) - self._config.quota_bytes
+        for path, size in list(self._others.items()):
+            if excess <= 0:
+                return
+            if path.exists() and in_use(path):
+                continue
+            path.unlink(missing_ok=True)
+            log.info("removed %s: logs exceed %d bytes", path, self._config.quota_bytes)
+            del self._others[path]
+            excess -= size
+
 
 _BATCH: Final = 256
 """Messages handed to the thread together; each hand-over makes both threads wait for the interpreter."""
@@ -45,7 +165,7 @@ class Recorder:
         on_failure: called on the event loop with the reason and one line of text.
         attachments: JSON-able values attached to every file as ``<name>.json`` (config, calibration, versions).
         metadata: text about the run, in every file.
-        digest: takes every recorded message, in the thread.
+        digest: updated with every recorded message, in the thread.
         deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
             by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
     """
@@ -108,7 +228,7 @@ class Recorder:
         """Take one encoded message; never waits for the disk (except in deterministic runs).
 
         Args:
-            topic: its row of the table; topics that are not logged are ignored.
+            topic: its entry of the topic table; topics that are not logged are ignored.
             stamp: the message's own stamp, ns.
             payload: its bytes on the wire.
             at: when it was published, ns; None = now.
@@ -131,7 +251,7 @@ class Recorder:
             self._hand_over()
 
     def refuse(self, error: OSError) -> None:
-        """From now on the disk answers with ``error``: for drills."""
+        """Every later write fails with ``error``: for fault drills."""
         self._refusal = error
 
     def health(self, seq: int) -> RecorderHealth:
@@ -213,6 +333,6 @@ class Recorder:
         self._recording = False
         self._reason = reason
         self._loop.call_soon_threadsafe(self._on_failure, reason, text)
-        self._progress.set()  # nobody may wait for room that never comes
+        self._progress.set()  # no more room will come: wake a waiting record()
         while not self._ended:
             self._ended = self._queue.get() is None

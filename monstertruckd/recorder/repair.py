@@ -1,16 +1,154 @@
-"""``python -m monstertruckd.recorder.repair FOLDER``: repair a folder's unfinished logs, niced.
+"""Repair of logs that a crash left without an index.
 
-The recorder starts this as a process of its own: a thread would compete with the control loop for the interpreter.
+``python -m monstertruckd.recorder.repair FOLDER`` repairs a folder's unfinished logs, niced. The recorder starts
+this as a process of its own: a thread would compete with the control loop for the interpreter.
 """
 
+import fcntl
 import logging
 import os
 import subprocess
 import sys
+import threading
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, Final
 
-from monstertruckd.recorder.framing import is_finished
-from monstertruckd.recorder.recover import in_use, recover_directory
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruckd.recorder.reader import LogReader, is_finished
+
+log = logging.getLogger(__name__)
+
+_PART: Final = ".part"
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """Outcome of one repair."""
+
+    path: Path
+    """The repaired file."""
+    messages: int
+    damage: str | None
+    """What was wrong with the original; None when it was sound."""
+
+
+def in_use(path: Path) -> bool:
+    """Whether the file is locked by a recorder or a repair."""
+    with path.open("rb") as file:
+        return not _lock(file)
+
+
+def recover(source: str | Path, target: str | Path, stop: threading.Event | None = None) -> Recovery:
+    """Rewrite everything up to the first error of ``source`` as a finished log ``target``.
+
+    One streaming pass; ``target`` appears complete or not at all, and may be ``source`` itself, which is left as it is
+    if it is sound.
+
+    Args:
+        source: the damaged log.
+        target: the repaired one.
+        stop: set by another thread, abandons the repair.
+
+    Raises:
+        InputError: not a log, being written right now, or ``target`` is another file or cannot be written.
+        NotFoundError: no such file.
+    """
+    source, target = Path(source), Path(target)
+    reader = LogReader(source)
+    part = target.with_name(target.name + _PART)
+    with source.open("rb") as original:
+        if not _lock(original):
+            msg = f"{source}: is being written"
+            raise InputError(msg)
+        in_place = target.exists()
+        if in_place and not target.samefile(source):
+            msg = f"{target}: exists already; name a new file"
+            raise InputError(msg)
+        try:
+            with part.open("wb") as output:
+                messages = _copy(reader, output, stop)
+                output.flush()
+                os.fsync(output.fileno())
+            if in_place and reader.fault is None:
+                part.unlink()
+            else:
+                part.replace(target)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            msg = f"{target}: cannot be written: {error.strerror}"
+            raise InputError(msg) from error
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    return Recovery(target, messages, reader.fault)
+
+
+def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:
+    """Repair every unfinished log of a folder in place; files in use and other files are left alone."""
+    done = []
+    for path in sorted(directory.glob("*.mcap")):
+        try:
+            if is_finished(path) or in_use(path):
+                continue
+            recovery = recover(path, path, stop)
+        except (TruckError, OSError) as error:
+            log.warning("not repaired: %s", error)
+        else:
+            log.info("repaired %s: %d messages", path, recovery.messages)
+            done.append(recovery)
+        if stop is not None and stop.is_set():
+            break
+    return done
+
+
+def _lock(file: BinaryIO) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _copy(reader: LogReader, output: BinaryIO, stop: threading.Event | None) -> int:
+    """Copy all records; returns the number of messages."""
+    writer = Writer(output)
+    schemas = {0: 0}
+    channels: dict[int, int] = {}
+    messages = 0
+    started = False
+    for record in reader.records():
+        if stop is not None and stop.is_set():
+            msg = f"{reader.path}: repair abandoned"
+            raise InputError(msg)
+        if not started:
+            header = record if isinstance(record, Header) else Header("", "")
+            writer.start(header.profile, header.library)
+            started = True
+        if isinstance(record, Schema) and record.id not in schemas:
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in channels:
+            schema = schemas.get(record.schema_id, 0)
+            channels[record.id] = writer.register_channel(
+                record.topic, record.message_encoding, schema, dict(record.metadata)
+            )
+        elif isinstance(record, Message):
+            writer.add_message(
+                channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
+            )
+            messages += 1
+        elif isinstance(record, Attachment):
+            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, dict(record.metadata))
+    if not started:
+        writer.start()
+    writer.finish()  # type: ignore[no-untyped-call]
+    return messages
+
 
 NICENESS = 15
 

@@ -1,7 +1,7 @@
 """The newest messages in memory, by time and by size: what a black box is written from.
 
-Messages lie one behind the other in blocks: times, number of the topic, payload. Blocks are pages of their own, which
-the kernel gets back at once; as objects on the heap messages left it in crumbs, and the daemon grew for hours.
+Messages are stored contiguously in blocks: times, number of the topic, payload. Blocks are memory maps of their
+own, which return to the kernel at once; messages as Python objects fragment the heap, and the daemon grows for hours.
 """
 
 from collections import deque
@@ -15,38 +15,38 @@ from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.topics import Topic
-from monstertruckd.recorder.file import Entry
+from monstertruckd.recorder.log_file import Entry
 
 BLOCK: Final = 256 * 1024
 """Bytes of entries that are freed together."""
 SHARE: Final = 32
 """Part of the whole memory that a block takes at most."""
-LOOK: Final = SECOND // 10
-"""Nanoseconds between two looks for what is too old: letting go of many at a time is cheaper."""
+EXPIRY_PERIOD: Final = SECOND // 10
+"""Nanoseconds between two removals of expired entries: removing many at a time is cheaper."""
 
 _HEAD: Final = Struct("<qqqII")
 """Log time, stamp, sequence, number of the topic, length of the payload."""
 
 PICTURES: Final = "foxglove.CompressedImage"
 JOURNAL: Final = "event"
-"""Group of topics that are kept longer than the others: they tell how it came about, and are small."""
+"""Group of topics that are kept longer than the others: they are small."""
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """How long what is kept, s."""
+class Retention:
+    """How long each sort of message is kept, s."""
 
     everything: float
     journal: float
     """Events and log records."""
     pictures: float
-    """All pictures; older ones thinned out."""
+    """All pictures; older ones are sampled."""
     picture_period: float
     """Between two pictures that are left of the older ones."""
 
 
 class _Block:
-    """Entries one behind the other."""
+    """Contiguous entries."""
 
     __slots__ = ("data", "used")
 
@@ -195,41 +195,41 @@ class Ring:
         limit: bytes, of whole blocks; the newest message of each sort stays even beyond them.
     """
 
-    def __init__(self, span: Span, limit: int) -> None:
+    def __init__(self, span: Retention, limit: int) -> None:
         self._limit = limit
         block = min(BLOCK, limit // SHARE)
         self._rest = _Part(span.everything, block)
         self._journal = _Part(span.journal, block)
         self._fresh = _Part(span.pictures, block)
-        self._thinned = _Part(span.everything, block)
+        self._sampled = _Part(span.everything, block)
         self._part_of: dict[str, _Part] = {}
         self._period = round(span.picture_period * SECOND)
         self._heads: dict[str, Entry] = {}
         self._newest = 0
         """Log time of the newest message."""
-        self._next_look = 0
+        self._next_expiry = 0
         self.lost = 0
-        """Messages that had to go before their time."""
+        """Messages removed early for want of memory."""
 
     @property
     def size(self) -> int:
         """Bytes taken by blocks; the newest message of each retained topic comes on top."""
-        return self._rest.size + self._journal.size + self._thinned.size + self._fresh.size
+        return self._rest.size + self._journal.size + self._sampled.size + self._fresh.size
 
     def add(self, entry: Entry) -> None:
-        """Take the newest message, and let go what is too old or too much."""
+        """Add the newest message, and remove what is too old or too much."""
         part = self._part_of.get(entry.topic.name)
         if part is None:
             part = self._part(entry.topic)
         grown = part.append(entry)
         self._newest = entry.log_time
-        if grown or entry.log_time >= self._next_look:
-            self._let_go()
+        if grown or entry.log_time >= self._next_expiry:
+            self._trim()
 
     def snapshot(self) -> Snapshot:
         """Everything kept; takes no longer however much it is than a list of its blocks."""
-        self._let_go()
-        parts = (self._rest, self._journal, self._thinned, self._fresh)
+        self._trim()
+        parts = (self._rest, self._journal, self._sampled, self._fresh)
         return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
 
     def _part(self, topic: Topic[Any]) -> _Part:
@@ -237,19 +237,19 @@ class Ring:
         self._part_of[topic.name] = part = self._fresh if topic.foxglove == PICTURES else part
         return part
 
-    def _let_go(self) -> None:
-        """What is too old first; what then still is too much was lost."""
-        self._next_look = self._newest + LOOK
+    def _trim(self) -> None:
+        """Remove expired entries; whatever then exceeds the limit is removed and counted as lost."""
+        self._next_expiry = self._newest + EXPIRY_PERIOD
         self._expire(self._newest)
         while self.size > self._limit and (crowded := self._fullest()) is not None:
             self._drop(crowded.popleft())
             self.lost += 1
 
     def _expire(self, now: int) -> None:
-        for part in (self._rest, self._journal, self._thinned):
+        for part in (self._rest, self._journal, self._sampled):
             while part.expired(now):
                 self._drop(part.popleft())
-        kept = self._thinned
+        kept = self._sampled
         while self._fresh.expired(now):
             picture = self._fresh.popleft()
             if kept and picture.log_time - kept.newest < self._period:
@@ -258,8 +258,8 @@ class Ring:
                 kept.append(picture)
 
     def _fullest(self) -> _Part | None:
-        """Where to make room; never the newest message of its sort."""
-        parts = (self._thinned, self._fresh, self._rest, self._journal)
+        """The part to remove from; never the newest message of its sort."""
+        parts = (self._sampled, self._fresh, self._rest, self._journal)
         return next((part for part in parts if len(part) > 1), None)
 
     def _drop(self, entry: Entry) -> None:

@@ -15,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
-from monstertruckd.recorder import black_boxes
+from monstertruckd.recorder.black_box import black_boxes
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.drill.stages import with_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig

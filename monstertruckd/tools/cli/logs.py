@@ -75,7 +75,7 @@ def list_command(
 @app.command("info")
 def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     """What a log holds: topics, counts, rates, attachments, damage."""
-    from monstertruckd.recorder.recover import in_use
+    from monstertruckd.recorder.repair import in_use
     from monstertruckd.tools.logs.info import info
 
     summary = info(log)
@@ -109,7 +109,7 @@ def recover_command(
     json_output: JsonOption = False,
 ) -> None:
     """Repair an unfinished or truncated log: everything up to the first error is kept."""
-    from monstertruckd.recorder.recover import recover
+    from monstertruckd.recorder.repair import recover
 
     done = recover(log, output or log)
     if json_output:

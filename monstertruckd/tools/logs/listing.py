@@ -8,9 +8,8 @@ from mcap.reader import make_reader
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.recorder.framing import DAMAGE, index_is_sound, is_finished
-from monstertruckd.recorder.reader import LogReader
-from monstertruckd.recorder.recover import in_use
+from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound, is_finished
+from monstertruckd.recorder.repair import in_use
 from monstertruckd.tools.logs.wall_time import is_plausible, real_offset, utc
 
 

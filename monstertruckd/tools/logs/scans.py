@@ -19,8 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.recorder.framing import MAGIC
-from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.reader import MAGIC, open_log
 
 BEGIN: Final = SECOND
 """Stamp of the first scan of a log that counts from elsewhere, ns."""

@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.channels import Channels
+from monstertruckd.recorder.log_file import Channels
 from monstertruckd.recorder.reader import LogReader
 from monstertruckd.tools.logs.selection import ALL, Progress, Selection
 from monstertruckd.tools.logs.unfinished import removed_on_failure

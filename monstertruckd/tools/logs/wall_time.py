@@ -16,8 +16,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import CLOCK
-from monstertruckd.recorder.framing import DAMAGE, index_is_sound
-from monstertruckd.recorder.reader import LogReader
+from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound
 
 _PLAUSIBLE: Final = 946_684_800 * SECOND
 """2000-01-01: earlier dates come from a virtual clock, or from a computer that never learned the time."""

@@ -7,7 +7,7 @@ from typing import Final
 from mcap.records import Attachment, McapRecord, Metadata
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.recorder.file import NAME
+from monstertruckd.recorder.log_file import NAME
 from monstertruckd.recorder.reader import LogMessage, LogReader, open_log
 
 ALIKE: Final = ("config.json", "versions.json", "calibration.json")

@@ -10,7 +10,8 @@ from monstertruck_runtime.clock import SECOND, VirtualClock
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import LaserScan
-from monstertruckd.recorder import Recorder, RecorderConfig
+from monstertruckd.recorder.config import RecorderConfig
+from monstertruckd.recorder.recorder import Recorder
 
 
 def steering(now: int, seq: int) -> SteeringCommand:

@@ -17,9 +17,10 @@ from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset, GateMode
 from monstertruckd.gate.stops import Trip
-from monstertruckd.recorder import BlackBox, BlackBoxConfig, black_boxes
 from monstertruckd.recorder import black_box as module
-from monstertruckd.recorder.file import LogFile
+from monstertruckd.recorder.black_box import BlackBox, black_boxes
+from monstertruckd.recorder.config import BlackBoxConfig
+from monstertruckd.recorder.log_file import LogFile
 from monstertruckd.recorder.reader import open_log
 from tests.unit.recorder.conftest import steering
 

@@ -16,11 +16,12 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, run_virtual, run_wall
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.recorder import LogDigest, Recorder, RecorderConfig
-from monstertruckd.recorder import file as file_module
-from monstertruckd.recorder import writer as writer_module
+from monstertruckd.recorder import log_file as file_module
+from monstertruckd.recorder import recorder as recorder_module
+from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.recorder.recover import recover_directory
+from monstertruckd.recorder.recorder import LogDigest, Recorder
+from monstertruckd.recorder.repair import recover_directory
 from tests.unit.recorder.conftest import drive, scan, steering
 
 
@@ -219,7 +220,7 @@ def test_quota_never_removes_a_file_somebody_else_is_writing(config, failures):
 def test_run_number_taken_meanwhile_is_skipped(config, failures, monkeypatch):
     folder = file_module.LogFolder(Path(config.directory))
     (Path(config.directory) / "run-000001-000.mcap").touch()
-    monkeypatch.setattr(writer_module, "LogFolder", lambda _: folder)
+    monkeypatch.setattr(recorder_module, "LogFolder", lambda _: folder)
     record(config, 0.1, failures)
     assert (Path(config.directory) / "run-000002-000.mcap").exists()
 
@@ -256,8 +257,8 @@ def test_topics_that_are_not_logged_are_ignored(config, failures):
 
 def test_full_queue_drops_and_counts_without_waiting(config, failures, monkeypatch):
     gate = threading.Event()
-    write = writer_module.LogWriter.write
-    monkeypatch.setattr(writer_module.LogWriter, "write", lambda self, entry: gate.wait(10) and write(self, entry))
+    write = recorder_module.LogWriter.write
+    monkeypatch.setattr(recorder_module.LogWriter, "write", lambda self, entry: gate.wait(10) and write(self, entry))
 
     async def main(clock):
         async with Recorder(config.model_copy(update={"queue_size": 5}), clock, failures) as recorder:
@@ -371,7 +372,8 @@ def test_unfinished_logs_are_repaired_at_start(config, failures):
 CHILD = """
 import sys
 from monstertruck_runtime.clock import run_wall
-from monstertruckd.recorder import Recorder, RecorderConfig
+from monstertruckd.recorder.recorder import Recorder
+from monstertruckd.recorder.config import RecorderConfig
 from tests.unit.recorder.conftest import steering
 from monstertruck_runtime import wire
 from monstertruck_schemas import topics as t

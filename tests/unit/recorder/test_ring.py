@@ -9,10 +9,10 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.recorder.file import Entry
-from monstertruckd.recorder.ring import SHARE, Ring, Span
+from monstertruckd.recorder.log_file import Entry
+from monstertruckd.recorder.ring import SHARE, Retention, Ring
 
-SPAN = Span(everything=65.0, journal=300.0, pictures=10.0, picture_period=0.5)
+SPAN = Retention(everything=65.0, journal=300.0, pictures=10.0, picture_period=0.5)
 
 
 def picture(now, size=1000):

@@ -6,7 +6,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.state import ClockOffset, GateMode, GateState, Odometry
-from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.log_file import Entry, LogFile
 
 MAY_2026 = 1_777_600_000 * SECOND
 """Offset of a log whose daemon time began with the boot: its first second is 2026-05-01 01:46:41 UTC."""

@@ -10,7 +10,7 @@ from monstertruck_schemas import topics as t
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Attitude, Vector3
-from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.log_file import Entry, LogFile
 from tests.unit.recorder.conftest import scan, steering
 
 

@@ -9,9 +9,9 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_schemas import topics as t
-from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.log_file import Entry, LogFile
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.recorder.recover import recover
+from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.logs.info import info
 from tests.unit.tools.logs.run_kit import compass, write
 from tests.unit.tools.replay_check.log_surgery import chunks

@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 
 from monstertruckd.config.load import load_truck
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.recorder.recover import recover
+from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.demo.wall import free_endpoint
 from monstertruckd.tools.logs.export import export_csv, export_npz
 from monstertruckd.tools.logs.info import info

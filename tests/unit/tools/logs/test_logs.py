@@ -14,9 +14,9 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
-from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.log_file import Entry, LogFile
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.recorder.recover import recover, recover_directory
+from monstertruckd.recorder.repair import recover, recover_directory
 from monstertruckd.tools.logs.export import export_csv, export_npz
 from monstertruckd.tools.logs.info import info
 from tests.unit.tools.logs.run_kit import MAKERS, write

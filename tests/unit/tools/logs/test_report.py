@@ -17,7 +17,7 @@ from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, Grid
-from monstertruckd.recorder.file import Entry, LogFile
+from monstertruckd.recorder.log_file import Entry, LogFile
 from monstertruckd.tools.logs.report import report
 from monstertruckd.tools.logs.report.collect import collect
 from monstertruckd.tools.logs.report.page import page

@@ -10,9 +10,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment
 
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.file import Entry, LogFile
-from monstertruckd.recorder.framing import MAGIC
-from monstertruckd.recorder.reader import LogMessage, open_log
+from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.reader import MAGIC, LogMessage, open_log
 from monstertruckd.tools.replay_check import check_log
 from monstertruckd.tools.replay_check.result import ROUNDING
 

@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.recorder.config import Compression, RecorderConfig
-from monstertruckd.recorder.file import Entry
+from monstertruckd.recorder.log_file import Entry
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.recorder.writer import LogWriter
+from monstertruckd.recorder.recorder import LogWriter
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.replay_check import parts_of
 from monstertruckd.tools.replay_check.run_log import RunLog

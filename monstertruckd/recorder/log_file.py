@@ -1,4 +1,4 @@
-"""One log file being written, and the folder of all of them."""
+"""Log files and their folder: topics as MCAP channels, one file being written, numbered names."""
 
 import errno
 import fcntl
@@ -11,11 +11,39 @@ from typing import Any, Final, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
+from monstertruck_runtime import wire
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
-from monstertruckd.recorder.channels import Channels
 from monstertruckd.recorder.config import Compression
+
+
+class Channels:
+    """Registers each topic with its schema when it is first asked for.
+
+    Args:
+        writer: of the file, started.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def of(self, topic: Topic[Any]) -> int:
+        """Number of the topic's channel."""
+        return self._channels.get(topic.name) or self._register(topic)
+
+    def _register(self, topic: Topic[Any]) -> int:
+        schema = wire.schema(topic)
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        channel = self._writer.register_channel(
+            topic.name, schema.message_encoding, self._schemas[schema.name], {"encoding": wire.encoding(topic)}
+        )
+        self._channels[topic.name] = channel
+        return channel
+
 
 NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
 """Of a log: run and part."""
@@ -28,7 +56,7 @@ _COMPRESSION: Final = {
 
 
 class Entry(NamedTuple):
-    """A message on its way to the log."""
+    """A message to be logged."""
 
     topic: Topic[Any]
     log_time: int
@@ -40,12 +68,12 @@ class Entry(NamedTuple):
 
 
 def disk_reason(error: OSError) -> Reason:
-    """Why a disk refused to take a log."""
+    """Reason of a failed write."""
     return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED
 
 
 class LogFile:
-    """An open MCAP file, locked against everybody who would repair or remove it.
+    """An open MCAP file, locked against repair and removal.
 
     Args:
         path: file to make.
@@ -127,12 +155,12 @@ class LogFile:
             self._output.close()
 
     def abandon(self) -> None:
-        """Close as it is; the file is repaired at the next start."""
+        """Close without an index; the file is repaired at the next start."""
         self._output.close()
 
 
 class _Output:
-    """Unbuffered file: what was written is with the kernel, and an error leaves nothing behind to flush."""
+    """Unbuffered file: what was written is in the kernel, and an error leaves nothing to flush."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -151,7 +179,7 @@ class _Output:
         return self.size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing is buffered."""
 
     def sync(self) -> None:
         os.fsync(self._fd)
@@ -184,7 +212,7 @@ class LogFolder:
         return path
 
     def next_run(self) -> None:
-        """Take another run number: somebody else uses this one."""
+        """Take another run number: another process uses this one."""
         self._run += 1
         self._part = 0
 
