@@ -7,6 +7,10 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
+
+from monstertruck_schemas import entry_points
+
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r'^```\w+ title="(?P<file>[^"]+)"\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
 
@@ -57,3 +61,26 @@ def run_with(target: Path, *arguments: str, cwd: Path = ROOT) -> str:
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Installs a distribution with one module and entry points (``group:name``) beside this one, for this process."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def put(distribution, module, text, places):
+        (tmp_path / f"{module}.py").write_text(text)
+        info = tmp_path / f"{distribution}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        groups = {}
+        for name, place in places.items():
+            group, _, entry = name.partition(":")
+            groups.setdefault(group, []).append(f"{entry} = {place}\n")
+        (info / "entry_points.txt").write_text("".join(f"[{g}]\n{''.join(lines)}" for g, lines in groups.items()))
+        monkeypatch.delitem(sys.modules, module, raising=False)
+        entry_points._installed.cache_clear()
+
+    entry_points._installed.cache_clear()
+    yield put
+    entry_points._installed.cache_clear()

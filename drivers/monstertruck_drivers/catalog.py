@@ -190,9 +190,9 @@ class DeviceCatalog(Catalog[DeviceKind]):
         super().__init__("monstertruck.devices", *rows)
         self._roles = {role.name: role for role in OUR_ROLES}
 
-    def fault(self, name: str, row: Any) -> str | None:
+    def fault(self, row: Any) -> str | None:
         """What is wrong with a kind of another distribution, or with a role it brings."""
-        if fault := super().fault(name, row):
+        if fault := super().fault(row):
             return fault
         for role in row.roles:
             if not role.name.isidentifier() or not role.writes:

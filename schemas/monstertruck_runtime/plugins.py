@@ -20,7 +20,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.entry_points import Broken, Extended, extended
+from monstertruck_schemas.entry_points import ExtensibleTable
 
 
 def load(place: str) -> Any:
@@ -69,10 +69,10 @@ class Plugin:
 P = TypeVar("P", bound=Plugin)
 
 
-class Catalog(Mapping[str, P], Generic[P]):
+class Catalog(ExtensibleTable[P], Generic[P]):
     """All plug-ins of one group by kind: ours in the order given, then those of other distributions.
 
-    Entry points and settings models are read on first use, once.
+    Settings models of other distributions are loaded with their entry points, ours on first use.
 
     Args:
         group: of the entry points.
@@ -81,45 +81,19 @@ class Catalog(Mapping[str, P], Generic[P]):
     """
 
     def __init__(self, group: str, *rows: P, base: type[Schema] = Schema) -> None:
-        self.group = group
-        self._base = base
-        self._ours = {row.name: row for row in rows}
-        self._row_class = type(rows[0])
+        super().__init__(group, rows)
+        self._base, self._row_class = base, type(rows[0])
 
-    @cached_property
-    def _all(self) -> Extended[P]:
-        return extended(self.group, self._ours, self.fault)
-
-    def fault(self, name: str, row: Any) -> str | None:
+    def fault(self, row: Any) -> str | None:
         """What is wrong with a row of another distribution."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
-        if row.name != name:
-            return f"the entry point is called {name}, its plug-in {row.name}"
         model: Any = row.settings_class()
         if not (isinstance(model, type) and issubclass(model, self._base)):
             return f"{row.settings}: expected a subclass of {self._base.__name__}"
-        if kind_of(model) != name:
-            return f'{row.settings}: expected a field `kind: Literal["{name}"]`'
+        if kind_of(model) != row.name:
+            return f'{row.settings}: expected a field `kind: Literal["{row.name}"]`'
         return None
-
-    def __getitem__(self, name: str) -> P:
-        return self._all.rows[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all.rows)
-
-    def __len__(self) -> int:
-        return len(self._all.rows)
-
-    def origin(self, name: str) -> str:
-        """Distribution a kind comes from."""
-        return self._all.origins[name]
-
-    @property
-    def broken(self) -> tuple[Broken, ...]:
-        """Entry points that were left out."""
-        return self._all.broken
 
     @cached_property
     def settings(self) -> Mapping[str, type[Schema]]:

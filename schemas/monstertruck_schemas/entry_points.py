@@ -1,18 +1,29 @@
-"""What other installed distributions give through entry points: one object each, read when first asked for.
+"""Tables that other installed distributions extend through entry points.
 
-A distribution that is broken is named and left out: it never keeps the robot from starting.
+An entry point that is broken is named and left out: it never keeps the robot from starting.
 """
 
 import importlib.metadata
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Generic, TypeVar
+from functools import cache, cached_property
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
-OURS = "monstertruckd"
+OURS: Final = "monstertruckd"
 """Origin of what is in this repository."""
 
-R = TypeVar("R")
+
+class Named(Protocol):
+    """A row of a table."""
+
+    @property
+    def name(self) -> str:
+        """By which it is found."""
+        ...
+
+
+R = TypeVar("R", bound=Named)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,45 +40,77 @@ class Broken:
         return f"{self.group}: {self.name} of {self.origin}: {self.error}"
 
 
-@dataclass(frozen=True, slots=True)
-class Extended(Generic[R]):
-    """A table with its additions."""
-
-    rows: Mapping[str, R]
-    """By name: ours first, then the others' by distribution and name."""
+class _Read(NamedTuple):
+    rows: Mapping[str, Any]
     origins: Mapping[str, str]
-    """Distribution of each row."""
     broken: tuple[Broken, ...]
+
+
+class ExtensibleTable(Mapping[str, R]):
+    """Rows by name: ours in the order given, then those of other distributions, which are read on first use.
+
+    Each entry point has the name of the row that it points to.
+
+    Args:
+        group: of the entry points, for instance ``monstertruck.trackers``.
+        ours: rows of this repository.
+    """
+
+    def __init__(self, group: str, ours: Iterable[R]) -> None:
+        self.group = group
+        self.ours: Mapping[str, R] = {row.name: row for row in ours}
+
+    @abstractmethod
+    def fault(self, row: Any) -> str | None:
+        """What is wrong with a row of another distribution, None if nothing is; it may raise as well."""
+
+    @cached_property
+    def _read(self) -> _Read:
+        rows, origins = dict(self.ours), dict.fromkeys(self.ours, OURS)
+        broken: list[Broken] = []
+        found = [(_origin(entry), entry) for entry in _installed().select(group=self.group)]
+        for origin, entry in sorted(found, key=lambda pair: (pair[0], pair[1].name)):
+            try:
+                row = entry.load()
+                error = (
+                    f"the name is taken by {origins[entry.name]}"
+                    if entry.name in rows
+                    else f"the entry point is called {entry.name}, what it points to {row.name}"
+                    if getattr(row, "name", entry.name) != entry.name
+                    else self.fault(row)
+                )
+            except (Exception, SystemExit) as raised:  # noqa: BLE001  # whatever somebody else's module does
+                error = f"{type(raised).__name__}: {raised}"
+            if error is None:
+                rows[entry.name], origins[entry.name] = row, origin
+            else:
+                broken.append(Broken(self.group, entry.name, origin, error))
+        return _Read(rows, origins, tuple(broken))
+
+    def __getitem__(self, name: str) -> R:
+        row: R = self._read.rows[name]
+        return row
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._read.rows)
+
+    def __len__(self) -> int:
+        return len(self._read.rows)
+
+    def origin(self, name: str) -> str:
+        """Distribution that a row comes from."""
+        return self._read.origins[name]
+
+    @property
+    def broken(self) -> tuple[Broken, ...]:
+        """Entry points that were left out."""
+        return self._read.broken
 
 
 @cache
 def _installed() -> Any:
     """All entry points of this environment, with ``select``; reading them takes some 30 ms."""
     return importlib.metadata.entry_points()
-
-
-def extended(group: str, ours: Mapping[str, R], accept: Callable[[str, Any], str | None]) -> Extended[R]:
-    """Our rows, and those that other distributions give in a group of entry points.
-
-    Args:
-        group: name of the group, for instance ``monstertruck.trackers``.
-        ours: rows of this repository by name.
-        accept: what is wrong with an object of that name, or None; it may raise as well.
-    """
-    rows, origins = dict(ours), dict.fromkeys(ours, OURS)
-    broken: list[Broken] = []
-    found = [(_origin(entry), entry) for entry in _installed().select(group=group)]
-    for origin, entry in sorted(found, key=lambda pair: (pair[0], pair[1].name)):
-        try:
-            row = entry.load()
-            error = f"the name is taken by {origins[entry.name]}" if entry.name in rows else accept(entry.name, row)
-        except (Exception, SystemExit) as raised:  # noqa: BLE001  # whatever somebody else's module does
-            error = f"{type(raised).__name__}: {raised}"
-        if error is None:
-            rows[entry.name], origins[entry.name] = row, origin
-        else:
-            broken.append(Broken(group, entry.name, origin, error))
-    return Extended(rows, origins, tuple(broken))
 
 
 def _origin(entry: importlib.metadata.EntryPoint) -> str:

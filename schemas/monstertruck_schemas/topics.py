@@ -1,13 +1,21 @@
-"""The topic table: one row per key. Bus, recorder, health, access rules and docs are derived from it."""
+"""The topic table: one row per key. Bus, recorder, health, access rules and docs are derived from it.
+
+Other distributions add topics through entry points, each of which names a ``Topic``::
+
+    [project.entry-points."monstertruck.topics"]
+    "sensor/sonar" = "my_package.topics:SONAR"
+"""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.entry_points import ExtensibleTable
 from monstertruck_schemas.event import Event, LogRecord, Stop
 from monstertruck_schemas.health import (
     HealthTable,
@@ -179,14 +187,45 @@ REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to"
 REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")
 REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off board")
 
-TOPICS: Final[tuple[Topic[Message], ...]] = tuple(
-    value for value in list(globals().values()) if isinstance(value, Topic)
-)
 DRIVES: Final = (DRIVE, DRIVE_2, DRIVE_3, DRIVE_4)
 """Feedback of the driven shafts in their order; most robots have the first one only."""
 CMD_DRIVES: Final = (CMD_DRIVE, CMD_DRIVE_2, CMD_DRIVE_3, CMD_DRIVE_4)
 """Their commands."""
-BY_NAME: Final[dict[str, Topic[Message]]] = {topic.name: topic for topic in TOPICS}
+
+OPEN_GROUPS: Final = {
+    "sensor": (W.DRIVER,),
+    "state": (W.ESTIMATION,),
+    "plan": (W.PLANNER,),
+    "health": (W.DRIVER, W.ESTIMATION, W.PLANNER),
+}
+"""Groups to which other distributions may add topics, and who may write them."""
+
+
+class TopicTable(ExtensibleTable[Topic[Message]]):
+    """Topics by name: ours, then those of other distributions."""
+
+    def fault(self, row: Any) -> str | None:
+        """What is wrong with a topic of another distribution."""
+        if not isinstance(row, Topic):
+            return f"expected a Topic, found {type(row).__name__}"
+        if row.group not in OPEN_GROUPS or not re.fullmatch(r"[a-z]+/[a-z][a-z0-9_]*", row.name):
+            return f"expected a name like sensor/sonar, in one of the groups {', '.join(OPEN_GROUPS)}"
+        if row.writer not in OPEN_GROUPS[row.group]:
+            return f"written by {row.writer}: expected {' or '.join(OPEN_GROUPS[row.group])}"
+        model: Any = row.model
+        if not (isinstance(model, type) and issubclass(model, Message)):
+            return "model: expected a subclass of Message"
+        taken = {known.schema_name: known.model for known in self.ours.values()}
+        if taken.get(row.schema_name, model) is not model:
+            return f"another message is called {row.schema_name}"
+        return None
+
+
+BY_NAME: Final = TopicTable(
+    "monstertruck.topics", [value for value in list(globals().values()) if isinstance(value, Topic)]
+)
+TOPICS: Final = BY_NAME.values()
+"""All topics, in the order of the table."""
 
 
 def topics_of(group: str) -> Iterator[Topic[Message]]:

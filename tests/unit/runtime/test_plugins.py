@@ -1,16 +1,19 @@
 """Catalogs: our rows, and those of distributions that are installed beside us."""
 
 import json
-import sys
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from monstertruck_runtime.actors.codec import StepCodec
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, classes_in, kind_of
-from monstertruck_schemas import entry_points
 from monstertruck_schemas.base import Schema
+from tests.plugin_kit import install
+
+__all__ = ["install"]
 
 GROUP = "monstertruck.toys"
 
@@ -30,26 +33,6 @@ def row(name, settings, implementation="json:dumps", **more):
 
 def toys():
     return Catalog(GROUP, row("ball", "BallConfig"), row("cube", "CubeConfig", "no_such_module:Cube", extra="toys"))
-
-
-@pytest.fixture
-def install(tmp_path, monkeypatch):
-    """Installs a distribution with one module and entry points of toys."""
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-    def put(distribution, module, text, **entries):
-        (tmp_path / f"{module}.py").write_text(text)
-        info = tmp_path / f"{distribution}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
-        lines = "".join(f"{name} = {place}\n" for name, place in entries.items())
-        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{lines}")
-        monkeypatch.delitem(sys.modules, module, raising=False)
-        entry_points._installed.cache_clear()
-
-    entry_points._installed.cache_clear()
-    yield put
-    entry_points._installed.cache_clear()
 
 
 TOP = """
@@ -80,7 +63,7 @@ def test_a_catalog_names_its_kinds_and_loads_them_on_use():
 
 
 def test_another_distribution_adds_a_kind(install):
-    install("spinning-top", "spinning", TOP, top="spinning:TOP")
+    install("spinning-top", "spinning", TOP, {f"{GROUP}:top": "spinning:TOP"})
     catalog = toys()
     assert list(catalog) == ["ball", "cube", "top"]
     assert catalog.origin("top") == "spinning-top 1.0"
@@ -96,16 +79,18 @@ def test_what_is_broken_is_named_and_left_out(install):
         "spinning-top",
         "spinning",
         TOP,
-        top="spinning:TOP",
-        ball="spinning:BALL",
-        round="spinning:TOP",
-        wrong="spinning:WRONG",
-        plain="spinning:PLAIN",
-        missing="spinning:MISSING",
-        other="json:dumps",
+        {
+            f"{GROUP}:top": "spinning:TOP",
+            f"{GROUP}:ball": "spinning:BALL",
+            f"{GROUP}:round": "spinning:TOP",
+            f"{GROUP}:wrong": "spinning:WRONG",
+            f"{GROUP}:plain": "spinning:PLAIN",
+            f"{GROUP}:missing": "spinning:MISSING",
+            f"{GROUP}:other": "json:dumps",
+        },
     )
-    install("a-broken-one", "breaks", "import sys; sys.exit('no')", kite="breaks:KITE")
-    install("z-later", "later", TOP.replace("spinning", "later"), top="later:TOP")
+    install("a-broken-one", "breaks", "import sys; sys.exit('no')", {f"{GROUP}:kite": "breaks:KITE"})
+    install("z-later", "later", TOP.replace("spinning", "later"), {f"{GROUP}:top": "later:TOP"})
     catalog = toys()
     assert list(catalog) == ["ball", "cube", "top"]
     assert catalog.origin("top") == "spinning-top 1.0"
@@ -116,7 +101,7 @@ def test_what_is_broken_is_named_and_left_out(install):
         ("spinning-top 1.0", "missing"): "AttributeError: module 'spinning' has no attribute 'MISSING'",
         ("spinning-top 1.0", "other"): "expected a Plugin, found function",
         ("spinning-top 1.0", "plain"): "json:dumps: expected a subclass of Schema",
-        ("spinning-top 1.0", "round"): "the entry point is called round, its plug-in top",
+        ("spinning-top 1.0", "round"): "the entry point is called round, what it points to top",
         ("spinning-top 1.0", "wrong"): 'spinning:TopConfig: expected a field `kind: Literal["wrong"]`',
         ("z-later 1.0", "top"): "the name is taken by spinning-top 1.0",
     }
@@ -145,3 +130,17 @@ def test_a_section_with_a_default_needs_no_kind():
 def test_the_kind_of_a_model():
     assert kind_of(BallConfig) == "ball"
     assert kind_of(Schema) is None
+
+
+def test_settings_of_another_distribution_travel_to_another_machine(install):
+    install("spinning-top", "spinning", TOP, {f"{GROUP}:top": "spinning:TOP"})
+    catalog = toys()
+
+    @dataclass
+    class Task:
+        toy: Annotated[Schema, catalog.section()]
+
+    codec, top = StepCodec(Task), catalog["top"].settings_class()
+    assert codec.from_json(codec.to_json(Task(top(kind="top", turns=7)))) == Task(top(kind="top", turns=7))
+    with pytest.raises(InputError, match="no Plugin travels"):
+        codec.to_json(catalog["top"])

@@ -4,7 +4,10 @@ import pytest
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import BY_NAME, TOPICS, Topic, Writer, alive_key, rpc_key, topics_of
+from monstertruck_schemas.topics import BY_NAME, TOPICS, Topic, TopicTable, Writer, alive_key, rpc_key, topics_of
+from tests.plugin_kit import install
+
+__all__ = ["install"]
 
 
 def test_names_are_unique_and_in_a_known_group():
@@ -37,6 +40,45 @@ def test_every_request_carries_role_lease_and_nonce():
 def test_every_field_of_every_message_has_a_json_schema():
     for topic in TOPICS:
         assert topic.model.model_json_schema()["properties"]
+
+
+SONAR = """
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import Topic, Writer
+
+class Sonar(Message):
+    distance: float
+
+class Battery(Message):
+    pass
+
+SONAR = Topic("sensor/sonar", Sonar, Writer.DRIVER, "Distance ahead", 10, 0.5)
+AHEAD = Topic("sonar/ahead", Sonar, Writer.DRIVER, "No such group")
+MOTOR = Topic("cmd/motor", Sonar, Writer.GATE, "Past the gate")
+FORGED = Topic("sensor/forged", Sonar, Writer.GATE, "By the gate")
+TAKEN = Topic("sensor/taken", Battery, Writer.DRIVER, "Named like a message that is known")
+PLAIN = Topic("sensor/plain", dict, Writer.DRIVER, "No message")
+"""
+
+
+def test_another_distribution_adds_a_topic(install):
+    group = BY_NAME.group
+    places = {f"{group}:{t.lower()}": f"sonar:{n}" for t, n in (("sensor/sonar", "SONAR"), ("sonar/ahead", "AHEAD"))}
+    places |= {f"{group}:cmd/motor": "sonar:MOTOR", f"{group}:sensor/forged": "sonar:FORGED"}
+    places |= {f"{group}:sensor/taken": "sonar:TAKEN", f"{group}:sensor/plain": "sonar:PLAIN"}
+    install("sonar-driver", "sonar", SONAR, places | {f"{group}:sensor/scan": "sonar:SONAR"})
+    table = TopicTable(group, TOPICS)
+    assert list(table)[:-1] == list(BY_NAME)
+    assert table["sensor/sonar"].schema_name == "monstertruck.Sonar"
+    assert table.origin("sensor/sonar") == "sonar-driver 1.0"
+    assert {broken.name: broken.error for broken in table.broken} == {
+        "cmd/motor": "expected a name like sensor/sonar, in one of the groups sensor, state, plan, health",
+        "sensor/forged": "written by gate: expected driver",
+        "sensor/plain": "model: expected a subclass of Message",
+        "sensor/scan": "the name is taken by monstertruckd",
+        "sensor/taken": "another message is called monstertruck.Battery",
+        "sonar/ahead": "expected a name like sensor/sonar, in one of the groups sensor, state, plan, health",
+    }
 
 
 def test_keys_beside_topics():
