@@ -81,7 +81,7 @@ def drive(scenario: Scenario, car: str, config: DeformConfig, limit: float = LIM
         surroundings = window.field(world.known)
         result = session.step(guide, surroundings, vehicle.reference_pose(truck.pose))
         cycles.append((time.thread_time() - begin) * 1e3)
-        if result.path is not None and len(result.path.rows):
+        if result.path is not None and len(result.path.segments):
             violations += beyond(result.path, vehicle)
             follower, waited = Follower(result.path, vehicle), 0.0
         else:
@@ -111,7 +111,7 @@ def drive(scenario: Scenario, car: str, config: DeformConfig, limit: float = LIM
 
 def beyond(path: MotionPath, vehicle: Vehicle) -> int:
     """Pieces of a path that the truck's wheels cannot drive."""
-    turn, slip = path.rows[:, 1], path.rows[:, 2]
+    turn, slip = path.segments[:, 1], path.segments[:, 2]
     if vehicle.steering == "front":
         return int(((np.abs(turn) > math.tan(ANGLE) / TRUCK.wheelbase + 1e-6) | (slip != 0.0)).sum())
     angles = np.abs(np.array(TRUCK.steer_for(turn, slip)))

@@ -117,7 +117,7 @@ def judged(result, world, planner, query: Query, tolerance) -> dict:  # noqa: AN
         vehicle.footprint.centres, vehicle.footprint.radius, vehicle.radius, vehicle.crab_angle,
         tolerance["position_m"], tolerance["yaw_rad"],
     )  # fmt: skip
-    segments = [(s.length, s.direction, s.curvature, s.sideslip) for s in result.path.segments]
+    segments = [(abs(s), 1 if s > 0 else -1, k, b) for s, k, b in result.path.segments.tolist()]
     return {
         "length": result.path.length,
         "cusps": result.path.cusps,

@@ -1,7 +1,6 @@
-"""The one collision checker of the project: truck footprint against scan points and occupancy grids.
+"""Collision checks of the truck's footprint against scan points and occupancy grids, for gate, trackers and planners.
 
-Gate, trackers and planners all ask here. Poses are rows (x, y, yaw) in the same frame as the points or the grid;
-distances are metres, negative inside the footprint.
+Poses are (x, y, yaw) in the same frame as the points or the grid; distances are metres, negative inside the footprint.
 """
 
 import math
@@ -18,7 +17,7 @@ from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.state import Grid
 
 if TYPE_CHECKING:
-    from monstertruck_planners.collision_kernels import BodyData, FieldData
+    from monstertruck_planners.collision_kernels import FieldData, FootprintData
 
 
 OCCUPIED = 50
@@ -27,7 +26,7 @@ OCCUPIED = 50
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Rectangle round the point that the poses speak of (the base), grown by ``padding`` on every side.
+    """Rectangle around the point that poses refer to (the base), grown by ``padding`` on every side.
 
     Args:
         length: along x, m.
@@ -64,12 +63,12 @@ class Footprint:
 
     @property
     def circumscribed_radius(self) -> float:
-        """Radius of the circle round the poses' point that holds the padded rectangle, m."""
+        """Radius of the circle around the poses' point that contains the padded rectangle, m."""
         return math.hypot(self.half_length + abs(self.offset), self.half_width)
 
     @property
     def inscribed_radius(self) -> float:
-        """Radius of the largest circle round the poses' point inside the padded rectangle, m."""
+        """Radius of the largest circle around the poses' point inside the padded rectangle, m."""
         return max(min(self.half_length - abs(self.offset), self.half_width), 0.0)
 
     def covering_discs(self, count: int = 3) -> tuple[Array, float]:
@@ -82,13 +81,15 @@ class Footprint:
         centres = np.array([self.offset - self.half_length + half * (2 * i + 1) for i in range(count)])
         return centres, math.hypot(half, self.half_width)
 
-    def body(self) -> "BodyData":
-        """What the compiled tests take."""
-        from monstertruck_planners.collision_kernels import BodyData  # noqa: PLC0415 - workers only
+    def data(self) -> "FootprintData":
+        """What the numba functions take."""
+        from monstertruck_planners.collision_kernels import FootprintData  # noqa: PLC0415 - workers only
 
         discs, radius = self.covering_discs()
         reach = float(np.abs(discs).max())
-        return BodyData(discs, radius, self.half_length, self.half_width, self.offset, self.inscribed_radius, reach)
+        return FootprintData(
+            discs, radius, self.half_length, self.half_width, self.offset, self.inscribed_radius, reach
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,20 +115,20 @@ class DiscFootprint:
 
     @property
     def circumscribed_radius(self) -> float:
-        """Radius of the circle round the poses' point that holds all discs, m."""
+        """Radius of the circle around the poses' point that contains all discs, m."""
         return max(map(abs, self.centres)) + self.radius
 
     @property
     def inscribed_radius(self) -> float:
-        """Radius of the largest circle round the poses' point inside one of the discs, m."""
+        """Radius of the largest circle around the poses' point inside one of the discs, m."""
         return max(self.radius - min(map(abs, self.centres)), 0.0)
 
-    def body(self) -> "BodyData":
-        """What the compiled tests take."""
-        from monstertruck_planners.collision_kernels import BodyData  # noqa: PLC0415 - workers only
+    def data(self) -> "FootprintData":
+        """What the numba functions take."""
+        from monstertruck_planners.collision_kernels import FootprintData  # noqa: PLC0415 - workers only
 
         reach = max(map(abs, self.centres))
-        return BodyData(np.array(self.centres), self.radius, 0.0, 0.0, 0.0, self.inscribed_radius, reach)
+        return FootprintData(np.array(self.centres), self.radius, 0.0, 0.0, 0.0, self.inscribed_radius, reach)
 
 
 def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Array:
@@ -176,7 +177,7 @@ def clearance_to_points(footprint: Footprint, poses: Array, points: Array) -> Ar
 
 
 def points_near(points: Array, poses: Array, reach: float) -> Array:
-    """Those points that are not surely further than ``reach`` from all poses.
+    """Points within the bounding box of the poses, grown by ``reach``.
 
     Args:
         points: shape (n, 2).
@@ -211,7 +212,7 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     if len(near) == 0:
         return None
     beyond_x, beyond_y = _beyond(footprint, poses, near)
-    # Most points are never touched: the exact distance is for the others.
+    # The exact distance is computed only for points that are touched.
     touching = (beyond_x < margin) & (beyond_y < margin)
     points_touched = touching.any(axis=0)
     if not points_touched.any():
@@ -259,7 +260,7 @@ def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:
 
 
 class ScanPoints:
-    """``scan_points`` of the newest scan, computed once for all who ask; not to be written to.
+    """``scan_points`` of the newest scan, computed once and shared; read-only.
 
     Args:
         mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
@@ -311,7 +312,7 @@ class DistanceField:
 
     @classmethod
     def from_grid(cls, grid: Grid, *, unknown_blocks: bool = True) -> "DistanceField":
-        """Field of a ``state/map`` grid; unknown cells count as occupied unless told otherwise."""
+        """Field of a ``state/map`` grid; unknown cells count as occupied, or as free."""
         cells = grid.cells.reshape(grid.height, grid.width)
         occupied = cells >= OCCUPIED
         if unknown_blocks:
@@ -319,7 +320,7 @@ class DistanceField:
         return cls(occupied, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
 
     def data(self) -> "FieldData":
-        """What the compiled tests take: the grid with its ring."""
+        """What the numba functions take: the grid with its ring."""
         from monstertruck_planners.collision_kernels import FieldData  # noqa: PLC0415 - workers only
 
         x, y, yaw = self.origin
@@ -373,5 +374,5 @@ class DistanceField:
         """
         from monstertruck_planners.collision_kernels import free_poses  # noqa: PLC0415 - workers only
 
-        rows = np.ascontiguousarray(poses, dtype=np.float64)
-        return np.asarray(free_poses(self.data(), footprint.body(), margin, rows))
+        poses = np.ascontiguousarray(poses, dtype=np.float64)
+        return np.asarray(free_poses(self.data(), footprint.data(), margin, poses))

@@ -1,4 +1,4 @@
-"""Footprint against an occupancy grid, compiled: the exact tests behind ``collision.DistanceField``. Loads numba.
+"""Exact tests of a footprint against an occupancy grid, behind ``collision.DistanceField``. Loads numba.
 
 An occupied cell is its whole square. Distances between cell centres bound the true ones from below and above; only what
 these bounds leave open is tested cell by cell (separating axes of rectangle and square; distance of disc and square).
@@ -31,7 +31,7 @@ class FieldData(NamedTuple):
     """Pose of the outer corner of the ringed grid's cell (0, 0)."""
 
 
-class BodyData(NamedTuple):
+class FootprintData(NamedTuple):
     """A footprint: discs on the x axis, and the rectangle they cover (half sizes 0: the discs are the footprint)."""
 
     discs: Array
@@ -86,12 +86,12 @@ def _rectangle_hits(
 
 
 @njit(cache=True)
-def room(field: FieldData, body: BodyData, margin: float, x: float, y: float, yaw: float) -> float:
-    """How far every part of the body may surely move, m; 0 if it is free but close to something, -1 if it is not free.
+def safe_distance(field: FieldData, footprint: FootprintData, margin: float, x: float, y: float, yaw: float) -> float:
+    """Distance every part of the footprint may move without collision, m; 0 if it is free but close, -1 if not free.
 
     Args:
         field: the grid.
-        body: the footprint.
+        footprint: the footprint.
         margin: to keep on all sides, m.
         x: of the pose, in the grid's parent frame, m.
         y: the same.
@@ -103,61 +103,67 @@ def room(field: FieldData, body: BodyData, margin: float, x: float, y: float, ya
     rows, columns = field.occupied.shape
     if not (0.0 <= px < columns and 0.0 <= py < rows):
         return -1.0
-    if field.distance[int(py), int(px)] + res * (HALF_DIAGONAL - 0.5) < body.inscribed + margin:
+    if field.distance[int(py), int(px)] + res * (HALF_DIAGONAL - 0.5) < footprint.inscribed + margin:
         return -1.0
     c, s = cos(yaw), sin(yaw)
     c, s = c * field.cos + s * field.sin, s * field.cos - c * field.sin
     least = 1e9
-    for i in range(len(body.discs)):
-        qx, qy = px + body.discs[i] / res * c, py + body.discs[i] / res * s
+    for i in range(len(footprint.discs)):
+        qx, qy = px + footprint.discs[i] / res * c, py + footprint.discs[i] / res * s
         if not (0.0 <= qx < columns and 0.0 <= qy < rows):
             return -1.0
         column, row = int(qx), int(qy)
         off = sqrt((qx - column - 0.5) ** 2 + (qy - row - 0.5) ** 2)
-        bound = field.distance[row, column] - res * (off + HALF_DIAGONAL) - body.radius - margin
+        bound = field.distance[row, column] - res * (off + HALF_DIAGONAL) - footprint.radius - margin
         if bound < least:
             least = bound
-            if bound <= 0.0 and body.half_length > 0.0:
+            if bound <= 0.0 and footprint.half_length > 0.0:
                 break
-        if bound <= 0.0 and body.half_length <= 0.0 and _disc_hits(field, qx, qy, (body.radius + margin) / res):
+        if (
+            bound <= 0.0
+            and footprint.half_length <= 0.0
+            and _disc_hits(field, qx, qy, (footprint.radius + margin) / res)
+        ):
             return -1.0
     if least > 0.0:
         return float(least)
-    if body.half_length <= 0.0:
+    if footprint.half_length <= 0.0:
         return 0.0
-    qx, qy = px + body.centre / res * c, py + body.centre / res * s
-    hit = _rectangle_hits(field, qx, qy, c, s, (body.half_length + margin) / res, (body.half_width + margin) / res)
+    qx, qy = px + footprint.centre / res * c, py + footprint.centre / res * s
+    hit = _rectangle_hits(
+        field, qx, qy, c, s, (footprint.half_length + margin) / res, (footprint.half_width + margin) / res
+    )
     return -1.0 if hit else 0.0
 
 
 @njit(cache=True)
-def free_poses(field: FieldData, body: BodyData, margin: float, poses: Array) -> NDArray[np.bool_]:
+def free_poses(field: FieldData, footprint: FootprintData, margin: float, poses: Array) -> NDArray[np.bool_]:
     """Whether each pose (m, 3) is free."""
     result = np.empty(len(poses), np.bool_)
     for i in range(len(poses)):
-        result[i] = room(field, body, margin, poses[i, 0], poses[i, 1], poses[i, 2]) >= 0.0
+        result[i] = safe_distance(field, footprint, margin, poses[i, 0], poses[i, 1], poses[i, 2]) >= 0.0
     return result
 
 
 @njit(cache=True)
-def row_free(
-    field: FieldData, body: BodyData, margin: float, step: float,
+def segment_free(
+    field: FieldData, footprint: FootprintData, margin: float, step: float,
     x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float,
 ) -> bool:  # fmt: skip
-    """Whether a motion row (signed length, curvature, sideslip) is free all the way, its end included.
+    """Whether a motion segment (signed length, curvature, sideslip) is free all the way, its end included.
 
-    Where there is room the test leaps as far as the room allows, elsewhere it goes by ``step`` metres (a quarter of it
-    beside the heading, where corners leave teeth between two poses).
+    The test advances as far as the safe distance allows, and by ``step`` metres at least (a quarter of it with
+    sideslip, where corners leave gaps between two poses).
     """
     total = abs(length)
     sign = 1.0 if length > 0.0 else -1.0
     if sideslip != 0.0:
         step *= 0.25
-    pace = 1.0 + abs(curvature) * body.reach
+    pace = 1.0 + abs(curvature) * footprint.reach
     travelled = 0.0
     while True:
         px, py, pyaw = advance(x, y, yaw, sign * travelled, curvature, sideslip)
-        safe = room(field, body, margin, px, py, pyaw)
+        safe = safe_distance(field, footprint, margin, px, py, pyaw)
         if safe < 0.0:
             return False
         if travelled >= total:

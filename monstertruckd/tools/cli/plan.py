@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class SteeringChoice(StrEnum):
-    """What the truck may do with its axles."""
+    """Steering of the axles."""
 
     FRONT = "2ws"
     COUNTER = "counter"
@@ -25,7 +25,7 @@ class SteeringChoice(StrEnum):
 
 
 class UnknownChoice(StrEnum):
-    """What unknown cells are."""
+    """How unknown cells are regarded."""
 
     BLOCKED = "blocked"
     DEAR = "dear"
@@ -45,20 +45,20 @@ def plan(
         str, typer.Option("--planner", "-p", help="Kind of route planner.", autocompletion=complete_planner)
     ] = "hybrid",
     steering: Annotated[
-        SteeringChoice, typer.Option(help="Front axle alone, both axles opposite, or both in every way.")
+        SteeringChoice, typer.Option(help="Front axle only, both axles opposite, or both in all modes.")
     ] = SteeringChoice.BOTH,
     via: ViaOption = None,
-    unknown: Annotated[UnknownChoice, typer.Option(help="What unknown cells are.")] = UnknownChoice.BLOCKED,
+    unknown: Annotated[UnknownChoice, typer.Option(help="How unknown cells are regarded.")] = UnknownChoice.BLOCKED,
     budget: Annotated[float, typer.Option(min=0.01, help="Time for the route and its improvement, s.")] = 1.0,
     reproducible: Annotated[
-        bool, typer.Option("--reproducible", help="A fixed amount of work instead: equal inputs, equal routes.")
+        bool, typer.Option("--reproducible", help="Limit the work instead of the time: equal inputs give equal routes.")
     ] = False,
     picture: Annotated[Path | None, typer.Option("--png", help="Draw map and route into this file.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Plan a route over a map and say what it is like.
+    """Plan a route over a map and print or draw it.
 
-    The truck is the author's; poses are of its base. Exit code by reason when there is no route.
+    The truck is the author's; poses are of its base. The exit code follows the reason if there is no route.
     """
     from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
     from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
@@ -66,7 +66,7 @@ def plan(
     from monstertruck_runtime.map_files import load_map
 
     world = load_map(map_file)
-    ground = RouteMap.from_cells(world.cells, world.resolution, (*world.origin, 0.0), unknown.value)
+    route_map = RouteMap.from_cells(world.cells, world.resolution, (*world.origin, 0.0), unknown.value)
     vehicle = Vehicle.truck(steering.value)
     settings: Any = ROUTE_PLANNERS.find(planner).settings_class()
     planning = make_planner(vehicle, settings(kind=planner, budget=budget, unknown=unknown.value))
@@ -74,31 +74,32 @@ def plan(
     if not reproducible:
         warm_up(planning)
     now = None if reproducible else (lambda: clock.now() / SECOND)
-    result = _route(planning, ground, vehicle, (parse_pose(start), parse_pose(goal)), via or [], now)
+    result = _route(planning, route_map, vehicle, (parse_pose(start), parse_pose(goal)), via or [], now)
     if picture is not None:
         _draw(picture, world, vehicle, result, map_file.stem)
     if json_output:
         print_json(_report(result, vehicle))
     elif result.ok:
-        _tell(result)
+        _print_summary(result)
     finish(result.reason, f"{result.reason.text}: {result.text}")
 
 
 def _route(
-    planner: "RoutePlanner", ground: "RouteMap", vehicle: "Vehicle", ends: tuple[tuple[float, ...], tuple[float, ...]],
+    planner: "RoutePlanner", route_map: "RouteMap", vehicle: "Vehicle",
+    ends: tuple[tuple[float, ...], tuple[float, ...]],
     via: list[str], now: Any,
 ) -> "RouteResult":  # fmt: skip
     from monstertruck_planners.route.hybrid import HybridPlanner
-    from monstertruck_planners.route.replan import Waypoint, plan_through
+    from monstertruck_planners.route.replan import ViaPoint, plan_through
 
     start, goal = (vehicle.reference_pose(pose) for pose in ends)
     if not via:
-        return planner.plan(ground, start, goal, now)
+        return planner.plan(route_map, start, goal, now)
     if not isinstance(planner, HybridPlanner):
         raise InputError("--via: expected the planner hybrid")
     poses = [parse_pose(text, yaw_needed=False) for text in via]
-    places = [Waypoint(*(pose if len(pose) == 2 else vehicle.reference_pose(pose).tolist())) for pose in poses]
-    return plan_through(planner, ground, start, [*places, Waypoint(*goal.tolist())], now)
+    places = [ViaPoint(*(pose if len(pose) == 2 else vehicle.reference_pose(pose).tolist())) for pose in poses]
+    return plan_through(planner, route_map, start, [*places, ViaPoint(*goal.tolist())], now)
 
 
 def _report(result: "RouteResult", vehicle: "Vehicle") -> dict[str, Any]:
@@ -116,14 +117,14 @@ def _report(result: "RouteResult", vehicle: "Vehicle") -> dict[str, Any]:
             "reference": path.reference,
             "segments": [
                 {
-                    "kind": s.kind,
-                    "length": s.length,
-                    "direction": s.direction,
-                    "curvature": s.curvature,
-                    "sideslip": s.sideslip,
-                    "steering": s.steering,
+                    "kind": "arc" if curvature else "crab" if sideslip else "line",
+                    "length": abs(length),
+                    "direction": 1 if length > 0 else -1,
+                    "curvature": curvature,
+                    "sideslip": sideslip,
+                    "steering": steering,
                 }
-                for s in path.segments
+                for (length, curvature, sideslip), steering in zip(path.segments.tolist(), path.steering, strict=True)
             ],
             "poses": path.base_poses(0.05).tolist(),
         }
@@ -132,11 +133,11 @@ def _report(result: "RouteResult", vehicle: "Vehicle") -> dict[str, Any]:
     return report
 
 
-def _tell(result: "RouteResult") -> None:
+def _print_summary(result: "RouteResult") -> None:
     statistics = result.statistics
     first = f", first route after {statistics['first_s'] * 1e3:.1f} ms" if statistics.get("elapsed_s") else ""
     if result.path is None:
-        print(f"way of cost {result.cost:.2f} m, not drivable as it is{first}")
+        print(f"path over the grid of cost {result.cost:.2f} m, no drivable motion{first}")
         return
     path = result.path
     tightest = f", least radius {1 / path.greatest_curvature:.3f} m" if path.greatest_curvature else ""
@@ -186,7 +187,7 @@ def _draw(file: Path, world: "WorldMap", vehicle: "Vehicle", result: "RouteResul
     elif result.poses is not None:
         base = moved(result.poses, -vehicle.reference)
         axis.plot(base[:, 0], base[:, 1], "C0", lw=1.5)
-        axis.set_title(f"{name}: way over the grid")
+        axis.set_title(f"{name}: path over the grid")
     else:
         axis.set_title(f"{name}: {result.reason.text}")
     axis.set(xlabel="x, m", ylabel="y, m")

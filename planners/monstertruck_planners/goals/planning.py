@@ -16,7 +16,7 @@ from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, Route
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.replan import Waypoint, replan, with_headings
+from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
@@ -145,7 +145,7 @@ class PlanningStep:
         cells = ground.with_points(points) if len(points) else ground.cells
         route_map = RouteMap.from_cells(cells, ground.resolution, ground.origin, self._setup.config.route.unknown)
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
-        way = with_headings(task.pose, [Waypoint(*place) for place in (*task.via, task.goal)])
+        way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
         via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
         result = self._search(self._planner, route_map, start, via, goal)
         if result.reason is Reason.START_BLOCKED:

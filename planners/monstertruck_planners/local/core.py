@@ -13,15 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.collision_kernels import BodyData, FieldData, room
+from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
 from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
 from monstertruck_planners.local.config import DeformConfig
 from monstertruck_planners.local.elastic_band import Cover, clearance, cover_of
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.hybrid import SKIN, HybridPlanner
-from monstertruck_planners.route.hybrid_search import LEVELS
+from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.hybrid_search import RESOLUTIONS
 from monstertruck_planners.route.motion import MotionPath, advance
+from monstertruck_planners.route.search import CHECK_MARGIN
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
@@ -39,7 +40,7 @@ SLACK = 2e-3
 
 
 @njit(cache=True)
-def loosen(field: FieldData, body: BodyData, cover: Cover, pose: Array, moves: Array, margin: float) -> Array:
+def loosen(field: FieldData, body: FootprintData, cover: Cover, pose: Array, moves: Array, margin: float) -> Array:
     """Shortest motion out of the margin.
 
     Args:
@@ -47,7 +48,7 @@ def loosen(field: FieldData, body: BodyData, cover: Cover, pose: Array, moves: A
         body: footprint, for the margin.
         cover: the same, for clearances, see ``band.cover_of``.
         pose: shape (3,), where the truck stands.
-        moves: shape (n, 3): motion rows that it may drive; their signs count, their lengths do not. Of equally
+        moves: shape (n, 3): motion segments that it may drive; their signs count, their lengths do not. Of equally
             long ways out the first one is taken.
         margin: wanted at the end, m.
 
@@ -66,7 +67,7 @@ def loosen(field: FieldData, body: BodyData, cover: Cover, pose: Array, moves: A
                 if here < known - SLACK:
                     break
                 known = max(known, here)
-                if room(field, body, margin, x, y, yaw) >= 0.0:
+                if safe_distance(field, body, margin, x, y, yaw) >= 0.0:
                     best, shortest = i, travelled
                     break
                 travelled += STEP
@@ -134,7 +135,7 @@ class Surveyor:
         search = search or HybridConfig(effort=config.effort)
         margins = dict.fromkeys((config.margin, 0.0))
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
-        self._moves = self._planners[0].car(LEVELS[0]).moves
+        self._primitives = self._planners[0].motion_model(RESOLUTIONS[0]).primitives
 
     def begin(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> Cycle | DeformResult:
         """The route cut to the window for one cycle, see ``api.Deformer``, or the result if nothing of it is free.
@@ -243,7 +244,7 @@ class Surveyor:
         reason = Reason.PATH_BLOCKED
         for planner in self._planners:
             result = planner.plan(RouteMap(surroundings), pose, goal)
-            if result.path is not None and len(result.path.rows):
+            if result.path is not None and len(result.path.segments):
                 return result.path if out is None else out.then(result.path), Reason.OK
             reason = result.reason
             if reason is not Reason.START_BLOCKED and reason is not Reason.GOAL_BLOCKED:
@@ -254,10 +255,15 @@ class Surveyor:
         """Way out of the margin of what is too near; None if nothing is, or there is no such way."""
         if surroundings.free(self.vehicle.footprint, pose[None], self.config.margin)[0]:
             return None
-        rows = loosen(
-            surroundings.data(), self._planners[0].body, self.cover, pose, self._moves, self.config.margin + SKIN
+        segments = loosen(
+            surroundings.data(),
+            self._planners[0].footprint,
+            self.cover,
+            pose,
+            self._primitives,
+            self.config.margin + CHECK_MARGIN,
         )
-        return MotionPath(pose, rows, self.vehicle.steering, self.vehicle.reference) if len(rows) else None
+        return MotionPath(pose, segments, self.vehicle.steering, self.vehicle.reference) if len(segments) else None
 
     def cost(self, surroundings: DistanceField, path: MotionPath) -> float:
         """What a path costs, m."""
@@ -294,7 +300,7 @@ class Surveyor:
         near = np.flatnonzero(travelled[:first_run] <= travelled[max(broken - 1, 0)] - STANDOFF)
         if not len(near) or travelled[near[-1]] < self.config.shortest:
             return None
-        path = self.vehicle.steer().path(here, band.poses[near[-1]])
+        path = self.vehicle.reeds_shepp().path(here, band.poses[near[-1]])
         return path if path.cusps == 0 and self.free(surroundings, path) else None
 
 
@@ -374,9 +380,9 @@ def _place(path: MotionPath, poses: Array, travelled: Array, first: int, last: i
     return s, float(apart(foot, pose))
 
 
-def ways(vehicle: Vehicle, rows: Array) -> tuple[str, ...]:
+def ways(vehicle: Vehicle, segments: Array) -> tuple[str, ...]:
     """How each row's wheels are set."""
     names = []
-    for _, turn, slip in rows.tolist():
+    for _, turn, slip in segments.tolist():
         names.append(vehicle.steering if slip == 0.0 else "hybrid" if turn else "crab")
     return tuple(names)

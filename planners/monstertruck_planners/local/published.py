@@ -54,7 +54,7 @@ class Published:
         config = self.config.model_copy(update={"margin": 0.0})
         states = Vehicle(DiscFootprint((0.0,), self.config.inflation), self.config.radius, 0.0, vehicle.steering)
         self._states = Surveyor(states, config, search)
-        self._steer = states.steer()
+        self._steer = states.reeds_shepp()
         self._band = Surveyor(replace(states, footprint=DiscFootprint((0.0,), INSCRIBED)), config)
         self._rules = rules_of(AUTHORS, self._band.cover)._replace(
             scale=0.5, reach=0.0, spacing=math.inf, published=True
@@ -100,7 +100,7 @@ class Published:
 
     def _join(self, surroundings: DistanceField, here: Array, goal: Array) -> MotionPath | None:
         path = self._steer.path(here, goal)
-        if len(path.rows) and self._states.free(surroundings, path):
+        if len(path.segments) and self._states.free(surroundings, path):
             return path
         end = Local(Guide(goal[None], np.ones(1)), 0, final=True)
         return self._states.search(surroundings, here, end, 0)[0]

@@ -52,7 +52,7 @@ class Rsband:
         self.vehicle = vehicle
         self.config = config or RsbandConfig()
         costs = costs_of(self.config)
-        self._steer = vehicle.steer(costs)
+        self._steer = vehicle.reeds_shepp(costs)
         self._surveyor = Surveyor(vehicle, self.config, costs)
         self._rules = rules_of(self.config.band, self._surveyor.cover)
         self._strategy: Callable[[Guide, DistanceField, Array], Motion | None] = getattr(
@@ -81,7 +81,7 @@ class Rsband:
         return self._fresh(local, surroundings, here, memory, rest)
 
     def _good(self, rest: MotionPath, far: float, *, to_end: bool, to_cusp: bool) -> bool:
-        if far > self.config.off_path or not len(rest.rows):
+        if far > self.config.off_path or not len(rest.segments):
             return False
         if to_end or to_cusp:
             return rest.length > (RUN_ENDED if to_end else CRUMB)
@@ -117,7 +117,7 @@ class Rsband:
     def _join(self, surroundings: DistanceField, here: Array, goal: Array) -> MotionPath | None:
         """Best motion between two poses if it is free."""
         path = self._steer.path(here, goal)
-        return path if len(path.rows) and self._surveyor.free(surroundings, path) else None
+        return path if len(path.segments) and self._surveyor.free(surroundings, path) else None
 
     def _start_to_end(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
         last = len(band.poses) - 1
@@ -164,7 +164,7 @@ class Rsband:
         at, reached = here, 0
         for last in self._posts(band):
             path = self._join(surroundings, at, band.poses[last])
-            backs = legs and path is not None and (path.rows[:, 0] * band.directions[last] < 0).any()
+            backs = legs and path is not None and (path.segments[:, 0] * band.directions[last] < 0).any()
             if path is None or backs or self._roundabout(path, at):
                 if not skip:
                     break
@@ -207,9 +207,9 @@ def with_robot(band: Guide, here: Array) -> Guide:
 
 def to_cusp(path: MotionPath, band: Guide) -> bool:
     """Whether a path leads to where its band changes direction, or the band has done so already."""
-    if not len(path.rows):
+    if not len(path.segments):
         return False
-    if path.rows[-1, 0] * band.directions[0] < 0:
+    if path.segments[-1, 0] * band.directions[0] < 0:
         return True
     cusps = band.poses[np.flatnonzero(np.diff(band.directions))]
     return bool((apart(cusps, path.end) < 0.05).any())

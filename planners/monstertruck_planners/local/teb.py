@@ -1,7 +1,7 @@
 """Timed elastic band: poses and times of shortest time that keep off obstacles and within the truck's limits. Compiled.
 
 The band keeps its way round every obstacle and its changes of direction; where it is broken a small search lays a new
-one. What the least squares leave of the kinematics is taken off at the end: rows within the limits are driven from
+one. What the least squares leave of the kinematics is taken off at the end: segments within the limits are driven from
 the truck's pose, so the path is drivable exactly, and it is checked.
 """
 
@@ -69,22 +69,22 @@ class System(NamedTuple):
     matrix: Array
     """Shape (4 n, WIDTH): lower diagonals; [i, k] couples the unknowns i and i - k."""
     gradient: Array
-    row: Array
+    jacobian: Array
     """Shape (WIDTH,): derivatives of the residual at hand."""
 
 
 @njit(cache=True)
 def _add(system: System, base: int, residual: float) -> float:
-    """Take in a residual whose derivatives are in ``row``, first unknown ``base``; clears the row."""
-    row = system.row
+    """Take in a residual whose derivatives are in ``jacobian``, first unknown ``base``; clears the jacobian."""
+    jacobian = system.jacobian
     for i in range(WIDTH):
-        if row[i] == 0.0:
+        if jacobian[i] == 0.0:
             continue
-        system.gradient[base + i] += row[i] * residual
+        system.gradient[base + i] += jacobian[i] * residual
         for j in range(i + 1):
-            system.matrix[base + i, i - j] += row[i] * row[j]
+            system.matrix[base + i, i - j] += jacobian[i] * jacobian[j]
     for i in range(WIDTH):
-        row[i] = 0.0
+        jacobian[i] = 0.0
     return residual * residual
 
 
@@ -99,18 +99,18 @@ def _interval(band: Array, i: int, out: Array) -> None:
 
 
 @njit(cache=True)
-def _spread(row: Array, at: int, v: Array, da: float, db: float, dd: float, dt: float) -> None:
-    """Derivatives by the unknowns from those by a, b, d and t of an interval; ``at`` is its first pose in the row."""
+def _spread(jacobian: Array, at: int, v: Array, da: float, db: float, dd: float, dt: float) -> None:
+    """Derivatives by the unknowns from those by a, b, d, t of an interval; ``at``: index of its first pose's x."""
     c, s = v[3], v[4]
     gx, gy = da * c - db * s, da * s + db * c
     turn = 0.5 * (da * v[1] - db * v[0])
-    row[at] -= gx
-    row[at + 1] -= gy
-    row[at + 2] += turn - dd
-    row[at + 4] += gx
-    row[at + 5] += gy
-    row[at + 6] += turn + dd
-    row[at + 7] += dt
+    jacobian[at] -= gx
+    jacobian[at + 1] -= gy
+    jacobian[at + 2] += turn - dd
+    jacobian[at + 4] += gx
+    jacobian[at + 5] += gy
+    jacobian[at + 6] += turn + dd
+    jacobian[at + 7] += dt
 
 
 @njit(cache=True)
@@ -118,11 +118,11 @@ def _single(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
     """Terms of the interval before pose i."""
     total = 0.0
     base = 4 * (i - 1)
-    row, sign, t = system.row, sense[i], band[i, 3]
+    jacobian, sign, t = system.jacobian, sense[i], band[i, 3]
     _interval(band, i, v)
     ahead = sign * v[0]
     if ahead < LEAST_STEP:
-        _spread(row, 0, v, -sign * terms.w_steering, 0.0, 0.0, 0.0)
+        _spread(jacobian, 0, v, -sign * terms.w_steering, 0.0, 0.0, 0.0)
         total += _add(system, base, terms.w_steering * (LEAST_STEP - ahead))
     for axle in range(2):
         arm = terms.l_f if axle == 0 else -terms.l_r
@@ -132,21 +132,21 @@ def _single(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
         if over > 0.0:
             side = 1.0 if aside > 0.0 else -1.0
             w = terms.w_steering
-            _spread(row, 0, v, -w * limit * sign if ahead > 0.0 else 0.0, w * side, w * side * arm, 0.0)
+            _spread(jacobian, 0, v, -w * limit * sign if ahead > 0.0 else 0.0, w * side, w * side * arm, 0.0)
             total += _add(system, base, w * over)
-    row[7] = terms.w_time
+    jacobian[7] = terms.w_time
     total += _add(system, base, terms.w_time * t)
     limit = terms.speed if sign > 0.0 else terms.reverse
     long = hypot(v[0], v[1])
     if long > limit * t and long > 1e-9:
         w = 10.0 * terms.w_rate
-        _spread(row, 0, v, w * v[0] / long, w * v[1] / long, 0.0, -w * limit)
+        _spread(jacobian, 0, v, w * v[0] / long, w * v[1] / long, 0.0, -w * limit)
         total += _add(system, base, w * (long - limit * t))
     if t < LEAST_TIME:
-        row[7] = -10.0
+        jacobian[7] = -10.0
         total += _add(system, base, 10.0 * (LEAST_TIME - t))
     if terms.rear > 0.0:
-        _spread(row, 0, v, 0.0, terms.w_crab * 10.0, 0.0, 0.0)
+        _spread(jacobian, 0, v, 0.0, terms.w_crab * 10.0, 0.0, 0.0)
         total += _add(system, base, terms.w_crab * 10.0 * v[1])
     return total
 
@@ -155,7 +155,7 @@ def _single(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
 def _double(terms: Terms, band: Array, sense: Array, i: int, system: System, v: Array, u: Array) -> float:
     """Terms of the intervals before and after pose i."""
     total = 0.0
-    base, row = 4 * (i - 1), system.row
+    base, jacobian = 4 * (i - 1), system.jacobian
     _interval(band, i, v)
     _interval(band, i + 1, u)
     t0, t1 = band[i, 3], band[i + 1, 3]
@@ -165,8 +165,8 @@ def _double(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
     if over > 0.0:
         w = terms.w_rate * (1.0 if change > 0.0 else -1.0)
         half = 0.5 * terms.w_rate * terms.acceleration
-        _spread(row, 0, v, -w / t0, 0.0, 0.0, w * v0 / t0 - half)
-        _spread(row, 4, u, w / t1, 0.0, 0.0, -w * v1 / t1 - half)
+        _spread(jacobian, 0, v, -w / t0, 0.0, 0.0, w * v0 / t0 - half)
+        _spread(jacobian, 4, u, w / t1, 0.0, 0.0, -w * v1 / t1 - half)
         total += _add(system, base, terms.w_rate * over)
     if sense[i] != sense[i + 1] or abs(v[0]) < LEAST_STEP or abs(u[0]) < LEAST_STEP:
         return total
@@ -182,8 +182,8 @@ def _double(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
                 continue
             w = terms.w_smooth if kind == 0 else terms.w_rate * (1.0 if turned > 0.0 else -1.0)
             half = 0.0 if kind == 0 else 0.5 * terms.w_rate * terms.rate
-            _spread(row, 0, v, w * f0 / v[0], -w / v[0], -w * arm / v[0], -half)
-            _spread(row, 4, u, -w * f1 / u[0], w / u[0], w * arm / u[0], -half)
+            _spread(jacobian, 0, v, w * f0 / v[0], -w / v[0], -w * arm / v[0], -half)
+            _spread(jacobian, 4, u, -w * f1 / u[0], w / u[0], w * arm / u[0], -half)
             total += _add(system, base, w * turned if kind == 0 else terms.w_rate * over)
     return total
 
@@ -200,7 +200,7 @@ def _obstacles(field: FieldData, cover: Cover, terms: Terms, band: Array, i: int
         lack = terms.clearance - (value - cover.radius[k])
         if lack > 0.0:
             w = terms.w_obstacle / sqrt(len(cover.x))
-            system.row[0], system.row[1], system.row[2] = -w * gx, -w * gy, -w * (gy * ox - gx * oy)
+            system.jacobian[0], system.jacobian[1], system.jacobian[2] = -w * gx, -w * gy, -w * (gy * ox - gx * oy)
             total += _add(system, 4 * i, w * lack)
     return total
 
@@ -211,7 +211,7 @@ def _assemble(field: FieldData, cover: Cover, terms: Terms, band: Array, sense: 
     n = len(band)
     system.matrix[:] = 0.0
     system.gradient[:] = 0.0
-    system.row[:] = 0.0
+    system.jacobian[:] = 0.0
     v, u = np.empty(5), np.empty(5)
     total = 0.0
     for i in range(1, n):
@@ -458,15 +458,15 @@ def drivable(vehicle: Vehicle, terms: Terms, band: Array, directions: Array) -> 
     rear = np.clip(np.tan(slip) - terms.l_r * turn, -terms.rear / TAUT, terms.rear / TAUT)
     slip = np.arctan((terms.l_r * front + terms.l_f * rear) / reach)
     curvature = np.cos(slip) * (front - rear) / reach
-    rows = np.column_stack((length, curvature, slip))[np.abs(length) > 1e-4]
-    return MotionPath(band[0, :3], rows, ways(vehicle, rows), vehicle.reference)  # type: ignore[arg-type]
+    segments = np.column_stack((length, curvature, slip))[np.abs(length) > 1e-4]
+    return MotionPath(band[0, :3], segments, ways(vehicle, segments), vehicle.reference)  # type: ignore[arg-type]
 
 
 def turns_soon(path: MotionPath) -> bool:
     """Whether the path changes direction within the next metres: there it stays as it is."""
-    signs = np.sign(path.rows[:, 0])
+    signs = np.sign(path.segments[:, 0])
     change = np.flatnonzero(np.diff(signs))
-    return bool(len(change)) and float(np.abs(path.rows[: change[0] + 1, 0]).sum()) < BEFORE_CUSP
+    return bool(len(change)) and float(np.abs(path.segments[: change[0] + 1, 0]).sum()) < BEFORE_CUSP
 
 
 def resampled(guide: Guide, spacing: float) -> Guide:

@@ -1,4 +1,4 @@
-"""What goes into a route planner and what comes out: map, vehicle, budget, result. Compiled."""
+"""Interface of the route planners: map, vehicle, budget, result. Loads numba."""
 
 import math
 from collections.abc import Callable
@@ -14,22 +14,21 @@ from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceFie
 from monstertruck_planners.route.config import DriveCosts, Unknown
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
-from monstertruck_planners.route.search import Layer
+from monstertruck_planners.route.search import CostLayer
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import Grid
 
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class RouteMap:
-    """Ground to plan on.
+    """Map to plan on.
 
     Args:
         field: obstacles.
-        unknown: shape of the field's grid, bool: cells that are dear; None: none.
+        unknown: shape of the field's grid, bool: unknown cells, which cost extra; None: none.
         tilt: the same shape, rad, 0 where not known; None: level.
         roughness: the same shape, m; None: smooth.
 
@@ -50,16 +49,6 @@ class RouteMap:
                 raise InputError(f"route map: {name} of shape {layer.shape}: expected that of the grid, {shape}")
 
     @classmethod
-    def from_grid(
-        cls, grid: Grid, unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None
-    ) -> "RouteMap":
-        """Map of an occupancy grid, unknown cells by policy."""
-        cells = grid.cells.reshape(grid.height, grid.width)
-        return cls.from_cells(
-            cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), unknown, tilt, roughness
-        )
-
-    @classmethod
     def from_cells(
         cls, cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None,
@@ -71,39 +60,39 @@ class RouteMap:
             occupied = occupied | unseen
         return cls(DistanceField(occupied, resolution, origin), unseen if unknown == "dear" else None, tilt, roughness)
 
-    def layer(self, costs: DriveCosts, keep: float) -> Layer:
-        """Prices of all cells.
+    def cost_layer(self, costs: DriveCosts, contact: float) -> CostLayer:
+        """Extra costs of all cells.
 
         Args:
             costs: weights.
-            keep: distance to a cell's centre at which the footprint's side touches it, m.
+            contact: distance to a cell's centre at which the footprint's side touches it, m.
         """
         data = self.field.data()
-        price = np.zeros((0, 0), np.float32)
+        cost = np.zeros((0, 0), np.float32)
         for amount, weight in (
             (self.unknown, costs.unknown_cost),
             (self.tilt, costs.tilt_cost),
             (self.roughness, costs.roughness_cost),
         ):
             if amount is not None and weight > 0.0:
-                if not price.size:
-                    price = np.zeros(data.distance.shape, np.float32)
-                price[1:-1, 1:-1] += weight * np.abs(amount)
+                if not cost.size:
+                    cost = np.zeros(data.distance.shape, np.float32)
+                cost[1:-1, 1:-1] += weight * np.abs(amount)
         if costs.clearance > 0.0 and costs.clearance_cost > 0.0:
-            near = costs.clearance_cost * np.clip(1.0 - (data.distance - keep) / costs.clearance, 0.0, 1.0)
-            price = near.astype(np.float32) + (price if price.size else np.float32(0.0))
-        return Layer(price)
+            near = costs.clearance_cost * np.clip(1.0 - (data.distance - contact) / costs.clearance, 0.0, 1.0)
+            cost = near.astype(np.float32) + (cost if cost.size else np.float32(0.0))
+        return CostLayer(cost)
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What is driven.
+    """Footprint and limits of what is driven.
 
     Args:
-        footprint: of the reference point: its ``offset`` or disc centres are seen from there.
+        footprint: relative to the reference point, as its ``offset`` or disc centres say.
         radius: least turning radius of the reference point, m.
         crab_angle: largest angle of a translation, rad; 0: cannot crab.
-        steering: how arcs and lines are steered.
+        steering: mode of arcs and lines.
         reference: x of the reference point in base, m.
     """
 
@@ -135,19 +124,19 @@ class Vehicle:
         """Pose of the reference point for one of the base."""
         return moved(np.asarray(base, dtype=np.float64), self.reference)
 
-    def steer(self, costs: DriveCosts | None = None) -> ReedsShepp:
-        """Motions without obstacles, with the costs or by length."""
+    def reeds_shepp(self, costs: DriveCosts | None = None) -> ReedsShepp:
+        """Obstacle-free motions, cheapest by the costs, or shortest."""
         weights = (costs.reverse_cost, costs.cusp_cost, costs.crab_cost) if costs else (1.0, 0.0, 1.0)
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
 class Budget:
-    """How long a planner may go on: until a time, or for an amount of work.
+    """Limit of a planner: seconds, or an amount of work.
 
     Args:
-        seconds: from now on, needs ``now``.
-        now: gives seconds, monotonic.
-        effort: search steps and trials, if there is no clock.
+        seconds: from now on, if there is a clock.
+        now: the clock, monotonic, s.
+        effort: nodes expanded and smoothing trials, if there is no clock.
     """
 
     def __init__(self, seconds: float, now: Clock | None, effort: int) -> None:
@@ -162,24 +151,24 @@ class Budget:
         """Seconds since the beginning; 0 without a clock."""
         return self._now() - self._begin if self._now else 0.0
 
-    def left(self) -> float:
-        """Share of the budget that is left, at most 1."""
+    def remaining(self) -> float:
+        """Share of the budget that remains, at most 1."""
         used = self.elapsed / self._seconds if self._now else self.work / self._effort
         return max(1.0 - used, 0.0)
 
 
 @dataclass(frozen=True)
 class RouteResult:
-    """A route, or why there is none."""
+    """A route, or the reason why there is none."""
 
     reason: Reason
     path: MotionPath | None = None
     poses: Array | None = None
-    """Shape (n, 3): a route of grid A*, which is not drivable as it is: x, y, yaw of the reference point."""
+    """Shape (n, 3): x, y, yaw of the reference point, from planners whose routes are not drivable motions."""
     cost: float = math.inf
-    """Metres, with all prices."""
+    """Metres, with all extra costs."""
     text: str = ""
-    """What exactly was wrong."""
+    """Detail of the reason."""
     statistics: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -191,41 +180,48 @@ class RouteResult:
 class RoutePlanner(Protocol):
     """Pure: the same arguments, without a clock, give the same result."""
 
-    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route between two poses of the vehicle's reference point."""
+    def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+        """Route between two poses (x, y, yaw) of the vehicle's reference point.
+
+        Args:
+            route_map: obstacles and costs.
+            start: in the map's frame, m, rad.
+            goal: the same.
+            now: clock for the budget, s; None: the budget is an amount of work, and the result is reproducible.
+        """
 
 
 @dataclass(frozen=True)
-class Ends:
-    """Start and goal that may be used."""
+class Endpoints:
+    """Start and goal that are free."""
 
     start: Array
     goal: Array
 
 
-def check_ends(
-    ground: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float, margin: float
-) -> Ends | RouteResult:
-    """Start and goal, the latter within tolerance, or a refusal."""
+def check_endpoints(
+    route_map: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float, margin: float
+) -> Endpoints | RouteResult:
+    """Free start and goal, the latter within tolerance, or the result that refuses them."""
     try:
         a, b = (np.array(p, dtype=np.float64).reshape(3) for p in (start, goal))
     except (TypeError, ValueError):
         return RouteResult(Reason.BAD_INPUT, text="start and goal: expected x, y, yaw")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return RouteResult(Reason.NOT_FINITE, text="start and goal: expected finite numbers")
-    field, footprint = ground.field, vehicle.footprint
+    field, footprint = route_map.field, vehicle.footprint
     if not field.free(footprint, a[None], margin)[0]:
-        return RouteResult(Reason.START_BLOCKED, text=f"start {_said(a)}: the footprint overlaps an obstacle")
+        return RouteResult(Reason.START_BLOCKED, text=f"start {_format_pose(a)}: the footprint overlaps an obstacle")
     if not field.inside(b[:2]):
-        return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_said(b)}: off the map")
-    candidates = np.vstack((b, *(b + d for d in _tolerated(position, yaw))))
+        return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_format_pose(b)}: off the map")
+    candidates = np.vstack((b, *(b + d for d in _tolerance_offsets(position, yaw))))
     free = field.free(footprint, candidates, margin)
     if not free.any():
-        return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_said(b)}: the footprint overlaps an obstacle")
-    return Ends(a, candidates[int(np.argmax(free))])
+        return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_format_pose(b)}: the footprint overlaps an obstacle")
+    return Endpoints(a, candidates[int(np.argmax(free))])
 
 
-def _tolerated(position: float, yaw: float) -> list[Array]:
+def _tolerance_offsets(position: float, yaw: float) -> list[Array]:
     """Small displacements within the tolerances, the smallest first."""
     around = [(0.0, 0.0)]
     around += [
@@ -236,12 +232,12 @@ def _tolerated(position: float, yaw: float) -> list[Array]:
     return [np.array([x, y, t * yaw]) for x, y in around for t in (0.0, 0.5, -0.5, 0.98, -0.98)][1:]
 
 
-def _said(pose: Array) -> str:
+def _format_pose(pose: Array) -> str:
     return f"({pose[0]:g}, {pose[1]:g}, {pose[2]:g})"
 
 
 def warm_up(planner: RoutePlanner) -> None:
-    """Plan once on a small empty map, so that everything is compiled (or read from the cache) before it matters."""
+    """Plan once on a small map, so that numba compiles everything (or reads its cache) beforehand."""
     cells = np.zeros((80, 80), np.int8)
     cells[38:42, 36:44] = 100
     planner.plan(RouteMap.from_cells(cells, 0.1), (2.0, 4.0, 0.0), (6.0, 4.0, 1.0))

@@ -1,7 +1,11 @@
-"""Closes gaps into which the footprint fits in no heading, though a circle inside it does. Compiled.
+"""Corridors on the coarse grid: gaps too narrow for the footprint, and alternative ways. Loads numba.
 
-``distance_to_go`` sees the truck as a point with a radius, so it leads the search into slits. Looking at every cell and
-heading of a map would take longer than the search: only cells on the ways that matter are looked at.
+The cost to go treats the vehicle as a point with a radius, so it leads the search into gaps that a circle inside the
+footprint passes but the footprint does not. Checking every cell and heading of a map would take longer than the
+search: only cells on the ways in question are checked.
+
+Alternatives to the shortest way (other homotopy classes) come from the sum of the cost to the goal and from the start,
+which is the cost of the shortest way over a cell: the cheapest cell far from all known ways leads to a new one.
 """
 
 from math import ceil, pi
@@ -10,36 +14,37 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_planners.collision_kernels import BodyData, FieldData, room
-from monstertruck_planners.route.heuristic import FAR, STEPS
+from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
+from monstertruck_planners.route.heuristic import NEIGHBOURS, UNREACHED
 
-IntArray = NDArray[np.int64]
 HEADINGS = 72
-"""Looked at in half a turn."""
+"""Checked in half a turn."""
 
 STRIDE = 29
-"""Between two headings tried in turn: neighbours fit or do not fit alike."""
+"""Between two headings tried in turn: neighbouring headings fit or do not fit alike."""
 
 SAMPLE = 0.0125
-"""Between two places looked at, m; middles and borders of the grid's cells are among them."""
+"""Between two positions checked, m; middles and borders of the grid's cells are among them."""
 
 
 @njit(cache=True)
-def fits(field: FieldData, body: BodyData, margin: float, x: float, y: float) -> bool:
-    """Whether the footprint is free at a place in any heading."""
-    whole = 1 if abs(body.centre) < 1e-9 and abs(body.discs.sum()) < 1e-9 else 2
-    count = whole * HEADINGS
-    for k in range(count):  # noqa: SIM110 - compiled
-        if room(field, body, margin, x, y, (k * STRIDE % count) * pi / HEADINGS) >= 0.0:
+def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x: float, y: float) -> bool:
+    """Whether the footprint is free at a position in any heading."""
+    symmetric = abs(footprint.centre) < 1e-9 and abs(footprint.discs.sum()) < 1e-9
+    count = (1 if symmetric else 2) * HEADINGS
+    for k in range(count):
+        if safe_distance(field, footprint, margin, x, y, (k * STRIDE % count) * pi / HEADINGS) >= 0.0:
             return True
     return False
 
 
 @njit(cache=True)
-def _fits_in(field: FieldData, body: BodyData, margin: float, row: int, column: int, factor: int, wide: float) -> bool:
+def _fits_in_cell(
+    field: FieldData, footprint: FootprintData, margin: float, row: int, column: int, factor: int, wide: float
+) -> bool:
     """Whether the footprint fits anywhere in a coarse cell."""
     rows, columns = field.distance.shape
-    least = body.inscribed + margin
+    least = footprint.inscribed + margin
     last_row, last_column = min((row + 1) * factor, rows), min((column + 1) * factor, columns)
     for r in range(row * factor, last_row):
         for c in range(column * factor, last_column):
@@ -56,47 +61,47 @@ def _fits_in(field: FieldData, body: BodyData, margin: float, row: int, column: 
                 across = (r + k // places / pieces) * field.resolution
                 x = field.x + along * field.cos - across * field.sin
                 y = field.y + along * field.sin + across * field.cos
-                if fits(field, body, margin, x, y):
+                if footprint_fits(field, footprint, margin, x, y):
                     return True
     return False
 
 
 @njit(cache=True)
-def close_slits(
-    field: FieldData, body: BodyData, margin: float, toll: NDArray[np.int16], factor: int, wide: float,
-    lane: NDArray[np.bool_], looked: NDArray[np.bool_],
+def close_narrow_gaps(
+    field: FieldData, footprint: FootprintData, margin: float, cell_cost: NDArray[np.int16], factor: int, wide: float,
+    corridor: NDArray[np.bool_], checked: NDArray[np.bool_],
 ) -> int:  # fmt: skip
-    """Close the coarse cells of a lane in which the footprint fits nowhere.
+    """Close the coarse cells of a corridor in which the footprint fits nowhere.
 
     Args:
         field: the fine grid.
-        body: the footprint.
+        footprint: of the vehicle.
         margin: to keep, m.
-        toll: of the coarse cells, 0 = closed, see ``distance_to_go.tolls``; changed in place.
+        cell_cost: of the coarse cells, 0 = closed, see ``heuristic.cell_costs``; changed in place.
         factor: fine cells per coarse one, each way.
         wide: cells further than this from obstacles are taken to be open, m.
-        lane: coarse cells to be looked at.
-        looked: those that have been; changed in place.
+        corridor: coarse cells to be checked.
+        checked: those that have been; changed in place.
 
     Returns:
         Number of cells closed.
     """
     closed = 0
-    rows, columns = toll.shape
+    rows, columns = cell_cost.shape
     for row in range(rows):
         for column in range(columns):
-            if not lane[row, column] or looked[row, column]:
+            if not corridor[row, column] or checked[row, column]:
                 continue
-            looked[row, column] = True
-            if toll[row, column] > 0 and not _fits_in(field, body, margin, row, column, factor, wide):
-                toll[row, column] = 0
+            checked[row, column] = True
+            if cell_cost[row, column] > 0 and not _fits_in_cell(field, footprint, margin, row, column, factor, wide):
+                cell_cost[row, column] = 0
                 closed += 1
     return closed
 
 
 @njit(cache=True)
-def brush(mask: NDArray[np.bool_], row: int, column: int, radius: float) -> None:
-    """Mark the cells round one."""
+def _mark_disc(mask: NDArray[np.bool_], row: int, column: int, radius: float) -> None:
+    """Mark the cells around one."""
     rows, columns = mask.shape
     span = int(radius)
     for r in range(max(row - span, 0), min(row + span + 1, rows)):
@@ -106,27 +111,27 @@ def brush(mask: NDArray[np.bool_], row: int, column: int, radius: float) -> None
 
 
 @njit(cache=True)
-def brush_way(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, column: int, radius: float) -> None:
-    """Mark the cells round the way from one to where ``step`` ends."""
+def mark_corridor(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, column: int, radius: float) -> None:
+    """Mark the cells within ``radius`` cells of the way from one cell to where ``step`` ends."""
     while True:
-        brush(mask, row, column, radius)
+        _mark_disc(mask, row, column, radius)
         k = step[row, column]
         if k < 0:
             return
-        row += STEPS[k, 1]
-        column += STEPS[k, 0]
+        row += NEIGHBOURS[k, 1]
+        column += NEIGHBOURS[k, 0]
 
 
 @njit(cache=True)
-def cheapest_new(
-    to_goal: NDArray[np.int32], from_start: NDArray[np.int32], known: NDArray[np.bool_], limit: int
+def cheapest_unmarked(
+    to_goal: NDArray[np.int32], from_start: NDArray[np.int32], marked: NDArray[np.bool_], limit: int
 ) -> int:
-    """Flat index of the unknown cell with the cheapest way over it; -1 if none costs at most ``limit``."""
+    """Flat index of the unmarked cell with the cheapest way over it; -1 if none costs at most ``limit``."""
     best, where = limit + 1, -1
-    rows, columns = known.shape
+    rows, columns = marked.shape
     for row in range(rows):
         for column in range(columns):
-            if known[row, column] or to_goal[row, column] >= FAR or from_start[row, column] >= FAR:
+            if marked[row, column] or to_goal[row, column] >= UNREACHED or from_start[row, column] >= UNREACHED:
                 continue
             cost = to_goal[row, column] + from_start[row, column]
             if cost < best:

@@ -1,16 +1,16 @@
-"""The author's first planner: the cheapest way over a grid with inflated obstacles, for a truck as a point. Compiled.
+"""The author's first planner: the cheapest way over a grid with inflated obstacles, for a point. Loads numba.
 
-Costs as on the author's robot: neutral 50 for every cell, three times the costmap's value on top, nothing from 200 up;
-the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the way. The
-result is not drivable as it is: turning radius and footprint are not looked at.
+Costs as on the author's robot: neutral 50 for every cell, plus three times the costmap's value; cells from 200 up are
+closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the way.
+The result is no drivable motion: turning radius and footprint are not regarded.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.route import heuristic as togo
-from monstertruck_planners.route.api import Budget, Clock, RouteMap, RouteResult, Vehicle, check_ends
+from monstertruck_planners.route import heuristic
+from monstertruck_planners.route.api import Budget, Clock, RouteMap, RouteResult, Vehicle, check_endpoints
 from monstertruck_planners.route.config import GridAstarConfig
 from monstertruck_schemas.reasons import Reason
 
@@ -18,7 +18,7 @@ INSCRIBED_COST = 252.0
 
 
 class GridAstarPlanner:
-    """Ways over the grid.
+    """Ways over the grid for one vehicle.
 
     Args:
         vehicle: its inscribed circle inflates the obstacles.
@@ -29,25 +29,25 @@ class GridAstarPlanner:
         self.vehicle = vehicle
         self.config = config or GridAstarConfig()
 
-    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+    def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Way between two poses; ``poses`` of the result, one for each cell."""
         config = self.config
         budget = Budget(config.budget, now, config.effort)
-        ends = check_ends(
-            ground, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
+        ends = check_endpoints(
+            route_map, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
         )
         if isinstance(ends, RouteResult):
             return ends
-        field = ground.field.data()
-        toll = self._tolls(field.distance)
-        row, column = togo.cell_at(field, field.resolution, ends.start[0], ends.start[1])
-        goal_row, goal_column = togo.cell_at(field, field.resolution, ends.goal[0], ends.goal[1])
-        cost, step = togo.spread(
-            toll, np.zeros((0, 0), np.bool_), goal_row, goal_column, row * toll.shape[1] + column, 1.0
+        field = route_map.field.data()
+        cell_cost = self._cell_costs(field.distance)
+        row, column = heuristic.cell_at(field, field.resolution, ends.start[0], ends.start[1])
+        goal_row, goal_column = heuristic.cell_at(field, field.resolution, ends.goal[0], ends.goal[1])
+        cost, step = heuristic.dijkstra(
+            cell_cost, heuristic.EVERYWHERE, goal_row, goal_column, row * cell_cost.shape[1] + column, 1.0
         )
-        if cost[row, column] >= togo.FAR:
+        if cost[row, column] >= heuristic.UNREACHED:
             return RouteResult(Reason.GOAL_UNREACHABLE, text="no way over free cells")
-        cells = togo.cells_on_way(step, row, column)
+        cells = heuristic.cells_to_goal(step, row, column)
         across, along = (cells[:, 1] + 0.5) * field.resolution, (cells[:, 0] + 0.5) * field.resolution
         points = np.column_stack(
             (field.x + across * field.cos - along * field.sin, field.y + across * field.sin + along * field.cos)
@@ -58,12 +58,12 @@ class GridAstarPlanner:
             Reason.OK, poses=poses, cost=metres, statistics={"first_s": budget.elapsed, "cells": float(len(cells))}
         )
 
-    def _tolls(self, distance: NDArray[np.float32]) -> NDArray[np.int16]:
+    def _cell_costs(self, distance: NDArray[np.float32]) -> NDArray[np.int16]:
         config = self.config
         beyond = distance - np.float32(self.vehicle.footprint.inscribed_radius)
         value = np.where(beyond < config.inflation, INSCRIBED_COST * np.exp(-config.decay * np.maximum(beyond, 0)), 0.0)
-        toll = np.minimum(config.neutral + config.cost_factor * value, config.lethal - 1)
-        return np.where((value >= config.lethal - 1) | (beyond < 0), 0, toll).astype(np.int16)
+        cell_cost = np.minimum(config.neutral + config.cost_factor * value, config.lethal - 1)
+        return np.where((value >= config.lethal - 1) | (beyond < 0), 0, cell_cost).astype(np.int16)
 
 
 def _headed(points: Array, start: Array, goal: Array) -> Array:

@@ -1,4 +1,7 @@
-"""The main route planner: Hybrid-A* for a first route, then shortening and other ways while there is time. Compiled."""
+"""The main route planner: Hybrid-A* for a first route, then path smoothing and alternatives while there is time.
+
+Loads numba.
+"""
 
 import math
 from collections.abc import Iterator
@@ -9,86 +12,86 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.route import heuristic as togo
-from monstertruck_planners.route import search
-from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
+from monstertruck_planners.route import heuristic, search
+from monstertruck_planners.route.api import Budget, Clock, Endpoints, RouteMap, RouteResult, Vehicle, check_endpoints
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.corridors import brush_way, cheapest_new, close_slits
-from monstertruck_planners.route.heuristic import turning_table
-from monstertruck_planners.route.hybrid_search import CHUNK, LEVELS, MOST_NODES, Hunt, Level, Question
+from monstertruck_planners.route.corridors import cheapest_unmarked, close_narrow_gaps, mark_corridor
+from monstertruck_planners.route.hybrid_search import (
+    MAX_NODES,
+    RESOLUTIONS,
+    Resolution,
+    SearchProblem,
+    SearchRun,
+)
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.search import Layer
-from monstertruck_planners.route.smoothing import Draft, redraft, shorten, tidy
+from monstertruck_planners.route.smoothing import EditablePath, choose_headings, current_segments, editable, shortcut
 from monstertruck_schemas.reasons import Reason
 
-CHECK_STEP = 0.01
-"""Between two collision checks close to obstacles, m."""
-
-SKIN = 1e-3
-"""Kept beside the margin, as the footprint may come nearer between two checks, m."""
-
 BATCH = 1000
-"""Trials of shortening between two looks."""
+"""Smoothing trials between two checks of the budget."""
 
-PATIENCE = 12
+MAX_IDLE_ROUNDS = 12
 """Rounds of improvement without gain after which the route is taken to be the best."""
 
-FINE = (0.1, 0.03, 0.01)
-"""Shares of a stretch by which poses move at last."""
+FINE_SHIFTS = (0.1, 0.03, 0.01)
+"""Shares of a stretch by which poses move in the final smoothing."""
 
-FINE_SHARE = 0.1
-"""Of the budget, for these."""
+FINAL_SHARE = 0.1
+"""Of the budget, for the final smoothing."""
 
-LAST_SHARE = 0.4
-"""Of the budget, for shortening with translations and for these."""
+CRAB_SHARE = 0.4
+"""Of the budget, for smoothing with translations and for the final smoothing."""
 
-APART = 2.5
-"""Ways differ if they are this far apart somewhere, turning radii."""
+ALTERNATIVE_DISTANCE = 2.5
+"""Alternatives are this far from all known ways somewhere, turning radii."""
 
-DETOUR = 1.15
-"""Other ways are tried up to this factor on the shortest."""
+ALTERNATIVE_LENGTH = 1.15
+"""Alternatives are tried up to this factor on the shortest way."""
 
-FIRST_LOOK = 512
-"""Nodes expanded coarsely before gaps are measured and the fine search takes its turns."""
+FIRST_NODES = 512
+"""Nodes expanded coarsely before gaps are measured and the fine search takes turns."""
 
 GROWTH = 2
 """Of the nodes expanded in a turn, from one round to the next."""
 
-SLIT = 0.06
-"""Nearer than this and half the footprint's width to obstacles a place may be a slit, m."""
+OVERRUN = 1.3
+"""The cost to go is known up to this factor on the cost of the start."""
 
-SLIT_SLACK = 0.01
-"""By that much the places and headings looked at may be off the best ones, m."""
+NARROW = 0.06
+"""Nearer than this and half the footprint's width to obstacles a cell may belong to a narrow gap, m."""
 
-PLAY = 0.005
-"""Needed in a slit beyond the margin on both sides: with less no search finds the way through, m."""
+GAP_ERROR = 0.01
+"""The positions and headings checked may be off the best ones by that much, m."""
 
-SLIT_ROUNDS = 30
-"""Ways looked at for slits."""
+GAP_PLAY = 0.005
+"""Needed in a gap beyond the margin on both sides: with less no search finds the way through, m."""
 
-SLIT_LANE = 0.15
-"""Looked at on both sides of a way on which there is a slit, m."""
+GAP_ROUNDS = 30
+"""Ways checked for narrow gaps."""
 
-EMPTY = np.empty((0, 3))
+GAP_CORRIDOR = 0.15
+"""Checked on both sides of a way on which there is a narrow gap, m."""
 
-NARROWER = 0.005
+NO_SEGMENTS = np.empty((0, 3))
+
+MARGIN_STEP = 0.005
 """From one margin tried to the next, m."""
 
-WIDE_SHARE = 0.5
-"""Of what is left of the budget: for searches with narrower margins."""
+MARGIN_SHARE = 0.5
+"""Of the rest of the budget: for the searches with narrower margins."""
 
 NARROW_COST = 1.0
-"""Clearance cost of routes with the narrow margin: they keep it only where they have to, m."""
+"""Clearance cost of routes with a narrower margin: they use it only where they have to, m."""
 
 TRY_NARROWER = (Reason.START_BLOCKED, Reason.GOAL_BLOCKED, Reason.GOAL_UNREACHABLE, Reason.ROUTE_TIMEOUT)
 
 
 @dataclass(frozen=True)
-class Try:
-    """Searching with one of several margins."""
+class MarginAttempt:
+    """Planning with one of several margins."""
 
     reserve: float
-    """Share of the budget left for the others."""
+    """Share of the budget kept for the others."""
     first: bool
 
 
@@ -103,301 +106,287 @@ class HybridPlanner:
     def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or HybridConfig()
-        self.steer = vehicle.steer(self.config)
-        self.table = turning_table(vehicle.crab_angle)
-        self.body = vehicle.footprint.body()
-        self.side = self.body.half_width or self.body.radius
-        self._narrow = [HybridPlanner(vehicle, narrow) for narrow in narrower(self.config)]
+        self.reeds_shepp = vehicle.reeds_shepp(self.config)
+        self.table = heuristic.reeds_shepp_table(vehicle.crab_angle)
+        self.footprint = vehicle.footprint.data()
+        self.side = self.footprint.half_width or self.footprint.radius
+        self._narrower = [HybridPlanner(vehicle, narrow) for narrow in narrower_configs(self.config)]
 
-    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route of the vehicle's reference point; ``statistics["margin"]`` tells the margin it keeps.
-
-        Args:
-            ground: the map.
-            start: pose (x, y, yaw) in the map's frame, m, rad.
-            goal: the same.
-            now: seconds, for the budget; None: the config's ``effort`` limits the work and the result is reproducible.
-        """
+    def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+        """Route of the vehicle's reference point, see ``RoutePlanner``; ``statistics["margin"]`` is the margin kept."""
         budget = Budget(self.config.budget, now, self.config.effort)
-        planners, share = [self, *self._narrow], 1.0
+        planners, share = [self, *self._narrower], 1.0
         for planner in planners:
-            share *= WIDE_SHARE
-            last = planner is planners[-1]
-            result = planner.within(budget, ground, start, goal, Try(0.0 if last else share, planner is self))
+            share *= MARGIN_SHARE
+            attempt = MarginAttempt(0.0 if planner is planners[-1] else share, planner is self)
+            result = planner.plan_with_margin(budget, route_map, start, goal, attempt)
             if result.reason not in TRY_NARROWER:
                 break
         return replace(result, statistics={**result.statistics, "margin": planner.config.margin})
 
-    def within(
-        self, budget: Budget, ground: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: "Try"
+    def plan_with_margin(
+        self, budget: Budget, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: MarginAttempt
     ) -> RouteResult:
-        """Route with one margin, see ``plan``."""
+        """Route with the margin of this planner's settings, see ``plan``."""
         position, yaw, margin = self.config.position_tolerance, self.config.yaw_tolerance, self.config.margin
-        ends = check_ends(ground, self.vehicle, start, goal, position, yaw, margin)
+        ends = check_endpoints(route_map, self.vehicle, start, goal, position, yaw, margin)
         if isinstance(ends, RouteResult):
             return ends
-        return _Run(self, ground, ends, budget, attempt).route()
+        return _PlanningRun(self, route_map, ends, budget, attempt).route()
 
-    def keeping(self, margin: float) -> "HybridPlanner":
+    def planner_for(self, margin: float) -> "HybridPlanner":
         """The planner of the greatest margin tried that is not above this one; of the narrowest, if all are."""
-        planners = [self, *self._narrow]
+        planners = [self, *self._narrower]
         return next((planner for planner in planners if planner.config.margin <= margin), planners[-1])
 
     @property
     def tolerance(self) -> float:
-        """How far off the goal a route may end, m and rad."""
+        """Greatest deviation of a route's end from the goal, m and rad."""
         return max(self.config.position_tolerance, self.config.yaw_tolerance)
 
-    def free(self, ground: RouteMap, path: MotionPath) -> bool:
-        """Whether the vehicle may drive a path of its reference point."""
-        rows = np.ascontiguousarray(path.rows)
-        return bool(search.rows_free(ground.field.data(), self.body, self.car(LEVELS[0]), path.start, rows, len(rows)))
+    def free(self, route_map: RouteMap, path: MotionPath) -> bool:
+        """Whether a path of the reference point is free of collisions."""
+        segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
+        field = route_map.field.data()
+        return bool(search.segments_free(field, self.footprint, model, path.start, segments, len(segments)))
 
-    def cost(self, ground: RouteMap, path: MotionPath) -> float:
-        """What a path costs, m."""
-        layer = self.layer(ground)
-        rows = np.ascontiguousarray(path.rows)
-        car = self.car(LEVELS[0])
-        return float(search.rows_cost(ground.field.data(), layer, car, path.start, rows, len(rows), 0.0))
+    def cost(self, route_map: RouteMap, path: MotionPath) -> float:
+        """Cost of a path, m."""
+        segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
+        field, layer = route_map.field.data(), self.cost_layer(route_map)
+        return float(search.segments_cost(field, layer, model, path.start, segments, len(segments), 0.0))
 
-    def layer(self, ground: RouteMap) -> Layer:
-        """Prices on a map."""
-        return ground.layer(self.config, self.side + 0.5 * ground.field.resolution)
+    def cost_layer(self, route_map: RouteMap) -> search.CostLayer:
+        """Extra costs on a map."""
+        return route_map.cost_layer(self.config, self.side + 0.5 * route_map.field.resolution)
 
-    def car(self, level: Level) -> search.Car:
-        """The vehicle as the compiled search takes it, with moves of one level."""
+    def motion_model(self, resolution: Resolution) -> search.MotionModel:
+        """The vehicle's limits and costs, with motion primitives of a resolution."""
         radius, crab = self.vehicle.radius, self.vehicle.crab_angle
-        length = level.move * radius
-        moves = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
+        length = resolution.primitive * radius
+        primitives = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
         if crab > 0.0:
-            moves += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
-        leaps = np.array([16.0, 8.0, 4.0, 2.0]) * radius
-        weights, swing, margin = self.steer.weights, self.config.swing_cost, self.config.margin + SKIN
-        return search.Car(radius, crab, weights, swing, np.array(moves), leaps, CHECK_STEP, margin)
+            primitives += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
+        return search.MotionModel(
+            radius, crab, self.reeds_shepp.weights, self.config.swing_cost, np.array(primitives),
+            np.array([16.0, 8.0, 4.0, 2.0]) * radius, search.CHECK_STEP,
+            self.config.margin + search.CHECK_MARGIN,
+        )  # fmt: skip
 
 
-def narrower(config: HybridConfig) -> list[HybridConfig]:
+def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
     """Settings with the margins that are tried after that of ``config``."""
     spare = config.margin - config.narrow_margin
     if spare <= 0.0:
         return []
-    margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / NARROWER - 1e-6) + 1)[1:].tolist()
-    price = max(config.clearance_cost, NARROW_COST)
-    return [config.model_copy(update={"margin": m, "narrow_margin": m, "clearance_cost": price}) for m in margins]
+    margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / MARGIN_STEP - 1e-6) + 1)[1:].tolist()
+    cost = max(config.clearance_cost, NARROW_COST)
+    return [config.model_copy(update={"margin": m, "narrow_margin": m, "clearance_cost": cost}) for m in margins]
 
 
-class _Run:
-    """One planning request."""
+class _PlanningRun:
+    """One planning request with one margin."""
 
-    def __init__(self, planner: HybridPlanner, ground: RouteMap, ends: Ends, budget: Budget, attempt: Try) -> None:
+    def __init__(
+        self, planner: HybridPlanner, route_map: RouteMap, ends: Endpoints, budget: Budget, attempt: MarginAttempt
+    ) -> None:
         self.planner, self.vehicle, self.config, self.budget = planner, planner.vehicle, planner.config, budget
         self.attempt = attempt
-        self.table, self.body = planner.table, planner.body
+        self.footprint = planner.footprint
         self.start, self.goal = ends.start, ends.goal
-        self.field = ground.field.data()
-        self.layer = planner.layer(ground)
-        self.factor = max(round(togo.COARSE / self.field.resolution), 1)
+        self.field = route_map.field.data()
+        self.layer = planner.cost_layer(route_map)
+        self.factor = max(round(heuristic.COARSE_CELL / self.field.resolution), 1)
         self.cell = self.factor * self.field.resolution
-        self.car = planner.car(LEVELS[0])
+        self.model = planner.motion_model(RESOLUTIONS[0])
         self.random = np.random.default_rng(0)
-        self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "ways": 0}
-        self.question = Question(
-            self.field, self.body, self.layer, self.table, self.start, self.goal, self.config.greed, budget,
+        self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "alternatives": 0}
+        self.problem = SearchProblem(
+            self.field, self.footprint, self.layer, planner.table, self.start, self.goal, self.config.greed, budget,
             self.statistics,
         )  # fmt: skip
 
     def route(self) -> RouteResult:
-        rows = self._direct()
-        if rows is None:
-            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-            rows, reason, text = self._first(go)
-            if rows is None:
-                return self._none(reason, text)
+        segments = self._direct()
+        if segments is None:
+            segments, reason, text = self._search(self._cost_to_go())
+            if segments is None:
+                return RouteResult(reason, text=text, statistics=self._final_statistics())
         self.statistics["first_s"] = self.budget.elapsed
-        self.statistics["first_length"] = float(np.abs(rows[:, 0]).sum())
+        self.statistics["first_length"] = float(np.abs(segments[:, 0]).sum())
         if self.config.improve:
-            rows = self._improve(rows)
-        path = MotionPath(self.start, rows, self.vehicle.steering, self.vehicle.reference)
-        return RouteResult(Reason.OK, path, cost=self._cost(rows), statistics=self._told())
+            segments = self._improve(segments)
+        path = MotionPath(self.start, segments, self.vehicle.steering, self.vehicle.reference)
+        return RouteResult(Reason.OK, path, cost=self._cost(segments), statistics=self._final_statistics())
 
-    def _none(self, reason: Reason, text: str) -> RouteResult:
-        return RouteResult(reason, text=text, statistics=self._told())
-
-    def _told(self) -> dict[str, float]:
+    def _final_statistics(self) -> dict[str, float]:
         return {**self.statistics, "elapsed_s": self.budget.elapsed}
 
-    def _cell(self, pose: Array) -> tuple[int, int]:
-        return togo.cell_at(self.field, self.cell, pose[0], pose[1])
+    def _cell_of(self, pose: Array) -> tuple[int, int]:
+        return heuristic.cell_at(self.field, self.cell, pose[0], pose[1])
 
     @cached_property
-    def toll(self) -> NDArray[np.int16]:
+    def cell_cost(self) -> NDArray[np.int16]:
         """Cost of entering each coarse cell."""
         side = self.planner.side
-        return togo.tolls(
-            self.field, self.layer.price, self.factor,
-            self.body.inscribed + self.config.margin, side, side + 0.25 * self.vehicle.radius,
+        return heuristic.cell_costs(
+            self.field, self.layer.cost, self.factor,
+            self.footprint.inscribed + self.config.margin, side, side + 0.25 * self.vehicle.radius,
         )  # fmt: skip
 
-    def _ways(self, allowed: NDArray[np.bool_], stretch: float) -> togo.ToGo:
-        row, column = self._cell(self.start)
-        cost, step = togo.spread(self.toll, allowed, *self._cell(self.goal), row * self.toll.shape[1] + column, stretch)
-        return togo.ToGo(cost, step, self.toll, self.cell)
+    def _cost_to_go(
+        self, allowed: NDArray[np.bool_] = heuristic.EVERYWHERE, overrun: float = OVERRUN
+    ) -> heuristic.CostToGo:
+        row, column = self._cell_of(self.start)
+        stop = row * self.cell_cost.shape[1] + column
+        cost, step = heuristic.dijkstra(self.cell_cost, allowed, *self._cell_of(self.goal), stop, overrun)
+        return heuristic.CostToGo(cost, step, self.cell_cost, self.cell)
 
     def _direct(self) -> Array | None:
         """The best motion without obstacles, if it is free."""
-        rows = self.planner.steer.path(self.start, self.goal).rows
-        free = search.rows_free(self.field, self.body, self.car, self.start, np.ascontiguousarray(rows), len(rows))
-        return np.array(rows) if free else None
+        segments = np.ascontiguousarray(self.planner.reeds_shepp.path(self.start, self.goal).segments)
+        free = search.segments_free(self.field, self.footprint, self.model, self.start, segments, len(segments))
+        return np.array(segments) if free else None
 
-    def _first(self, go: togo.ToGo) -> tuple[Array | None, Reason, str]:
-        """A first way: a short coarse search, then gaps are measured, and a fine and the coarse one take turns."""
-        narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
-        if not self._known(go):
-            return narrow
-        coarse = self._hunt(go, LEVELS[0])
-        rows = coarse.go_on(FIRST_LOOK, self.attempt.reserve) if self.attempt.first else None
-        if rows is not None:
-            return rows, Reason.OK, ""
-        if self._close_slits(go):
-            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-            if not self._known(go):
-                return narrow
-            coarse = self._hunt(go, LEVELS[0])
-        fine = self._hunt(go, LEVELS[1])
-        rows = self._in_turns(fine, coarse)
-        if rows is None and fine.exhausted:
-            fine = self._hunt(self._ways(np.zeros((0, 0), np.bool_), stretch=1e4), LEVELS[2])
-            rows = fine.go_on(MOST_NODES, self.attempt.reserve)
-        if rows is not None:
-            return rows, Reason.OK, ""
+    def _search(self, to_go: heuristic.CostToGo) -> tuple[Array | None, Reason, str]:
+        """First route: a short coarse search, then gaps are measured, and a fine and the coarse one take turns."""
+        too_narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
+        if not self._reachable(to_go):
+            return too_narrow
+        coarse = self._search_run(to_go, RESOLUTIONS[0])
+        segments = coarse.run(FIRST_NODES, self.attempt.reserve) if self.attempt.first else None
+        if segments is not None:
+            return segments, Reason.OK, ""
+        if self._close_narrow_gaps(to_go):
+            to_go = self._cost_to_go()
+            if not self._reachable(to_go):
+                return too_narrow
+            coarse = self._search_run(to_go, RESOLUTIONS[0])
+        fine = self._search_run(to_go, RESOLUTIONS[1])
+        segments = self._run_in_turns(fine, coarse)
+        if segments is None and fine.exhausted:
+            fine = self._search_run(self._cost_to_go(overrun=1e4), RESOLUTIONS[2])
+            segments = fine.run(MAX_NODES, self.attempt.reserve)
+        if segments is not None:
+            return segments, Reason.OK, ""
         return None, Reason.GOAL_UNREACHABLE if fine.exhausted else Reason.ROUTE_TIMEOUT, "no drivable way found"
 
-    def _hunt(self, go: togo.ToGo, level: Level, sight: float = np.inf) -> Hunt:
-        level = level.fitting(self.field, self.vehicle.radius)
-        return Hunt(self.question, self.planner.car(level), go, level, sight)
+    def _search_run(self, to_go: heuristic.CostToGo, resolution: Resolution, goal_range: float = np.inf) -> SearchRun:
+        resolution = resolution.fitted(self.field, self.vehicle.radius)
+        return SearchRun(self.problem, self.planner.motion_model(resolution), to_go, resolution, goal_range)
 
-    def _in_turns(self, fine: Hunt, coarse: Hunt) -> Array | None:
-        quota = FIRST_LOOK
-        while self.budget.left() > self.attempt.reserve and not fine.exhausted:
-            for hunt in (fine, coarse):
-                rows = hunt.go_on(quota, self.attempt.reserve)
-                if rows is not None:
-                    return rows
-            quota *= GROWTH
+    def _run_in_turns(self, fine: SearchRun, coarse: SearchRun) -> Array | None:
+        count = FIRST_NODES
+        while self.budget.remaining() > self.attempt.reserve and not fine.exhausted:
+            for run in (fine, coarse):
+                segments = run.run(count, self.attempt.reserve)
+                if segments is not None:
+                    return segments
+            count *= GROWTH
         return None
 
-    def _known(self, go: togo.ToGo) -> bool:
-        return bool(go.cost[self._cell(self.start)] < togo.FAR)
+    def _reachable(self, to_go: heuristic.CostToGo) -> bool:
+        return bool(to_go.cost[self._cell_of(self.start)] < heuristic.UNREACHED)
 
-    def _close_slits(self, go: togo.ToGo) -> bool:
-        """Close the slits on the shortest way, on that round these, and so on; False if there are none."""
-        lane, looked = np.zeros(self.toll.shape, np.bool_), np.zeros(self.toll.shape, np.bool_)
-        # Without a margin to spare, slits that may do just so are left to the search.
-        margin = self.config.margin + (PLAY if self.config.margin >= SLIT_SLACK else -SLIT_SLACK)
-        wide = self.planner.side + self.config.margin + SLIT
+    def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
+        """Close the narrow gaps on the shortest way, on the next one around these, and so on; False: there are none."""
+        corridor, checked = np.zeros(self.cell_cost.shape, np.bool_), np.zeros(self.cell_cost.shape, np.bool_)
+        # Without a margin to spare, gaps that may be just wide enough are left to the search.
+        margin = self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
+        wide = self.planner.side + self.config.margin + NARROW
         any_closed = False
-        for _ in range(SLIT_ROUNDS):
-            for width in (0.0, SLIT_LANE / self.cell):
-                brush_way(lane, go.step, *self._cell(self.start), width)
-                closed = close_slits(self.field, self.body, margin, self.toll, self.factor, wide, lane, looked)
+        for _ in range(GAP_ROUNDS):
+            for width in (0.0, GAP_CORRIDOR / self.cell):
+                mark_corridor(corridor, to_go.step, *self._cell_of(self.start), width)
+                closed = close_narrow_gaps(
+                    self.field, self.footprint, margin, self.cell_cost, self.factor, wide, corridor, checked
+                )
                 if not closed and not width:
                     return any_closed
             any_closed = True
-            go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-            if not self._known(go):
+            to_go = self._cost_to_go()
+            if not self._reachable(to_go):
                 break
         return any_closed
 
-    def _improve(self, rows: Array) -> Array:
-        car = self.car
+    def _improve(self, segments: Array) -> Array:
+        model = self.model
         # Motions without translations are found in half the time: only the middle part allows for these.
-        plain = self.car = car._replace(crab=0.0)
-        rows = self._rounds(rows, self._other_ways(), PATIENCE, LAST_SHARE if car.crab > 0.0 else FINE_SHARE)
-        if car.crab > 0.0:
-            self.car = car
-            rows = self._rounds(rows, iter(()), 4, FINE_SHARE)
-            self.car = plain
-        best = self._draft(rows)
-        for shift in FINE:
-            self._settle(best, 1e-4, shift)
-        self.car = car
-        return best.rows[: best.used[0]].copy()
+        without_crab = self.model = model._replace(crab=0.0)
+        share = CRAB_SHARE if model.crab > 0.0 else FINAL_SHARE
+        segments = self._improve_in_rounds(segments, self._alternatives(), MAX_IDLE_ROUNDS, share)
+        if model.crab > 0.0:
+            self.model = model
+            segments = self._improve_in_rounds(segments, iter(()), 4, FINAL_SHARE)
+            self.model = without_crab
+        best = editable(self.start, segments)
+        for shift in FINE_SHIFTS:
+            self._shortcut(best, 1e-4, shift)
+        self.model = model
+        return current_segments(best).copy()
 
-    def _rounds(self, rows: Array, others: Iterator[Array], patience: int, reserve: float) -> Array:
-        """Polish the best route and other drafts in turn until nothing gains or only the reserve is left."""
-        best, cost = self._polished(rows, np.inf)
+    def _improve_in_rounds(self, segments: Array, others: Iterator[Array], max_idle: int, reserve: float) -> Array:
+        """Smooth the best route and the others in turn until nothing gains or only the reserve is left."""
+        best, cost = self._smoothed(segments, np.inf)
         idle = 0
-        while self.budget.left() > reserve and idle < patience:
-            rows = next(others, EMPTY)
-            rows, other = self._polished(rows if len(rows) else best, 1.05 * cost)
+        while self.budget.remaining() > reserve and idle < max_idle:
+            segments = next(others, NO_SEGMENTS)
+            segments, other = self._smoothed(segments if len(segments) else best, 1.05 * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
-                best, cost = rows, other
+                best, cost = segments, other
         return best
 
-    def _polished(self, rows: Array, promising: float) -> tuple[Array, float]:
-        """Shorten, face the better way everywhere, shorten again; given up early unless the cost gets ``promising``."""
-        draft = self._draft(rows)
-        self._settle(draft)
-        cost = self._cost(draft.rows[: draft.used[0]])
-        if cost < promising and self.budget.left() > 0.0:
-            other = self._draft(self._redrafted(draft))
+    def _smoothed(self, segments: Array, promising: float) -> tuple[Array, float]:
+        """Shortcuts, better headings, shortcuts again; only the first unless the cost gets below ``promising``."""
+        path = editable(self.start, segments)
+        self._shortcut(path)
+        cost = self._cost(current_segments(path))
+        if cost < promising and self.budget.remaining() > 0.0:
+            other = editable(self.start, self._with_best_headings(path))
             if other.used[0]:
-                self._settle(other)
-                if self._cost(other.rows[: other.used[0]]) < cost:
-                    draft = other
-        rows = draft.rows[: draft.used[0]].copy()
-        return rows, self._cost(rows)
+                self._shortcut(other)
+                if self._cost(current_segments(other)) < cost:
+                    path = other
+        segments = current_segments(path).copy()
+        return segments, self._cost(segments)
 
-    def _settle(self, draft: Draft, gain: float = 1e-3, shift: float = 0.25) -> None:
-        """Shorten until a batch of trials gains less than a share of the cost."""
-        last = np.inf
-        while self.budget.left() > 0.0 and (cost := self._cost(draft.rows[: draft.used[0]])) < (1.0 - gain) * last:
-            last = cost
-            self._trials(draft, BATCH, shift)
+    def _shortcut(self, path: EditablePath, gain: float = 1e-3, shift: float = 0.25) -> None:
+        """Shortcut trials until a batch gains less than a share of the cost."""
+        last, reach = np.inf, 40.0 * self.vehicle.radius
+        while self.budget.remaining() > 0.0 and (cost := self._cost(current_segments(path))) < (1.0 - gain) * last:
+            last, random = cost, self.random.random((BATCH, 6))
+            kept = shortcut(self.field, self.footprint, self.layer, self.model, path, reach, shift, random)
+            self.budget.work += BATCH
+            self.statistics["trials"] += BATCH
+            self.statistics["kept"] += kept
 
-    def _cost(self, rows: Array) -> float:
-        return float(search.rows_cost(self.field, self.layer, self.car, self.start, rows, len(rows), 0.0))
+    def _cost(self, segments: Array) -> float:
+        return float(search.segments_cost(self.field, self.layer, self.model, self.start, segments, len(segments), 0.0))
 
-    def _redrafted(self, draft: Draft) -> Array:
-        path = MotionPath(self.start, draft.rows[: draft.used[0]])
-        spacing = max(1.5 * self.vehicle.radius, path.length / 60) * self.random.uniform(0.7, 1.3)
-        samples = path.sample(spacing)
-        return redraft(
-            self.field, self.body, self.layer, self.car, samples.poses, samples.travelled, 16.0 * self.vehicle.radius
+    def _with_best_headings(self, path: EditablePath) -> Array:
+        whole = MotionPath(self.start, current_segments(path))
+        spacing = max(1.5 * self.vehicle.radius, whole.length / 60) * self.random.uniform(0.7, 1.3)
+        samples, reach = whole.sample(spacing), 16.0 * self.vehicle.radius
+        return choose_headings(
+            self.field, self.footprint, self.layer, self.model, samples.poses, samples.travelled, reach
         )
 
-    def _other_ways(self) -> Iterator[Array]:
-        """First drafts along all ways worth a look, the shortest ways first."""
-        go = self._ways(np.zeros((0, 0), np.bool_), stretch=1.3)
-        columns = self.toll.shape[1]
-        whole = np.zeros((0, 0), np.bool_)
-        back, back_step = togo.spread(self.toll, whole, *self._cell(self.start), -1, 1.0)
-        known = np.zeros(self.toll.shape, np.bool_)
-        width = APART * self.vehicle.radius / self.cell
-        limit = int(DETOUR * go.cost[self._cell(self.start)])
-        while (cell := cheapest_new(go.cost, back, known, limit)) >= 0:
-            lane = np.zeros(self.toll.shape, np.bool_)
-            for step in (go.step, back_step):
-                brush_way(lane, step, cell // columns, cell % columns, width)
-                brush_way(known, step, cell // columns, cell % columns, width)
-            self.statistics["ways"] += 1
-            # From far off the goal is not tried directly: that motion would leave the lane.
+    def _alternatives(self) -> Iterator[Array]:
+        """First routes along all alternatives to the shortest way, the shortest first."""
+        to_go = self._cost_to_go()
+        columns = self.cell_cost.shape[1]
+        from_start, back = heuristic.dijkstra(self.cell_cost, heuristic.EVERYWHERE, *self._cell_of(self.start), -1, 1.0)
+        known = np.zeros(self.cell_cost.shape, np.bool_)
+        width = ALTERNATIVE_DISTANCE * self.vehicle.radius / self.cell
+        limit = int(ALTERNATIVE_LENGTH * to_go.cost[self._cell_of(self.start)])
+        while (cell := cheapest_unmarked(to_go.cost, from_start, known, limit)) >= 0:
+            corridor = np.zeros(self.cell_cost.shape, np.bool_)
+            for step in (to_go.step, back):
+                mark_corridor(corridor, step, cell // columns, cell % columns, width)
+                mark_corridor(known, step, cell // columns, cell % columns, width)
+            self.statistics["alternatives"] += 1
+            # From further off the expansion to the goal is not tried: it would leave the corridor.
             near = 3.0 * self.vehicle.radius
-            rows = self._hunt(self._ways(lane, 1.3), LEVELS[0], near).go_on(CHUNK)
-            yield EMPTY if rows is None else rows
-
-    def _draft(self, rows: Array) -> Draft:
-        room = len(rows) + 400
-        draft = Draft(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(rows)]))
-        draft.rows[: len(rows)] = rows
-        draft.poses[0] = self.start
-        tidy(draft)
-        return draft
-
-    def _trials(self, draft: Draft, count: int, shift: float) -> None:
-        reach = 40.0 * self.vehicle.radius
-        kept = shorten(self.field, self.body, self.layer, self.car, draft, reach, shift, self.random.random((count, 6)))
-        self.budget.work += count
-        self.statistics["trials"] += count
-        self.statistics["kept"] += kept
+            segments = self._search_run(self._cost_to_go(corridor), RESOLUTIONS[0], near).run(search.CHUNK)
+            yield NO_SEGMENTS if segments is None else segments

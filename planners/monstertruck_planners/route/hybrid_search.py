@@ -1,8 +1,8 @@
-"""Hybrid-A*: poses grown by drivable moves, guided by two heuristics, compiled.
+"""Hybrid-A*: a search over poses grown by motion primitives, guided by two heuristics. Loads numba.
 
-Beside the short moves a node tries the best obstacle-free motion to the goal and to places further along the way of
-``distance_to_go``, so that open ground is crossed in leaps. Source of the idea of analytic expansions: D. Dolgov and
-others, "Practical search techniques in path planning for autonomous driving", 2008.
+Besides the primitives a node tries analytic expansions: the best obstacle-free motion to the goal, and to poses further
+along the cost-to-go path, so that open ground is crossed in few nodes. Source: D. Dolgov and others, "Practical search
+techniques in path planning for autonomous driving", 2008.
 """
 
 import math
@@ -15,18 +15,33 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import BodyData, FieldData
+from monstertruck_planners.collision_kernels import FieldData, FootprintData
 from monstertruck_planners.route.api import Budget
-from monstertruck_planners.route.heuristic import ToGo, cell_at, estimate, walk
+from monstertruck_planners.route.heuristic import CostToGo, cell_ahead, cell_at, heuristic_cost
 from monstertruck_planners.route.motion import advance
-from monstertruck_planners.route.reeds_shepp import COST, MOST_ROWS, connect
-from monstertruck_planners.route.search import EXHAUSTED, FOUND, RUNNING, Car, Layer, drop, push, rows_cost, rows_free
+from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
+from monstertruck_planners.route.search import (
+    CHUNK,
+    EXHAUSTED,
+    FOUND,
+    RUNNING,
+    CostLayer,
+    IntArray,
+    MotionModel,
+    drop,
+    push,
+    segments_cost,
+    segments_free,
+)
 
-IntArray = NDArray[np.int64]
+EXPANSION = -1
+"""Action of a node reached by an analytic expansion; others are numbers of primitives."""
 
+MAX_NODES = 400_000
+"""In one search."""
 
-LEAP = -1
-"""Action of a node reached by ``connect``; others are numbers of moves."""
+MAX_TABLE_CELLS = 1 << 26
+"""Cells of one search: a table of 256 MB, of which only what is visited takes memory."""
 
 
 class Nodes(NamedTuple):
@@ -37,32 +52,32 @@ class Nodes(NamedTuple):
     cost: Array
     parent: IntArray
     action: IntArray
-    sense: Array
+    direction: Array
     """+1 or -1: direction at the end; 0 at the start."""
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
-    """The heap."""
+    """The heap of open nodes."""
     table: NDArray[np.int32]
     """Shape (rows, columns, headings): number of the node in each cell plus one, 0 = none."""
     cell: float
     counts: IntArray
-    """Used nodes, size of the heap, nodes expanded so far, the node that saw the goal."""
+    """Used nodes, open nodes, nodes expanded so far, the node before the goal."""
 
 
-USED, WAITING, EXPANDED, LAST = 0, 1, 2, 3
+USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
 
 
 @njit(cache=True)
-def add(
-    field: FieldData, go: ToGo, table: NDArray[np.float32], car: Car, goal: Array, nodes: Nodes, greed: float,
-    x: float, y: float, yaw: float, cost: float, parent: int, action: int, sense: float, bound: float,
+def _open_node(
+    field: FieldData, to_go: CostToGo, table: NDArray[np.float32], model: MotionModel, goal: Array, nodes: Nodes,
+    heuristic_weight: float, x: float, y: float, yaw: float, cost: float, parent: int, action: int, direction: float,
 ) -> None:  # fmt: skip
-    """Put a pose on the open list if it is the cheapest in its cell and may lead to a solution below ``bound``."""
+    """Put a pose on the open list if it is the cheapest in its cell and the goal can be reached from there."""
     if nodes.counts[USED] >= len(nodes.cost):
         return
-    left = estimate(field, go, table, car.radius, goal, x, y, yaw)
-    if cost + left >= bound:
+    left = heuristic_cost(field, to_go, table, model.radius, goal, x, y, yaw)
+    if left == np.inf:
         return
     row, column = cell_at(field, nodes.cell, x, y)
     headings = nodes.table.shape[2]
@@ -76,27 +91,24 @@ def add(
         nodes.closed[other] = True
     k = nodes.counts[USED]
     nodes.pose[k, 0], nodes.pose[k, 1], nodes.pose[k, 2] = x, y, yaw
-    nodes.cost[k], nodes.parent[k], nodes.action[k], nodes.sense[k], nodes.closed[k] = (
-        cost,
-        parent,
-        action,
-        sense,
-        False,
-    )
+    nodes.cost[k], nodes.parent[k], nodes.action[k] = cost, parent, action
+    nodes.direction[k], nodes.closed[k] = direction, False
     nodes.table[row, column, heading] = k + 1
     nodes.counts[USED] = k + 1
-    nodes.counts[WAITING] = push(nodes.keys, nodes.items, nodes.counts[WAITING], cost + greed * left, k)
+    nodes.counts[OPEN] = push(nodes.keys, nodes.items, nodes.counts[OPEN], cost + heuristic_weight * left, k)
 
 
 @njit(cache=True)
-def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: float, target: Array) -> bool:
-    """Pose ``leap`` metres along the way to the goal; False if the goal is nearer."""
-    row, column = cell_at(field, go.cell, x, y)
-    row, column = walk(go.step, row, column, leap / go.cell)
-    ahead_row, ahead_column = walk(go.step, row, column, turn / go.cell)
-    if go.step[ahead_row, ahead_column] < 0:
+def _expansion_target(
+    field: FieldData, to_go: CostToGo, x: float, y: float, distance: float, look_ahead: float, target: Array
+) -> bool:
+    """Pose ``distance`` metres along the cost-to-go path, facing along it; False if the goal is nearer."""
+    row, column = cell_at(field, to_go.cell, x, y)
+    row, column = cell_ahead(to_go.step, row, column, distance / to_go.cell)
+    ahead_row, ahead_column = cell_ahead(to_go.step, row, column, look_ahead / to_go.cell)
+    if to_go.step[ahead_row, ahead_column] < 0:
         return False
-    across, along = (column + 0.5) * go.cell, (row + 0.5) * go.cell
+    across, along = (column + 0.5) * to_go.cell, (row + 0.5) * to_go.cell
     target[0] = field.x + across * field.cos - along * field.sin
     target[1] = field.y + across * field.sin + along * field.cos
     target[2] = atan2(ahead_row - row, ahead_column - column) + atan2(field.sin, field.cos)
@@ -105,76 +117,74 @@ def _target(field: FieldData, go: ToGo, x: float, y: float, leap: float, turn: f
 
 @njit(cache=True)
 def expand(
-    field: FieldData, body: BodyData, layer: Layer, go: ToGo, table: NDArray[np.float32], car: Car,
-    goal: Array, nodes: Nodes, greed: float, bound: float, sight: float, count: int,
+    field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, table: NDArray[np.float32],
+    model: MotionModel, goal: Array, nodes: Nodes, heuristic_weight: float, goal_range: float, count: int,
 ) -> int:  # fmt: skip
     """Expand up to ``count`` nodes.
 
     Args:
         field: the grid.
-        body: the footprint.
-        layer: prices.
-        go: ways to the goal.
-        table: see ``turning_table``.
-        car: what may be driven.
+        footprint: of the vehicle.
+        layer: extra costs.
+        to_go: ways to the goal.
+        table: see ``reeds_shepp_table``.
+        model: limits, costs and primitives of the vehicle.
         goal: shape (3,).
         nodes: memory.
-        greed: factor on the heuristics.
-        bound: only cheaper solutions count, m.
-        sight: the goal is tried directly from this near, m.
+        heuristic_weight: factor on the heuristics.
+        goal_range: expansions to the goal are tried from this near, m.
         count: see above.
 
     Returns:
-        RUNNING, FOUND (the node ``counts[LAST]`` sees the goal, cheaper than ``bound``) or EXHAUSTED.
+        RUNNING, FOUND (the goal is reached from the node ``counts[LAST]``) or EXHAUSTED.
     """
-    rows, best, scratch, target = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
-    row = np.empty((1, 3))
+    segments, best, scratch, target = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
+    primitive = np.empty((1, 3))
     for _ in range(count):
-        if nodes.counts[WAITING] == 0 or nodes.counts[USED] >= len(nodes.cost):
+        if nodes.counts[OPEN] == 0 or nodes.counts[USED] >= len(nodes.cost):
             return EXHAUSTED
         n = nodes.items[0]
-        nodes.counts[WAITING] = drop(nodes.keys, nodes.items, nodes.counts[WAITING])
+        nodes.counts[OPEN] = drop(nodes.keys, nodes.items, nodes.counts[OPEN])
         if nodes.closed[n]:
             continue
         nodes.closed[n] = True
         nodes.counts[EXPANDED] += 1
-        pose, cost, sense = nodes.pose[n], nodes.cost[n], nodes.sense[n]
+        pose, cost, direction = nodes.pose[n], nodes.cost[n], nodes.direction[n]
         away = sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2)
-        if away < sight and (away < 6.0 * car.radius or nodes.counts[EXPANDED] % 4 == 1):
-            many = connect(pose, goal, car.radius, car.crab, car.weights, rows, best, scratch)
-            if (
-                cost + best[COST] * car.radius < bound
-                and cost + rows_cost(field, layer, car, pose, rows, many, sense) < bound
-                and rows_free(field, body, car, pose, rows, many)
-            ):
+        if away < goal_range and (away < 6.0 * model.radius or nodes.counts[EXPANDED] % 4 == 1):
+            many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
+            if segments_free(field, footprint, model, pose, segments, many):
                 nodes.counts[LAST] = n
                 return FOUND
-        for i in range(len(car.leaps)):
-            if not _target(field, go, pose[0], pose[1], car.leaps[i], car.radius, target):
+        for i in range(len(model.expansion_lengths)):
+            distance = model.expansion_lengths[i]
+            if not _expansion_target(field, to_go, pose[0], pose[1], distance, model.radius, target):
                 continue
-            many = connect(pose, target, car.radius, car.crab, car.weights, rows, best, scratch)
-            if best[COST] * car.radius < 2.0 * car.leaps[i] + 6.0 * car.radius and rows_free(
-                field, body, car, pose, rows, many
+            many = connect(pose, target, model.radius, model.crab, model.weights, segments, best, scratch)
+            if best[COST] * model.radius < 2.0 * distance + 6.0 * model.radius and segments_free(
+                field, footprint, model, pose, segments, many
             ):
-                price = rows_cost(field, layer, car, pose, rows, many, sense)
-                end = rows[many - 1, 0]
-                add(field, go, table, car, goal, nodes, greed, target[0], target[1], target[2], cost + price, n, LEAP,
-                    1.0 if end > 0.0 else -1.0, bound)  # fmt: skip
+                step_cost = segments_cost(field, layer, model, pose, segments, many, direction)
+                end = 1.0 if segments[many - 1, 0] > 0.0 else -1.0
+                _open_node(field, to_go, table, model, goal, nodes, heuristic_weight,
+                           target[0], target[1], target[2], cost + step_cost, n, EXPANSION, end)  # fmt: skip
                 break
-        for i in range(len(car.moves)):
-            row[0, 0], row[0, 1], row[0, 2] = car.moves[i, 0], car.moves[i, 1], car.moves[i, 2]
-            if rows_free(field, body, car, pose, row, 1):
-                x, y, yaw = advance(pose[0], pose[1], pose[2], row[0, 0], row[0, 1], row[0, 2])
-                price = rows_cost(field, layer, car, pose, row, 1, sense)
-                add(field, go, table, car, goal, nodes, greed, x, y, yaw, cost + price, n, i,
-                    1.0 if row[0, 0] > 0.0 else -1.0, bound)  # fmt: skip
+        for i in range(len(model.primitives)):
+            for k in range(3):
+                primitive[0, k] = model.primitives[i, k]
+            if segments_free(field, footprint, model, pose, primitive, 1):
+                x, y, yaw = advance(pose[0], pose[1], pose[2], primitive[0, 0], primitive[0, 1], primitive[0, 2])
+                step_cost = segments_cost(field, layer, model, pose, primitive, 1, direction)
+                end = 1.0 if primitive[0, 0] > 0.0 else -1.0
+                _open_node(field, to_go, table, model, goal, nodes, heuristic_weight,
+                           x, y, yaw, cost + step_cost, n, i, end)  # fmt: skip
     return RUNNING
 
 
 @njit(cache=True)
-def trace(car: Car, goal: Array, nodes: Nodes) -> Array:
-    """Motion rows of the solution at ``counts[LAST]``, from the start to the goal."""
-    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
+def _trace(model: MotionModel, goal: Array, nodes: Nodes) -> Array:
+    """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
+    segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, nodes.counts[LAST]
     while nodes.parent[n] >= 0:
         depth += 1
@@ -184,131 +194,123 @@ def trace(car: Car, goal: Array, nodes: Nodes) -> Array:
     for i in range(depth - 1, -1, -1):
         chain[i] = n
         n = nodes.parent[n]
-    result = np.empty((depth * MOST_ROWS, 3))
+    result = np.empty((depth * MAX_SEGMENTS, 3))
     used = 0
     for i in range(depth):
         n = chain[i]
         last = i == depth - 1
         if not last and nodes.action[chain[i + 1]] >= 0:
-            move = nodes.action[chain[i + 1]]
+            primitive = nodes.action[chain[i + 1]]
             for k in range(3):
-                result[used, k] = car.moves[move, k]
+                result[used, k] = model.primitives[primitive, k]
             used += 1
             continue
         target = goal if last else nodes.pose[chain[i + 1]]
-        many = connect(nodes.pose[n], target, car.radius, car.crab, car.weights, rows, best, scratch)
+        many = connect(nodes.pose[n], target, model.radius, model.crab, model.weights, segments, best, scratch)
         for j in range(many):
             for k in range(3):
-                result[used, k] = rows[j, k]
+                result[used, k] = segments[j, k]
             used += 1
     return result[:used].copy()
 
 
-CHUNK = 256
-"""Nodes expanded between two looks at the budget."""
-
-MOST_NODES = 400_000
-"""In one """
-
-
-MOST_POSES = 1 << 26
-"""Told apart in one search: a table of 256 MB, of which only what is visited takes memory."""
-
-
 @dataclass(frozen=True)
-class Level:
-    """How finely poses are told apart."""
+class Resolution:
+    """Size of the search's cells, and length of its primitives."""
 
     cell: float
     """In turning radii."""
-    move: float
+    primitive: float
     """The same."""
     headings: int = 36
 
-    def fitting(self, field: FieldData, radius: float) -> "Level":
-        """This level, or on a map too large for it a coarser one.
+    def fitted(self, field: FieldData, radius: float) -> "Resolution":
+        """This resolution, or on a map too large for it a coarser one.
 
         Args:
             field: the map.
             radius: turning radius, m.
         """
-        poses = field.occupied.size * (field.resolution / (self.cell * radius)) ** 2 * self.headings
-        factor = max(math.sqrt(poses / MOST_POSES), 1.0)
-        return Level(self.cell * factor, self.move * factor, self.headings)
+        cells = field.occupied.size * (field.resolution / (self.cell * radius)) ** 2 * self.headings
+        factor = max(math.sqrt(cells / MAX_TABLE_CELLS), 1.0)
+        return Resolution(self.cell * factor, self.primitive * factor, self.headings)
 
 
-LEVELS = (Level(0.35, 0.55), Level(0.15, 0.25), Level(0.06, 0.1, 72))
-"""The second one is for narrow places, where the first finds nothing soon; the third where that is at its end."""
+RESOLUTIONS = (Resolution(0.35, 0.55), Resolution(0.15, 0.25), Resolution(0.06, 0.1, 72))
+"""The second one is for narrow places, where the first finds nothing soon; the third where that is exhausted."""
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is looked for."""
+class SearchProblem:
+    """What is searched for."""
 
     field: FieldData
-    body: BodyData
-    layer: Layer
+    footprint: FootprintData
+    layer: CostLayer
     table: NDArray[np.float32]
-    """See ``turning_table``."""
+    """See ``reeds_shepp_table``."""
     start: Array
     goal: Array
     """Poses, shape (3,)."""
-    greed: float
+    heuristic_weight: float
     budget: Budget
-    """Takes down the nodes expanded."""
+    """Counts the nodes expanded."""
     statistics: dict[str, float]
     """The same, under "expanded"."""
 
 
-class Hunt:
-    """One search.
+class SearchRun:
+    """One search, which can be interrupted and continued.
 
     Args:
-        question: what is looked for.
-        car: what may be driven, with moves of the level.
-        go: ways to the goal.
-        level: how fine.
-        sight: the goal is tried directly from this near, m.
+        problem: what is searched for.
+        model: limits and costs of the vehicle, with primitives of the resolution.
+        to_go: ways to the goal.
+        resolution: of the search.
+        goal_range: expansions to the goal are tried from this near, m.
     """
 
-    def __init__(self, question: Question, car: Car, go: ToGo, level: Level, sight: float = np.inf) -> None:
-        self._asked, self._car, self._go, self._sight = question, car, go, sight
-        self._nodes = _room(question.field, level.cell * car.radius, level.headings)
+    def __init__(
+        self, problem: SearchProblem, model: MotionModel, to_go: CostToGo, resolution: Resolution,
+        goal_range: float = np.inf,
+    ) -> None:  # fmt: skip
+        self._problem, self._model, self._to_go, self._goal_range = problem, model, to_go, goal_range
+        self._nodes = _allocate(problem.field, resolution.cell * model.radius, resolution.headings)
         self.exhausted = False
-        """Whether there is nothing left to look at."""
-        (x, y, yaw), greed = question.start, question.greed
-        add(
-            question.field, go, question.table, car, question.goal, self._nodes, greed, x, y, yaw, 0.0, -1,
-            LEAP, 0.0, np.inf,
+        """Whether no node is left to expand."""
+        x, y, yaw = problem.start
+        _open_node(
+            problem.field, to_go, problem.table, model, problem.goal, self._nodes, problem.heuristic_weight,
+            x, y, yaw, 0.0, -1, EXPANSION, 0.0,
         )  # fmt: skip
 
-    def go_on(self, count: int, reserve: float = 0.0) -> Array | None:
+    def run(self, count: int, reserve: float = 0.0) -> Array | None:
         """Expand about ``count`` more nodes, while more than ``reserve`` of the budget is left.
 
         Returns:
-            Motion rows from start to goal, if they were found.
+            Segments from start to goal, if they were found.
         """
-        asked, nodes = self._asked, self._nodes
+        problem, nodes = self._problem, self._nodes
         first = int(nodes.counts[EXPANDED])
         status = EXHAUSTED if self.exhausted else RUNNING
-        while status == RUNNING and asked.budget.left() > reserve:
+        while status == RUNNING and problem.budget.remaining() > reserve:
             before = int(nodes.counts[EXPANDED])
             if before - first >= count:
                 break
             status = expand(
-                asked.field, asked.body, asked.layer, self._go, asked.table, self._car, asked.goal, nodes, asked.greed,
-                np.inf, self._sight, CHUNK,
+                problem.field, problem.footprint, problem.layer, self._to_go, problem.table, self._model,
+                problem.goal, nodes, problem.heuristic_weight, self._goal_range, CHUNK,
             )  # fmt: skip
-            done = int(nodes.counts[EXPANDED]) - before
-            asked.budget.work += done
-            asked.statistics["expanded"] += done
+            expanded = int(nodes.counts[EXPANDED]) - before
+            problem.budget.work += expanded
+            problem.statistics["expanded"] += expanded
         self.exhausted = status == EXHAUSTED
-        return trace(self._car, asked.goal, nodes) if status == FOUND else None
+        return _trace(self._model, problem.goal, nodes) if status == FOUND else None
 
 
-def _room(field: FieldData, cell: float, headings: int) -> Nodes:
+def _allocate(field: FieldData, cell: float, headings: int) -> Nodes:
     """Memory for the nodes of a search."""
-    n = MOST_NODES
+    n = MAX_NODES
     rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
     return Nodes(
         np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n),

@@ -1,7 +1,14 @@
-"""State-lattice planner with moves of exact radius; searched again less greedily while time is left. Compiled."""
+"""State-lattice planner: A* over cells and headings, repeated with a smaller heuristic weight while there is time.
+
+Cells and headings are exact; the goal is reached by one obstacle-free motion. There are 16 headings, those of the
+grid's short vectors. A turn to the next heading is line, arc, line with the largest radius that fits, and of all cells
+it could end at that with the shortest turn is taken. The primitives are computed for each vehicle: stored sets that
+keep their cells when the cell size changes turn tighter than the car.
+
+Loads numba.
+"""
 
 import math
-from dataclasses import dataclass
 from math import cos, inf, sin, sqrt
 from typing import NamedTuple
 
@@ -10,56 +17,72 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import BodyData, FieldData
-from monstertruck_planners.route.api import Budget, Clock, Ends, RouteMap, RouteResult, Vehicle, check_ends
+from monstertruck_planners.collision_kernels import FieldData, FootprintData
+from monstertruck_planners.route.api import Budget, Clock, Endpoints, RouteMap, RouteResult, Vehicle, check_endpoints
 from monstertruck_planners.route.config import LatticeConfig
-from monstertruck_planners.route.heuristic import COARSE, FAR, UNIT, ToGo, cell_at, spread, tolls
+from monstertruck_planners.route.heuristic import (
+    COARSE_CELL,
+    EVERYWHERE,
+    UNIT,
+    UNREACHED,
+    CostToGo,
+    cell_at,
+    cell_costs,
+    dijkstra,
+)
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.route.reeds_shepp import COST, connect
+from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
 from monstertruck_planners.route.search import (
+    CHECK_MARGIN,
+    CHECK_STEP,
+    CHUNK,
     EXHAUSTED,
     FOUND,
     RUNNING,
-    Car,
-    Layer,
+    CostLayer,
+    IntArray,
+    MotionModel,
     drop,
+    layer_cost,
     push,
-    row_price,
-    rows_cost,
-    rows_free,
+    segments_cost,
+    segments_free,
 )
 from monstertruck_schemas.reasons import Reason
-
-IntArray = NDArray[np.int64]
 
 VECTORS = (
     (1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1),
     (-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1),
 )  # fmt: skip
 ANGLES = np.array([math.atan2(y, x) for x, y in VECTORS])
+HEADINGS = len(VECTORS)
 LONG = 8
-"""Cells of the long straight move, about."""
-MOST_MOVE_ROWS = 3
+"""Cells of the long straight primitive, about."""
+MAX_PRIMITIVE_SEGMENTS = 3
+
+MAX_STATES = 1 << 19
+
+MAX_CELLS = 1 << 15
+"""On either side of the start."""
 
 
-@dataclass(frozen=True)
-class Moves:
-    """All moves, by the heading they start at.
+class Primitives(NamedTuple):
+    """The motion primitives by the heading they start at."""
 
-    ``rows[h, k]`` are up to three motion rows (unused ones of length 0), ``shift[h, k]`` the columns, rows and headings
-    moved on, ``cost[h, k]`` the price in metres, ``number[h]`` their number.
-    """
-
-    rows: Array
+    segments: Array
+    """Shape (headings, k, 3, 3): up to three segments each, unused ones of length 0."""
     shift: IntArray
+    """Shape (headings, k, 3): columns, rows and headings moved on."""
     cost: Array
-    number: IntArray
+    """Shape (headings, k), m."""
+    used: IntArray
+    """Shape (headings,): number of primitives."""
 
 
-def make_moves(
+def make_primitives(
     radius: float, crab_angle: float, cell: float, factors: tuple[float, float, float] = (2.0, 3.0, 5.0)
-) -> Moves:
-    """Moves of one truck.
+) -> Primitives:
+    """Motion primitives of one vehicle.
 
     Args:
         radius: least turning radius, m.
@@ -67,50 +90,53 @@ def make_moves(
         cell: m.
         factors: on the cost of a turn forward, a line backward, a turn or translation backward.
     """
-    table = [_moves_from(h, radius, crab_angle, cell, factors) for h in range(len(VECTORS))]
+    table = [_primitives_from(h, radius, crab_angle, cell, factors) for h in range(len(VECTORS))]
     most = max(map(len, table))
-    rows = np.zeros((len(VECTORS), most, MOST_MOVE_ROWS, 3))
+    segments = np.zeros((len(VECTORS), most, MAX_PRIMITIVE_SEGMENTS, 3))
     shift, cost = np.zeros((len(VECTORS), most, 3), np.int64), np.zeros((len(VECTORS), most))
-    for h, moves in enumerate(table):
-        for k, (pieces, where, price) in enumerate(moves):
-            rows[h, k, : len(pieces)] = pieces
+    for h, primitives in enumerate(table):
+        for k, (pieces, where, price) in enumerate(primitives):
+            segments[h, k, : len(pieces)] = pieces
             shift[h, k], cost[h, k] = where, price
-    return Moves(rows, shift, cost, np.array([len(moves) for moves in table]))
+    return Primitives(segments, shift, cost, np.array([len(primitives) for primitives in table]))
 
 
-Move = tuple[list[tuple[float, float, float]], tuple[int, int, int], float]
+_Segment = tuple[float, float, float]
+_Primitive = tuple[list[_Segment], tuple[int, int, int], float]
 
 
-def _moves_from(h: int, radius: float, crab: float, cell: float, factors: tuple[float, float, float]) -> list[Move]:
+def _primitives_from(
+    h: int, radius: float, crab: float, cell: float, factors: tuple[float, float, float]
+) -> list[_Primitive]:
     turn_factor, back_factor, back_turn_factor = factors
     x, y = VECTORS[h]
-    moves: list[Move] = []
+    primitives: list[_Primitive] = []
     for steps in (1, max(round(LONG / math.hypot(x, y)), 2)):
         length = steps * math.hypot(x, y) * cell
-        moves.append(([(length, 0.0, 0.0)], (steps * x, steps * y, 0), length))
+        primitives.append(([(length, 0.0, 0.0)], (steps * x, steps * y, 0), length))
         if steps == 1:
-            moves.append(([(-length, 0.0, 0.0)], (-x, -y, 0), back_factor * length))
+            primitives.append(([(-length, 0.0, 0.0)], (-x, -y, 0), back_factor * length))
     for turn in (1, -1):
         pieces, (dx, dy) = _turn(h, turn, radius, cell)
-        length = sum(abs(row[0]) for row in pieces)
-        moves.append((pieces, (dx, dy, turn), turn_factor * length))
+        length = sum(abs(piece[0]) for piece in pieces)
+        primitives.append((pieces, (dx, dy, turn), turn_factor * length))
     for turn in (1, -1):
-        # Backward into the next heading: the way of a turn from there, driven back.
-        pieces, (dx, dy) = _turn((h + turn) % 16, -turn, radius, cell)
-        length = sum(abs(row[0]) for row in pieces)
+        # Backward into the next heading: a turn from there, driven back.
+        pieces, (dx, dy) = _turn((h + turn) % HEADINGS, -turn, radius, cell)
+        length = sum(abs(piece[0]) for piece in pieces)
         back = [(-s, k, b) for s, k, b in reversed(pieces)]
-        moves.append((back, (-dx, -dy, turn), back_turn_factor * length))
+        primitives.append((back, (-dx, -dy, turn), back_turn_factor * length))
     for side in (1, -1) if crab > 0.0 else ():
         for dx, dy, angle in _translations(h, side, crab):
             length = math.hypot(dx, dy) * cell
-            moves.append(([(length, 0.0, angle)], (dx, dy, 0), length))
-            moves.append(([(-length, 0.0, angle)], (-dx, -dy, 0), back_turn_factor * length))
-    return moves
+            primitives.append(([(length, 0.0, angle)], (dx, dy, 0), length))
+            primitives.append(([(-length, 0.0, angle)], (-dx, -dy, 0), back_turn_factor * length))
+    return primitives
 
 
-def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[tuple[float, float, float]], tuple[int, int]]:
+def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment], tuple[int, int]]:
     """Shortest turn to the next heading that ends on a cell, with the largest radius that fits."""
-    a, b = ANGLES[h], ANGLES[h] + math.remainder(ANGLES[(h + turn) % 16] - ANGLES[h], math.tau)
+    a, b = ANGLES[h], ANGLES[h] + math.remainder(ANGLES[(h + turn) % HEADINGS] - ANGLES[h], math.tau)
     lines = np.array([[math.cos(a), math.cos(b)], [math.sin(a), math.sin(b)]])
     arc = turn * np.array([math.sin(b) - math.sin(a), math.cos(a) - math.cos(b)])
     reach = math.ceil(2.0 * radius * abs(b - a) / cell) + 6
@@ -131,7 +157,7 @@ def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[tuple[flo
     assert best is not None
     _, ends, widest, where = best
     pieces = [(float(ends[0]), 0.0, 0.0), (widest * abs(b - a), turn / widest, 0.0), (float(ends[1]), 0.0, 0.0)]
-    return [row for row in pieces if row[0] > 1e-9], where
+    return [piece for piece in pieces if piece[0] > 1e-9], where
 
 
 def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]]:
@@ -145,42 +171,38 @@ def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]
     return [(dx, dy, angle) for _, _, dx, dy, angle in sorted(found)[:1]]
 
 
-HEADINGS = 16
-SPREAD = 1 << 15
-"""Cells either side of the start."""
-
-
 class Lattice(NamedTuple):
-    """Moves, see ``lattice_moves.Moves``, and the frame: the start is cell (0, 0), heading 0."""
+    """Primitives and the frame: the start is cell (0, 0), heading 0."""
 
-    rows: Array
-    shift: IntArray
-    cost: Array
-    number: IntArray
+    primitives: Primitives
     cell: float
     frame: Array
     """Shape (3,): the start's pose."""
 
 
-class States(NamedTuple):
-    """Memory of one search; states are numbered in the order they are met."""
+class LatticeStates(NamedTuple):
+    """Memory of one search; states are numbered in the order they are found."""
 
     place: IntArray
     """Shape (n, 3): column, row, heading."""
     cost: Array
     parent: IntArray
-    move: IntArray
+    primitive: IntArray
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
+    """The heap of open states."""
     buckets: IntArray
     """Hash table, a power of two long: state number plus one; 0 = empty."""
     counts: IntArray
-    """States, heap size, expanded, the state that saw the goal."""
+    """States, open states, states expanded so far, the state before the goal."""
+
+
+USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
 
 
 @njit(cache=True)
-def pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
+def _pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
     """Pose of a state."""
     c, s = cos(lattice.frame[2]), sin(lattice.frame[2])
     x, y = place[0] * lattice.cell, place[1] * lattice.cell
@@ -190,10 +212,10 @@ def pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
 
 
 @njit(cache=True)
-def _find(states: States, column: int, row: int, heading: int) -> int:
+def _bucket_of(states: LatticeStates, column: int, row: int, heading: int) -> int:
     """Index in the hash table of a place: its own, or the empty one it would get."""
     mask = len(states.buckets) - 1
-    key = ((column + SPREAD) << 20) ^ ((row + SPREAD) << 4) ^ heading
+    key = ((column + MAX_CELLS) << 20) ^ ((row + MAX_CELLS) << 4) ^ heading
     i = (key * 0x9E3779B97F4A7C1) >> 12 & mask
     while states.buckets[i] > 0:
         k = states.buckets[i] - 1
@@ -204,97 +226,102 @@ def _find(states: States, column: int, row: int, heading: int) -> int:
 
 
 @njit(cache=True)
-def meet(
-    field: FieldData, go: ToGo, lattice: Lattice, states: States, greed: float, bound: float,
-    column: int, row: int, heading: int, cost: float, parent: int, move: int,
+def _open_state(
+    field: FieldData, to_go: CostToGo, lattice: Lattice, states: LatticeStates, heuristic_weight: float, bound: float,
+    column: int, row: int, heading: int, cost: float, parent: int, primitive: int,
 ) -> None:  # fmt: skip
-    """Note a way to a state, if it is the cheapest so far and may lead to a solution below ``bound``."""
+    """Put a state on the open list, if its cost is the lowest so far and may lead to a solution below ``bound``."""
     where = np.array([column, row, heading])
     pose = np.empty(3)
-    pose_of(lattice, where, pose)
-    r, c = cell_at(field, go.cell, pose[0], pose[1])
-    if not (0 <= r < go.cost.shape[0] and 0 <= c < go.cost.shape[1]) or go.cost[r, c] >= FAR:
+    _pose_of(lattice, where, pose)
+    r, c = cell_at(field, to_go.cell, pose[0], pose[1])
+    if not (0 <= r < to_go.cost.shape[0] and 0 <= c < to_go.cost.shape[1]) or to_go.cost[r, c] >= UNREACHED:
         return
-    left = go.cost[r, c] * go.cell / UNIT
+    left = to_go.cost[r, c] * to_go.cell / UNIT
     if cost + left >= bound:
         return
-    i = _find(states, column, row, heading)
+    i = _bucket_of(states, column, row, heading)
     k = states.buckets[i] - 1
     if k < 0:
-        k = states.counts[0]
+        k = states.counts[USED]
         if k >= len(states.cost):
             return
-        states.counts[0] = k + 1
+        states.counts[USED] = k + 1
         states.buckets[i] = k + 1
         states.place[k, 0], states.place[k, 1], states.place[k, 2] = column, row, heading
         states.cost[k] = inf
-    if cost >= states.cost[k] - 1e-9 or states.counts[1] >= len(states.keys) - 1:
+    if cost >= states.cost[k] - 1e-9 or states.counts[OPEN] >= len(states.keys) - 1:
         return
-    states.cost[k], states.parent[k], states.move[k], states.closed[k] = cost, parent, move, False
-    states.counts[1] = push(states.keys, states.items, states.counts[1], cost + greed * left, k)
+    states.cost[k], states.parent[k], states.primitive[k], states.closed[k] = cost, parent, primitive, False
+    states.counts[OPEN] = push(states.keys, states.items, states.counts[OPEN], cost + heuristic_weight * left, k)
 
 
 @njit(cache=True)
 def expand(
-    field: FieldData, body: BodyData, layer: Layer, go: ToGo, car: Car, lattice: Lattice, goal: Array,
-    states: States, greed: float, bound: float, count: int,
+    field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, model: MotionModel,
+    lattice: Lattice, goal: Array, states: LatticeStates, heuristic_weight: float, bound: float, count: int,
 ) -> int:  # fmt: skip
-    """Expand up to ``count`` states; returns as ``hybrid_search.expand`` does."""
-    rows, best, scratch, pose = np.empty((5, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
+    """Expand up to ``count`` states; only solutions cheaper than ``bound`` (m) count.
+
+    Returns:
+        RUNNING, FOUND (the goal is reached from the state ``counts[LAST]``) or EXHAUSTED.
+    """
+    segments, best, scratch, pose = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
     for _ in range(count):
-        if states.counts[1] == 0:
+        if states.counts[OPEN] == 0:
             return EXHAUSTED
         n = states.items[0]
-        states.counts[1] = drop(states.keys, states.items, states.counts[1])
+        states.counts[OPEN] = drop(states.keys, states.items, states.counts[OPEN])
         if states.closed[n]:
             continue
         states.closed[n] = True
-        states.counts[2] += 1
-        pose_of(lattice, states.place[n], pose)
-        if sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2) < 4.0 * car.radius:
-            many = connect(pose, goal, car.radius, car.crab, car.weights, rows, best, scratch)
+        states.counts[EXPANDED] += 1
+        _pose_of(lattice, states.place[n], pose)
+        if sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2) < 4.0 * model.radius:
+            many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
             if (
-                states.cost[n] + best[COST] * car.radius < bound
-                and states.cost[n] + rows_cost(field, layer, car, pose, rows, many, 0.0) < bound
-                and rows_free(field, body, car, pose, rows, many)
+                states.cost[n] + best[COST] * model.radius < bound
+                and states.cost[n] + segments_cost(field, layer, model, pose, segments, many, 0.0) < bound
+                and segments_free(field, footprint, model, pose, segments, many)
             ):
-                states.counts[3] = n
+                states.counts[LAST] = n
                 return FOUND
         heading = states.place[n, 2]
-        for k in range(lattice.number[heading]):
-            pieces = lattice.rows[heading, k]
+        for k in range(lattice.primitives.used[heading]):
+            pieces = lattice.primitives.segments[heading, k]
             used = 0
-            while used < 3 and pieces[used, 0] != 0.0:
+            while used < MAX_PRIMITIVE_SEGMENTS and pieces[used, 0] != 0.0:
                 used += 1
-            if not rows_free(field, body, car, pose, pieces, used):
+            if not segments_free(field, footprint, model, pose, pieces, used):
                 continue
-            price = lattice.cost[heading, k]
-            if layer.price.size > 0:
-                price += row_price(field, layer, pose[0], pose[1], pose[2], pieces[0, 0], pieces[0, 1], pieces[0, 2])
-            shift = lattice.shift[heading, k]
-            meet(field, go, lattice, states, greed, bound, states.place[n, 0] + shift[0], states.place[n, 1] + shift[1],
-                 (heading + shift[2]) % HEADINGS, states.cost[n] + price, n, k)  # fmt: skip
+            cost = lattice.primitives.cost[heading, k]
+            if layer.cost.size > 0:
+                cost += layer_cost(field, layer, pose[0], pose[1], pose[2], pieces[0, 0], pieces[0, 1], pieces[0, 2])
+            shift = lattice.primitives.shift[heading, k]
+            column, row = states.place[n, 0] + shift[0], states.place[n, 1] + shift[1]
+            _open_state(field, to_go, lattice, states, heuristic_weight, bound, column, row,
+                        (heading + shift[2]) % HEADINGS, states.cost[n] + cost, n, k)  # fmt: skip
     return RUNNING
 
 
 @njit(cache=True)
-def trace(car: Car, lattice: Lattice, goal: Array, states: States) -> Array:
-    """Motion rows from the start to the goal."""
-    depth, n = 0, states.counts[3]
+def _trace(model: MotionModel, lattice: Lattice, goal: Array, states: LatticeStates) -> Array:
+    """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
+    depth, n = 0, states.counts[LAST]
     while states.parent[n] >= 0:
         depth += 1
         n = states.parent[n]
-    result = np.empty((3 * depth + 5, 3))
-    used, n = 3 * depth + 5, states.counts[3]
-    rows, best, scratch, pose = np.empty((5, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
-    pose_of(lattice, states.place[n], pose)
-    many = connect(pose, goal, car.radius, car.crab, car.weights, rows, best, scratch)
+    result = np.empty((MAX_PRIMITIVE_SEGMENTS * depth + MAX_SEGMENTS, 3))
+    used, n = len(result), states.counts[LAST]
+    segments, best, scratch, pose = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
+    _pose_of(lattice, states.place[n], pose)
+    many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
     for i in range(many - 1, -1, -1):
         used -= 1
-        result[used] = rows[i]
+        result[used] = segments[i]
     while states.parent[n] >= 0:
-        pieces = lattice.rows[states.place[states.parent[n], 2], states.move[n]]
-        for i in range(2, -1, -1):
+        pieces = lattice.primitives.segments[states.place[states.parent[n], 2], states.primitive[n]]
+        for i in range(MAX_PRIMITIVE_SEGMENTS - 1, -1, -1):
             if pieces[i, 0] != 0.0:
                 used -= 1
                 result[used] = pieces[i]
@@ -302,16 +329,11 @@ def trace(car: Car, lattice: Lattice, goal: Array, states: States) -> Array:
     return result[used:].copy()
 
 
-CHUNK = 256
-MOST_STATES = 1 << 19
-CHECK_STEP, SKIN = 0.01, 1e-3
-
-
 class LatticePlanner:
     """Routes for one vehicle.
 
     Args:
-        vehicle: what is driven; its moves are made here.
+        vehicle: what is driven; its primitives are computed here.
         config: costs, cell, budget.
     """
 
@@ -319,36 +341,38 @@ class LatticePlanner:
         self.vehicle = vehicle
         self.config = config or LatticeConfig()
         factors = (self.config.turn_factor, self.config.reverse_factor, self.config.reverse_turn_factor)
-        self.moves = make_moves(vehicle.radius, vehicle.crab_angle, self.config.cell, factors)
-        self._body = vehicle.footprint.body()
-        weights, margin = vehicle.steer(self.config).weights, self.config.margin + SKIN
-        none = np.empty((0, 3))
-        self._car = Car(vehicle.radius, vehicle.crab_angle, weights, 0.0, none, np.empty(0), CHECK_STEP, margin)
+        self.primitives = make_primitives(vehicle.radius, vehicle.crab_angle, self.config.cell, factors)
+        self._footprint = vehicle.footprint.data()
+        self._reeds_shepp = vehicle.reeds_shepp(self.config)
+        self._model = MotionModel(
+            vehicle.radius, vehicle.crab_angle, self._reeds_shepp.weights, 0.0, np.empty((0, 3)), np.empty(0),
+            CHECK_STEP, self.config.margin + CHECK_MARGIN,
+        )  # fmt: skip
 
-    def plan(self, ground: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Route of the vehicle's reference point, see ``HybridPlanner.plan``."""
+    def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
+        """Route of the vehicle's reference point, see ``RoutePlanner``."""
         config = self.config
         budget = Budget(config.budget, now, config.effort)
-        ends = check_ends(
-            ground, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
+        ends = check_endpoints(
+            route_map, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
         )
         if isinstance(ends, RouteResult):
             return ends
-        field = ground.field.data()
-        side = self._body.half_width or self._body.radius
-        layer = ground.layer(config, side + 0.5 * field.resolution)
-        go = _to_go(field, layer.price, self._body.inscribed, side, side + 0.25 * self.vehicle.radius, ends)
-        row, column = cell_at(field, go.cell, ends.start[0], ends.start[1])
-        if go.cost[row, column] >= FAR:
+        field = route_map.field.data()
+        side = self._footprint.half_width or self._footprint.radius
+        layer = route_map.cost_layer(config, side + 0.5 * field.resolution)
+        to_go = self._cost_to_go(field, layer, side, ends)
+        row, column = cell_at(field, to_go.cell, ends.start[0], ends.start[1])
+        if to_go.cost[row, column] >= UNREACHED:
             return RouteResult(Reason.GOAL_UNREACHABLE, text="no way is wide enough")
         best, cost, statistics = None, np.inf, {"expanded": 0.0}
-        for greed in (config.greed, 0.5 * (1 + config.greed), 1.0):
-            rows, found, reason = self._search(field, layer, go, ends, budget, greed, cost, statistics)
-            if rows is None:
+        for weight in (config.greed, 0.5 * (1 + config.greed), 1.0):
+            segments, found, reason = self._search(field, layer, to_go, ends, budget, weight, cost, statistics)
+            if segments is None:
                 break
             if best is None:
                 statistics["first_s"] = budget.elapsed
-            best, cost = rows, found
+            best, cost = segments, found
         statistics["elapsed_s"] = budget.elapsed
         if best is None:
             return RouteResult(reason, text="no drivable way found", statistics=statistics)
@@ -356,49 +380,38 @@ class LatticePlanner:
         statistics.setdefault("first_length", path.length)
         return RouteResult(Reason.OK, path, cost=cost, statistics=statistics)
 
+    def _cost_to_go(self, field: FieldData, layer: CostLayer, side: float, ends: Endpoints) -> CostToGo:
+        factor = max(round(COARSE_CELL / field.resolution), 1)
+        cell = factor * field.resolution
+        wide = side + 0.25 * self.vehicle.radius
+        cell_cost = cell_costs(field, layer.cost, factor, self._footprint.inscribed, side, wide)
+        row, column = cell_at(field, cell, ends.goal[0], ends.goal[1])
+        cost, step = dijkstra(cell_cost, EVERYWHERE, row, column, -1, 1.0)
+        return CostToGo(cost, step, cell_cost, cell)
+
     def _search(
-        self, field: FieldData, layer: Layer, go: ToGo, ends: Ends, budget: Budget, greed: float, bound: float,
-        statistics: dict[str, float],
+        self, field: FieldData, layer: CostLayer, to_go: CostToGo, ends: Endpoints, budget: Budget, weight: float,
+        bound: float, statistics: dict[str, float],
     ) -> tuple[Array | None, float, Reason]:  # fmt: skip
-        moves, n = self.moves, MOST_STATES
-        lattice = Lattice(moves.rows, moves.shift, moves.cost, moves.number, self.config.cell, ends.start)
-        states = States(
+        """Segments and cost of a solution cheaper than ``bound``, or the reason why there is none."""
+        lattice, n = Lattice(self.primitives, self.config.cell, ends.start), MAX_STATES
+        states = LatticeStates(
             np.empty((n, 3), np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64),
             np.empty(n, np.bool_), np.empty(4 * n), np.empty(4 * n, np.int64), np.zeros(2 * n, np.int64),
             np.zeros(4, np.int64),
         )  # fmt: skip
-        meet(field, go, lattice, states, greed, bound, 0, 0, 0, 0.0, -1, -1)
+        _open_state(field, to_go, lattice, states, weight, bound, 0, 0, 0, 0.0, -1, -1)
         status = RUNNING
-        while status == RUNNING and budget.left() > 0.0:
-            before = int(states.counts[2])
-            status = expand(field, self._body, layer, go, self._car, lattice, ends.goal, states, greed, bound, CHUNK)
-            budget.work += int(states.counts[2]) - before
-            statistics["expanded"] += int(states.counts[2]) - before
+        while status == RUNNING and budget.remaining() > 0.0:
+            before = int(states.counts[EXPANDED])
+            status = expand(
+                field, self._footprint, layer, to_go, self._model, lattice, ends.goal, states, weight, bound, CHUNK
+            )
+            budget.work += int(states.counts[EXPANDED]) - before
+            statistics["expanded"] += int(states.counts[EXPANDED]) - before
         if status != FOUND:
-            reason = Reason.GOAL_UNREACHABLE if status == EXHAUSTED else Reason.ROUTE_TIMEOUT
-            return None, bound, reason
-        last = int(states.counts[3])
-        rows = trace(self._car, lattice, ends.goal, states)
-        return (
-            rows,
-            float(states.cost[last]) + _last_leg(self.vehicle, self.config, lattice, states, last, ends),
-            Reason.OK,
-        )
-
-
-def _last_leg(
-    vehicle: Vehicle, config: LatticeConfig, lattice: Lattice, states: States,
-    last: int, ends: Ends,
-) -> float:  # fmt: skip
-    pose = np.empty(3)
-    pose_of(lattice, states.place[last], pose)
-    return float(vehicle.steer(config).distance(pose, ends.goal)[0])
-
-
-def _to_go(field: FieldData, price: NDArray[np.float32], closed: float, side: float, wide: float, ends: Ends) -> ToGo:
-    factor = max(round(COARSE / field.resolution), 1)
-    cell = factor * field.resolution
-    toll = tolls(field, price, factor, closed, side, wide)
-    row, column = cell_at(field, cell, ends.goal[0], ends.goal[1])
-    cost, step = spread(toll, np.zeros((0, 0), np.bool_), row, column, -1, 1.0)
-    return ToGo(cost, step, toll, cell)
+            return None, bound, Reason.GOAL_UNREACHABLE if status == EXHAUSTED else Reason.ROUTE_TIMEOUT
+        last, pose = int(states.counts[LAST]), np.empty(3)
+        _pose_of(lattice, states.place[last], pose)
+        cost = float(states.cost[last]) + float(self._reeds_shepp.distance(pose, ends.goal)[0])
+        return _trace(self._model, lattice, ends.goal, states), cost, Reason.OK

@@ -1,4 +1,14 @@
-"""Shortest motions without obstacles: Reeds-Shepp, and the same with crab moves for two steered axles. Compiled."""
+"""Shortest motions without obstacles: Reeds-Shepp, extended by translations for two steered axles. Loads numba.
+
+Source: J. A. Reeds and L. A. Shepp, "Optimal paths for a car that goes both forwards and backwards", Pacific Journal of
+Mathematics 145(2), 1990, section 8. Lengths are in turning radii, the start is the origin, L and R are arcs of radius
+1, S is a straight line. A formula solves one pattern; driving backward (``flip``), mirrored left for right (``mirror``)
+and the reversed order (``backward``) give the others, 48 words in all.
+
+A vehicle that can crab has further words: arc, translation at the full crab angle, arc, each of them forward or
+backward; arc and translation in either order, the translation at any angle the vehicle can take, or else a zigzag of
+two at the full one.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -15,6 +25,9 @@ from monstertruck_schemas.plan import Steering
 
 SLACK = 1e-10
 """Rounding allowed where a formula asks for a sign."""
+
+MAX_SEGMENTS = 5
+"""Of a motion."""
 
 LSL, LSR, LRL, LRLR_SAME, LRLR_CUSP, LRSL, LRSR, LRSLR = range(8)
 
@@ -40,13 +53,13 @@ COST, PATTERN, FLIP, MIRROR, BACKWARD, T, U, V = range(8)
 
 
 @njit(cache=True)
-def _up(angle: float) -> float:
+def _wrap_upper(angle: float) -> float:
     """Angle in (-pi, pi], a rounding error above -pi counting as pi."""
     return float(angle - 2 * pi * ceil((angle - pi - SLACK) / (2 * pi)))
 
 
 @njit(cache=True)
-def _down(angle: float) -> float:
+def _wrap_lower(angle: float) -> float:
     """Angle in [-pi, pi), a rounding error below pi counting as -pi."""
     return float(angle - 2 * pi * floor((angle + pi + SLACK) / (2 * pi)))
 
@@ -66,7 +79,7 @@ def _lengths(pattern: int, t: float, u: float, v: float, out: Array) -> None:
 
 
 @njit(cache=True)
-def _offer(
+def _keep_solution(
     best: Array, pieces: Array, weights: Array, pattern: int,
     flip: float, mirror: float, backward: float, t: float, u: float, v: float,
 ) -> None:  # fmt: skip
@@ -83,7 +96,7 @@ def _offer(
     cost = length
     if weights[0] != 1.0 or weights[1] != 0.0:
         _lengths(pattern, t, u, v, pieces)
-        cost = _weigh(pieces, flip, weights)
+        cost = _word_cost(pieces, flip, weights)
         if cost >= best[COST]:
             return
     best[COST], best[PATTERN], best[FLIP], best[MIRROR], best[BACKWARD] = cost, pattern, flip, mirror, backward
@@ -91,7 +104,7 @@ def _offer(
 
 
 @njit(cache=True)
-def _weigh(pieces: Array, flip: float, weights: Array) -> float:
+def _word_cost(pieces: Array, flip: float, weights: Array) -> float:
     cost, before = 0.0, 0.0
     for i in range(5):
         length = flip * pieces[i]
@@ -116,74 +129,74 @@ def _tau_omega(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[f
 
 
 @njit(cache=True)
-def _three_arcs(
+def _reversible_patterns(
     best: Array, pieces: Array, weights: Array, flip: float, mirror: float, backward: float,
     phi: float, r1: float, a1: float, r2: float, xi2: float, eta2: float,
 ) -> None:  # fmt: skip
     """Patterns that are also valid in reversed order: LRL, LRSL, LRSR; polar (r, a) of the end circle's centre."""
     if r1 <= 4.0 and 0.5 * r1 < best[COST]:
         u = -2.0 * asin(r1 / 4.0)
-        t = _up(a1 + u / 2 + pi)
+        t = _wrap_upper(a1 + u / 2 + pi)
         if t >= -SLACK:
-            _offer(best, pieces, weights, LRL, flip, mirror, backward, t, u, _up(phi - t + u))
+            _keep_solution(best, pieces, weights, LRL, flip, mirror, backward, t, u, _wrap_upper(phi - t + u))
     if r1 >= 2.0:
         r = sqrt(r1 * r1 - 4.0)
         u = 2.0 - r
         if u <= SLACK and pi / 2 - u < best[COST]:
-            t = _up(a1 + atan2(r, -2.0))
-            v = _down(phi - pi / 2 - t)
+            t = _wrap_upper(a1 + atan2(r, -2.0))
+            v = _wrap_lower(phi - pi / 2 - t)
             if t >= -SLACK and v <= SLACK:
-                _offer(best, pieces, weights, LRSL, flip, mirror, backward, t, u, v)
+                _keep_solution(best, pieces, weights, LRSL, flip, mirror, backward, t, u, v)
     if r2 >= 2.0 and pi / 2 + r2 - 2.0 < best[COST]:
         u = 2.0 - r2
-        t = _up(atan2(xi2, -eta2))
-        v = _down(t + pi / 2 - phi)
+        t = _wrap_upper(atan2(xi2, -eta2))
+        v = _wrap_lower(t + pi / 2 - phi)
         if t >= -SLACK and v <= SLACK:
-            _offer(best, pieces, weights, LRSR, flip, mirror, backward, t, u, v)
+            _keep_solution(best, pieces, weights, LRSR, flip, mirror, backward, t, u, v)
 
 
 @njit(cache=True)
-def _others(
+def _symmetric_patterns(
     best: Array, pieces: Array, weights: Array, flip: float, mirror: float,
     phi: float, r1: float, a1: float, r2: float, a2: float, xi2: float, eta2: float,
 ) -> None:  # fmt: skip
-    """Patterns that reversed are again one of their own."""
-    t = _up(a1)
+    """Patterns that are their own reversal."""
+    t = _wrap_upper(a1)
     if t >= -SLACK and r1 + t < best[COST]:
-        v = _up(phi - t)
+        v = _wrap_upper(phi - t)
         if v >= -SLACK:
-            _offer(best, pieces, weights, LSL, flip, mirror, 1.0, t, r1, v)
+            _keep_solution(best, pieces, weights, LSL, flip, mirror, 1.0, t, r1, v)
     if r2 >= 2.0:
         u = sqrt(r2 * r2 - 4.0)
         if u < best[COST]:
-            t = _up(a2 + atan2(2.0, u))
-            v = _up(t - phi)
+            t = _wrap_upper(a2 + atan2(2.0, u))
+            v = _wrap_upper(t - phi)
             if t >= -SLACK and v >= -SLACK:
-                _offer(best, pieces, weights, LSR, flip, mirror, 1.0, t, u, v)
+                _keep_solution(best, pieces, weights, LSR, flip, mirror, 1.0, t, u, v)
         u = 4.0 - u
         if u <= SLACK and pi - u < best[COST]:
-            t = _up(atan2((4.0 - u) * xi2 - 2.0 * eta2, -2.0 * xi2 + (u - 4.0) * eta2))
-            v = _up(t - phi)
+            t = _wrap_upper(atan2((4.0 - u) * xi2 - 2.0 * eta2, -2.0 * xi2 + (u - 4.0) * eta2))
+            v = _wrap_upper(t - phi)
             if t >= -SLACK and v >= -SLACK:
-                _offer(best, pieces, weights, LRSLR, flip, mirror, 1.0, t, u, v)
+                _keep_solution(best, pieces, weights, LRSLR, flip, mirror, 1.0, t, u, v)
     rho = (2.0 + r2) / 4.0
     if rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
         u = acos(rho)
         t, v = _tau_omega(u, -u, xi2, eta2, phi)
-        t, v = _up(t), _down(v)
+        t, v = _wrap_upper(t), _wrap_lower(v)
         if t >= -SLACK and v <= SLACK:
-            _offer(best, pieces, weights, LRLR_SAME, flip, mirror, 1.0, t, u, v)
+            _keep_solution(best, pieces, weights, LRLR_SAME, flip, mirror, 1.0, t, u, v)
     rho = (20.0 - r2 * r2) / 16.0
     if 0.0 <= rho <= 1.0 and 2.0 * acos(rho) < best[COST]:
         u = -acos(rho)
         t, v = _tau_omega(u, u, xi2, eta2, phi)
-        t, v = _up(t), _up(v)
+        t, v = _wrap_upper(t), _wrap_upper(v)
         if t >= -SLACK and v >= -SLACK:
-            _offer(best, pieces, weights, LRLR_CUSP, flip, mirror, 1.0, t, u, v)
+            _keep_solution(best, pieces, weights, LRLR_CUSP, flip, mirror, 1.0, t, u, v)
 
 
 @njit(cache=True)
-def solve(x: float, y: float, phi: float, weights: Array, best: Array, pieces: Array) -> None:
+def _best_word(x: float, y: float, phi: float, weights: Array, best: Array, pieces: Array) -> None:
     """Cheapest word from the origin to (x, y, phi).
 
     Args:
@@ -191,7 +204,7 @@ def solve(x: float, y: float, phi: float, weights: Array, best: Array, pieces: A
         y: in turning radii.
         phi: rad.
         weights: cost of a radius backward (at least 1), and of a change of direction (at least 0).
-        best: shape (8,), gets the solution.
+        best: shape (8,), receives the solution.
         pieces: shape (5,), scratch.
     """
     best[COST] = inf
@@ -204,17 +217,17 @@ def solve(x: float, y: float, phi: float, weights: Array, best: Array, pieces: A
         px, py, s, angle = flip * x, mirror * y, turn * sin_phi, turn * phi
         xi1, eta1, xi2, eta2 = px - s, py - 1.0 + cos_phi, px + s, py - 1.0 - cos_phi
         r1, a1, r2 = sqrt(xi1 * xi1 + eta1 * eta1), atan2(eta1, xi1), sqrt(xi2 * xi2 + eta2 * eta2)
-        _others(best, pieces, weights, flip, mirror, angle, r1, a1, r2, atan2(eta2, xi2), xi2, eta2)
-        _three_arcs(best, pieces, weights, flip, mirror, 1.0, angle, r1, a1, r2, xi2, eta2)
+        _symmetric_patterns(best, pieces, weights, flip, mirror, angle, r1, a1, r2, atan2(eta2, xi2), xi2, eta2)
+        _reversible_patterns(best, pieces, weights, flip, mirror, 1.0, angle, r1, a1, r2, xi2, eta2)
         px, py = flip * back_x, mirror * back_y
         xi1, eta1, xi2, eta2 = px - s, py - 1.0 + cos_phi, px + s, py - 1.0 - cos_phi
         r1, a1, r2 = sqrt(xi1 * xi1 + eta1 * eta1), atan2(eta1, xi1), sqrt(xi2 * xi2 + eta2 * eta2)
-        _three_arcs(best, pieces, weights, flip, mirror, -1.0, angle, r1, a1, r2, xi2, eta2)
+        _reversible_patterns(best, pieces, weights, flip, mirror, -1.0, angle, r1, a1, r2, xi2, eta2)
 
 
 @njit(cache=True)
-def spell(best: Array, radius: float, rows: Array, pieces: Array) -> int:
-    """Write a solution as at most 5 rows (signed length m, curvature 1/m, sideslip rad); returns their number."""
+def write_segments(best: Array, radius: float, segments: Array, pieces: Array) -> int:
+    """Write a solution as at most 5 segments (signed length m, curvature 1/m, sideslip rad); returns their number."""
     pattern = int(best[PATTERN])
     count = PIECES[pattern]
     _lengths(pattern, best[T], best[U], best[V], pieces)
@@ -224,16 +237,16 @@ def spell(best: Array, radius: float, rows: Array, pieces: Array) -> int:
         length = best[FLIP] * pieces[k]
         if abs(length) <= SLACK:
             continue
-        rows[written, 0] = length * radius
-        rows[written, 1] = best[MIRROR] * TURNS[pattern, k] / radius
-        rows[written, 2] = 0.0
+        segments[written, 0] = length * radius
+        segments[written, 1] = best[MIRROR] * TURNS[pattern, k] / radius
+        segments[written, 2] = 0.0
         written += 1
     return written
 
 
 @njit(cache=True)
-def relative(start: Array, goal: Array, radius: float) -> tuple[float, float, float]:
-    """Goal seen from the start, lengths in turning radii, the angle within +-pi."""
+def _relative_pose(start: Array, goal: Array, radius: float) -> tuple[float, float, float]:
+    """Goal relative to the start, lengths in turning radii, the angle within +-pi."""
     dx, dy = (goal[0] - start[0]) / radius, (goal[1] - start[1]) / radius
     c, s = cos(start[2]), sin(start[2])
     turn = goal[2] - start[2]
@@ -246,13 +259,10 @@ def _word_distances(starts: Array, goals: Array, radius: float, weights: Array) 
     result = np.empty(len(starts))
     best, pieces = np.empty(8), np.empty(5)
     for i in range(len(starts)):
-        x, y, phi = relative(starts[i], goals[i], radius)
-        solve(x, y, phi, weights, best, pieces)
+        x, y, phi = _relative_pose(starts[i], goals[i], radius)
+        _best_word(x, y, phi, weights, best, pieces)
         result[i] = best[COST] * radius
     return result
-
-
-MOST_ROWS = 5
 
 
 @njit(cache=True)
@@ -265,8 +275,10 @@ def _wrap(angle: float) -> float:
 
 
 @njit(cache=True)
-def _try(word: Array, count: int, mirror: float, weights: Array, best: Array, rows: Array, kept: int) -> int:
-    """Take the word (its rows not yet mirrored) if it is the cheapest so far; returns the number of rows kept."""
+def _keep_if_cheaper(
+    word: Array, count: int, mirror: float, weights: Array, best: Array, segments: Array, kept: int
+) -> int:
+    """Keep a word (not yet mirrored) if it is the cheapest so far; returns the number of segments of the best one."""
     cost, before = 0.0, 0.0
     for i in range(count):
         length = word[i, 0]
@@ -285,22 +297,26 @@ def _try(word: Array, count: int, mirror: float, weights: Array, best: Array, ro
     kept = 0
     for i in range(count):
         if abs(word[i, 0]) > SLACK:
-            rows[kept, 0], rows[kept, 1], rows[kept, 2] = word[i, 0], mirror * word[i, 1], mirror * word[i, 2]
+            segments[kept, 0], segments[kept, 1], segments[kept, 2] = (
+                word[i, 0],
+                mirror * word[i, 1],
+                mirror * word[i, 2],
+            )
             kept += 1
     return kept
 
 
 @njit(cache=True)
-def _put(word: Array, i: int, length: float, curvature: float, sideslip: float) -> None:
+def _set_segment(word: Array, i: int, length: float, curvature: float, sideslip: float) -> None:
     word[i, 0], word[i, 1], word[i, 2] = length, curvature, sideslip
 
 
 @njit(cache=True)
 def _arc_crab_arc(
     x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
-    word: Array, best: Array, rows: Array, kept: int,
+    word: Array, best: Array, segments: Array, kept: int,
 ) -> int:  # fmt: skip
-    """Left arc, translation, left or right arc; the translation leads from one turning circle to the other."""
+    """Left arc, translation, left or right arc; the translation joins the two turning circles."""
     xi, eta = x - sin(phi), y - 1.0 + cos(phi)
     r, a = sqrt(xi * xi + eta * eta), atan2(eta, xi)
     xi2, eta2 = x + sin(phi), y - 1.0 - cos(phi)
@@ -309,61 +325,61 @@ def _arc_crab_arc(
         slip = crab if k & 1 else -crab
         sign = 1.0 if k & 2 else -1.0
         t = _wrap(a + (0.0 if sign > 0.0 else pi) - slip)
-        _put(word, 0, t, 1.0, 0.0)
-        _put(word, 1, sign * r, 0.0, slip)
-        _put(word, 2, _wrap(phi - t), 1.0, 0.0)
-        kept = _try(word, 3, mirror, weights, best, rows, kept)
+        _set_segment(word, 0, t, 1.0, 0.0)
+        _set_segment(word, 1, sign * r, 0.0, slip)
+        _set_segment(word, 2, _wrap(phi - t), 1.0, 0.0)
+        kept = _keep_if_cheaper(word, 3, mirror, weights, best, segments, kept)
         # In the frame turned by t the centres differ by (u cos, u sin - 2).
         root = 4.0 * sin(slip) ** 2 + xi2 * xi2 + eta2 * eta2 - 4.0
         if root < 0.0:
             continue
         u = 2.0 * sin(slip) + sign * sqrt(root)
         t = _wrap(a2 - atan2(u * sin(slip) - 2.0, u * cos(slip)))
-        _put(word, 0, t, 1.0, 0.0)
-        _put(word, 1, u, 0.0, slip)
-        _put(word, 2, _wrap(t - phi), -1.0, 0.0)
-        kept = _try(word, 3, mirror, weights, best, rows, kept)
+        _set_segment(word, 0, t, 1.0, 0.0)
+        _set_segment(word, 1, u, 0.0, slip)
+        _set_segment(word, 2, _wrap(t - phi), -1.0, 0.0)
+        kept = _keep_if_cheaper(word, 3, mirror, weights, best, segments, kept)
     return kept
 
 
 @njit(cache=True)
-def _translate(word: Array, first: int, x: float, y: float, crab: float) -> int:
-    """Rows of the shortest translation by (x, y), from index ``first`` on; returns their number."""
+def _translation(word: Array, first: int, x: float, y: float, crab: float) -> int:
+    """Segments of the shortest translation by (x, y), from index ``first`` on; returns their number."""
     r = sqrt(x * x + y * y)
     angle = atan2(y, x)
     if abs(angle) <= crab:
-        _put(word, first, r, 0.0, angle)
+        _set_segment(word, first, r, 0.0, angle)
         return 1
     angle = atan2(-y, -x)
     if abs(angle) <= crab:
-        _put(word, first, -r, 0.0, angle)
+        _set_segment(word, first, -r, 0.0, angle)
         return 1
     along, aside = x / cos(crab), y / sin(crab)
-    _put(word, first, 0.5 * (along + aside), 0.0, crab)
-    _put(word, first + 1, 0.5 * (along - aside), 0.0, -crab)
+    _set_segment(word, first, 0.5 * (along + aside), 0.0, crab)
+    _set_segment(word, first + 1, 0.5 * (along - aside), 0.0, -crab)
     return 2
 
 
 @njit(cache=True)
 def _arc_and_crab(
     x: float, y: float, phi: float, crab: float, mirror: float, weights: Array,
-    word: Array, best: Array, rows: Array, kept: int,
+    word: Array, best: Array, segments: Array, kept: int,
 ) -> int:  # fmt: skip
     """Left arc and translation in both orders."""
     px, py = x - sin(phi), y - 1.0 + cos(phi)
     c, s = cos(phi), sin(phi)
-    _put(word, 0, phi, 1.0, 0.0)
-    count = _translate(word, 1, px * c + py * s, py * c - px * s, crab)
-    kept = _try(word, 1 + count, mirror, weights, best, rows, kept)
-    count = _translate(word, 0, px, py, crab)
-    _put(word, count, phi, 1.0, 0.0)
-    return _try(word, count + 1, mirror, weights, best, rows, kept)
+    _set_segment(word, 0, phi, 1.0, 0.0)
+    count = _translation(word, 1, px * c + py * s, py * c - px * s, crab)
+    kept = _keep_if_cheaper(word, 1 + count, mirror, weights, best, segments, kept)
+    count = _translation(word, 0, px, py, crab)
+    _set_segment(word, count, phi, 1.0, 0.0)
+    return _keep_if_cheaper(word, count + 1, mirror, weights, best, segments, kept)
 
 
 @njit(cache=True)
 def connect(
     start: Array, goal: Array, radius: float, crab: float, weights: Array,
-    rows: Array, best: Array, scratch: Array,
+    segments: Array, best: Array, scratch: Array,
 ) -> int:  # fmt: skip
     """Cheapest motion from one pose to another.
 
@@ -373,30 +389,30 @@ def connect(
         radius: turning radius, m.
         crab: largest angle of a translation, rad; 0 for none.
         weights: cost per metre backward and of a change of direction (in radii), factor on translations.
-        rows: shape (5, 3), gets the motion: signed length m, curvature 1/m, sideslip rad.
-        best: shape (8,), gets the cost in radii as its first field.
+        segments: shape (5, 3), receives the motion: signed length m, curvature 1/m, sideslip rad.
+        best: shape (8,), receives the cost in radii as its first field.
         scratch: shape (4, 3).
 
     Returns:
-        Number of rows.
+        Number of segments.
     """
-    x, y, phi = relative(start, goal, radius)
+    x, y, phi = _relative_pose(start, goal, radius)
     pieces = scratch.reshape(12)[:5]
-    solve(x, y, phi, weights, best, pieces)
-    kept = spell(best, radius, rows, pieces)
+    _best_word(x, y, phi, weights, best, pieces)
+    kept = write_segments(best, radius, segments, pieces)
     if crab <= 0.0:
         return kept
     own = kept
     kept = -1
     for k in range(2):
         mirror = 1.0 if k == 0 else -1.0
-        kept = _arc_crab_arc(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, rows, kept)
-        kept = _arc_and_crab(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, rows, kept)
+        kept = _arc_crab_arc(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, segments, kept)
+        kept = _arc_and_crab(x, mirror * y, mirror * phi, crab, mirror, weights, scratch, best, segments, kept)
     if kept < 0:
         return own
     for i in range(kept):
-        rows[i, 0] *= radius
-        rows[i, 1] /= radius
+        segments[i, 0] *= radius
+        segments[i, 1] /= radius
     return kept
 
 
@@ -404,18 +420,18 @@ def connect(
 def _crab_distances(starts: Array, goals: Array, radius: float, crab: float, weights: Array) -> Array:
     """Cost in metres of the cheapest motion of every pair."""
     result = np.empty(len(starts))
-    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.full(8, inf), np.empty((4, 3))
+    segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.full(8, inf), np.empty((4, 3))
     for i in range(len(starts)):
-        connect(starts[i], goals[i], radius, crab, weights, rows, best, scratch)
+        connect(starts[i], goals[i], radius, crab, weights, segments, best, scratch)
         result[i] = best[COST] * radius
     return result
 
 
 @njit(cache=True)
-def rows_between(start: Array, goal: Array, radius: float, crab: float, weights: Array) -> Array:
-    """Rows of the cheapest motion, shape (n, 3)."""
-    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.full(8, inf), np.empty((4, 3))
-    return rows[: connect(start, goal, radius, crab, weights, rows, best, scratch)]
+def _best_segments(start: Array, goal: Array, radius: float, crab: float, weights: Array) -> Array:
+    """Segments of the cheapest motion, shape (n, 3)."""
+    segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.full(8, inf), np.empty((4, 3))
+    return segments[: connect(start, goal, radius, crab, weights, segments, best, scratch)]
 
 
 @dataclass(frozen=True)
@@ -426,11 +442,11 @@ class ReedsShepp:
 
     Args:
         radius: turning radius of the reference point, m.
-        crab_angle: largest angle between heading and a translation, rad; 0: the truck cannot crab.
+        crab_angle: largest angle between heading and a translation, rad; 0: no translations.
         reverse_cost: of a metre backward, at least 1.
         cusp_cost: of a change of direction, m, at least 0.
         crab_cost: factor on a translation's cost, at least 1.
-        steering: how arcs and lines are steered, see ``MotionPath``.
+        steering: mode of arcs and lines, see ``MotionPath``.
         reference: of the motions, see ``MotionPath``.
 
     Raises:
@@ -445,7 +461,7 @@ class ReedsShepp:
     steering: Steering = "counter"
     reference: float = 0.0
     weights: Array = field(init=False, repr=False, compare=False)
-    """The costs as the compiled words take them."""
+    """The costs as ``connect`` takes them."""
 
     def __post_init__(self) -> None:
         if not (
@@ -481,8 +497,8 @@ class ReedsShepp:
     def path(self, start: ArrayLike, goal: ArrayLike) -> MotionPath:
         """Best motion from one pose to another."""
         a, b = _poses(start)[0], _poses(goal)[0]
-        rows = rows_between(a, b, self.radius, self.crab_angle, self.weights)
-        return MotionPath(a, rows, self.steering, self.reference)
+        segments = _best_segments(a, b, self.radius, self.crab_angle, self.weights)
+        return MotionPath(a, segments, self.steering, self.reference)
 
 
 def _poses(values: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""Routes over waypoints, and routes that are kept while they are good. Compiled."""
+"""Routes over waypoints, and routes that are kept while they are good. Loads numba."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ SAME_GOAL = 1e-3
 """Goals nearer than this are the same, m and rad."""
 
 PASSING = 0.1
-"""A route passes a place that it comes this near to, m."""
+"""A route passes a waypoint if it comes this near, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class Waypoint:
-    """A place to pass; without a heading the truck takes that of the way there and on."""
+class ViaPoint:
+    """A waypoint; without a heading that of the way there and on is taken."""
 
     x: float
     y: float
@@ -32,9 +32,9 @@ class Waypoint:
 
 def plan_through(
     planner: HybridPlanner,
-    ground: RouteMap,
+    route_map: RouteMap,
     start: ArrayLike,
-    waypoints: Sequence[Waypoint],
+    waypoints: Sequence[ViaPoint],
     now: Clock | None = None,
 ) -> RouteResult:
     """Route over all waypoints in turn, the last one being the goal; the budget is shared by the legs.
@@ -54,7 +54,7 @@ def plan_through(
     legs: list[MotionPath] = []
     cost, statistics = 0.0, dict[str, float]()
     for number, goal in enumerate(with_headings(here, waypoints), start=1):
-        result = leg_planner.plan(ground, here, goal, now)
+        result = leg_planner.plan(route_map, here, goal, now)
         margin = min(statistics.get("margin", math.inf), result.statistics.get("margin", math.inf))
         for name, value in result.statistics.items():
             statistics[name] = statistics.get(name, 0.0) + value
@@ -67,7 +67,7 @@ def plan_through(
     return RouteResult(Reason.OK, joined(legs), cost=cost, statistics=statistics)
 
 
-def with_headings(start: ArrayLike, waypoints: Sequence[Waypoint]) -> list[Array]:
+def with_headings(start: ArrayLike, waypoints: Sequence[ViaPoint]) -> list[Array]:
     """Poses of all waypoints: where one has no heading, from the place before to the one after."""
     start = np.asarray(start, dtype=np.float64)
     places = [(float(start[0]), float(start[1])), *((w.x, w.y) for w in waypoints)]
@@ -83,7 +83,7 @@ def with_headings(start: ArrayLike, waypoints: Sequence[Waypoint]) -> list[Array
 
 @dataclass(frozen=True, slots=True)
 class KeepPolicy:
-    """When the route at hand is kept."""
+    """When a route is kept."""
 
     reach: float = 0.5
     """The truck may be this far from the route, m."""
@@ -93,7 +93,7 @@ class KeepPolicy:
 
 def replan(
     planner: HybridPlanner,
-    ground: RouteMap,
+    route_map: RouteMap,
     previous: MotionPath | None,
     pose: ArrayLike,
     goal: ArrayLike,
@@ -103,47 +103,48 @@ def replan(
 ) -> RouteResult:
     """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
 
-    So a truck before an obstacle does not waver between left and right. ``statistics["kept_route"]`` tells which it is.
+    This hysteresis keeps a truck before an obstacle from changing sides.
+    ``statistics["kept_route"]`` is 1 if it is kept.
 
     Args:
         planner: of both.
-        ground: the map as it is now.
+        route_map: the newest map.
         previous: the route so far.
-        pose: of the reference point now.
-        goal: where it is to go.
+        pose: of the reference point.
+        goal: of the reference point.
         now: see ``plan``.
         policy: when a route is kept.
         via: poses of the reference point to be passed before the goal.
     """
     policy = policy or KeepPolicy()
-    stops = [Waypoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
-    fresh = plan_through(planner, ground, pose, stops, now) if stops else planner.plan(ground, pose, goal, now)
-    keeper = planner.keeping(fresh.statistics.get("margin", planner.config.margin))
-    kept = None if previous is None else rest_of(keeper, ground, previous, pose, goal, policy.reach)
+    stops = [ViaPoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
+    fresh = plan_through(planner, route_map, pose, stops, now) if stops else planner.plan(route_map, pose, goal, now)
+    keeper = planner.planner_for(fresh.statistics.get("margin", planner.config.margin))
+    kept = None if previous is None else remaining_route(keeper, route_map, previous, pose, goal, policy.reach)
     if kept is not None and not all(_passes(kept, place) for place in via):
         kept = None
-    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * keeper.cost(ground, kept)):
+    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * keeper.cost(route_map, kept)):
         return replace(fresh, statistics={**fresh.statistics, "kept_route": 0.0})
     return RouteResult(
-        Reason.OK, kept, cost=keeper.cost(ground, kept), statistics={**fresh.statistics, "kept_route": 1.0}
+        Reason.OK, kept, cost=keeper.cost(route_map, kept), statistics={**fresh.statistics, "kept_route": 1.0}
     )
 
 
-def rest_of(
-    planner: HybridPlanner, ground: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float
+def remaining_route(
+    planner: HybridPlanner, route_map: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float
 ) -> MotionPath | None:
-    """A free way from the pose back onto the path and along it to its end, or None.
+    """A free path from the pose back onto the route and along it to its end, or None.
 
     Args:
         planner: of the path.
-        ground: the map as it is now.
+        route_map: the newest map.
         path: the route so far.
-        pose: of the reference point now.
+        pose: of the reference point.
         goal: where the path has to end.
         reach: greatest distance of the pose from the path, m.
     """
     here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    if not np.isfinite(here).all() or not len(path.rows) or _apart(path.end, there) > planner.tolerance + SAME_GOAL:
+    if not np.isfinite(here).all() or not len(path.segments) or _apart(path.end, there) > planner.tolerance + SAME_GOAL:
         return None
     samples = path.sample(0.05)
     away = np.hypot(samples.poses[:, 0] - here[0], samples.poses[:, 1] - here[1])
@@ -152,11 +153,11 @@ def rest_of(
     if away[nearest] > reach:
         return None
     begin = float(samples.travelled[nearest])
-    steer = planner.vehicle.steer(planner.config)
+    reeds_shepp = planner.vehicle.reeds_shepp(planner.config)
     rests = [path.part(begin + ahead * planner.vehicle.radius, math.inf) for ahead in (0.0, 0.5, 1.0, 2.0, 4.0)]
-    ways = [steer.path(here, rest.start).then(rest) for rest in rests]
-    ways = [way for way in ways if planner.free(ground, way)]
-    return min(ways, key=lambda way: planner.cost(ground, way), default=None)
+    ways = [reeds_shepp.path(here, rest.start).then(rest) for rest in rests]
+    ways = [way for way in ways if planner.free(route_map, way)]
+    return min(ways, key=lambda way: planner.cost(route_map, way), default=None)
 
 
 def _passes(path: MotionPath, place: Array) -> bool:

@@ -1,4 +1,4 @@
-"""What the searches share: binary heap, prices of places, costs and free ways of motions. Loads numba."""
+"""What the searches share: binary heap, cost layer, cost and collision check of motions. Loads numba."""
 
 from math import ceil
 from typing import NamedTuple
@@ -8,15 +8,33 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import BodyData, FieldData, row_free
+from monstertruck_planners.collision_kernels import FieldData, FootprintData, segment_free
 from monstertruck_planners.route.motion import advance
 
 IntArray = NDArray[np.int64]
 
+RUNNING, FOUND, EXHAUSTED = 0, 1, 2
+"""State of a search after an ``expand``."""
+
+CHUNK = 256
+"""Nodes expanded between two checks of the budget."""
+
+CHECK_STEP = 0.01
+"""Between two collision checks close to obstacles, m."""
+
+CHECK_MARGIN = 1e-3
+"""Added to the margin, as the footprint may come nearer between two checks, m."""
+
+SPACING = 0.1
+"""Between two samples of the cost layer, m."""
+
 
 @njit(cache=True)
 def push(keys: Array, items: IntArray, size: int, key: float, item: int) -> int:
-    """Add an entry to a heap of ``size`` entries in two arrays long enough; returns the new size."""
+    """Add an entry to a binary heap of ``size`` entries in two arrays long enough; returns the new size.
+
+    The smallest key is at index 0; entries of equal keys leave in the order of their numbers.
+    """
     i = size
     while i > 0:
         above = (i - 1) >> 1
@@ -30,7 +48,7 @@ def push(keys: Array, items: IntArray, size: int, key: float, item: int) -> int:
 
 @njit(cache=True)
 def drop(keys: Array, items: IntArray, size: int) -> int:
-    """Remove the first entry (look at index 0 before); returns the new size."""
+    """Remove the first entry of a heap (read index 0 before); returns the new size."""
     size -= 1
     key, item = keys[size], items[size]
     i = 0
@@ -49,22 +67,18 @@ def drop(keys: Array, items: IntArray, size: int) -> int:
     return size
 
 
-SPACING = 0.1
-"""Between two looks at the layer, m."""
+class CostLayer(NamedTuple):
+    """Extra cost per metre of every cell of a field's ringed grid; an empty array: no extra cost."""
 
-
-class Layer(NamedTuple):
-    """Price per metre of every cell of a field's ringed grid; an empty array: nothing costs extra."""
-
-    price: NDArray[np.float32]
+    cost: NDArray[np.float32]
 
 
 @njit(cache=True)
-def row_price(
-    field: FieldData, layer: Layer, x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
+def layer_cost(
+    field: FieldData, layer: CostLayer, x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
 ) -> float:
-    """Price of a motion row: the layer summed at the middles of pieces of about SPACING."""
-    rows, columns = layer.price.shape
+    """Extra cost of a motion segment: the layer summed at the middles of pieces of about SPACING."""
+    rows, columns = layer.cost.shape
     pieces = max(ceil(abs(length) / SPACING), 1)
     total = 0.0
     for i in range(pieces):
@@ -73,58 +87,63 @@ def row_price(
         r = int((dy * field.cos - dx * field.sin) / field.resolution)
         c = int((dx * field.cos + dy * field.sin) / field.resolution)
         if 0 <= r < rows and 0 <= c < columns:
-            total += layer.price[r, c]
+            total += layer.cost[r, c]
     return total * abs(length) / pieces
 
 
-RUNNING, FOUND, EXHAUSTED = 0, 1, 2
-
-
-class Car(NamedTuple):
-    """What may be driven and what it costs."""
+class MotionModel(NamedTuple):
+    """Limits, costs and motion primitives of the vehicle."""
 
     radius: float
+    """Least turning radius, m."""
     crab: float
+    """Largest angle of a translation, rad; 0: none."""
     weights: Array
     """Shape (3,): per metre backward, of a cusp in turning radii, per metre of translation."""
-    swing: float
-    """Of every row, whose beginning turns the wheels, m."""
-    moves: Array
-    """Shape (p, 3): the short moves, as motion rows."""
-    leaps: Array
-    """Lengths of the leaps along the way, m, longest first."""
-    step: float
+    steering_change_cost: float
+    """Of every segment, at whose beginning the wheels turn, m."""
+    primitives: Array
+    """Shape (p, 3): the motion primitives, one segment each."""
+    expansion_lengths: Array
+    """Distances along the cost-to-go path of the targets of analytic expansions, m, longest first."""
+    check_step: float
     """Of the collision check, m."""
     margin: float
     """Kept on all sides of the footprint, m."""
 
 
 @njit(cache=True)
-def rows_cost(field: FieldData, layer: Layer, car: Car, pose: Array, rows: Array, count: int, sense: float) -> float:
-    """Cost of rows driven from a pose after a row of direction ``sense``, m."""
+def segments_cost(
+    field: FieldData, layer: CostLayer, model: MotionModel, pose: Array, segments: Array, count: int, direction: float
+) -> float:
+    """Cost of ``count`` segments driven from a pose after a segment of this direction (sign; 0: none), m."""
     total = 0.0
     x, y, yaw = pose[0], pose[1], pose[2]
     for i in range(count):
-        length = rows[i, 0]
-        weight = 1.0 if length > 0.0 else car.weights[0]
-        if rows[i, 2] != 0.0:
-            weight *= car.weights[2]
-        total += abs(length) * weight + car.swing
-        if length * sense < 0.0:
-            total += car.weights[1] * car.radius
-        sense = length
-        if layer.price.size > 0:
-            total += row_price(field, layer, x, y, yaw, length, rows[i, 1], rows[i, 2])
-        x, y, yaw = advance(x, y, yaw, length, rows[i, 1], rows[i, 2])
+        length = segments[i, 0]
+        weight = 1.0 if length > 0.0 else model.weights[0]
+        if segments[i, 2] != 0.0:
+            weight *= model.weights[2]
+        total += abs(length) * weight + model.steering_change_cost
+        if length * direction < 0.0:
+            total += model.weights[1] * model.radius
+        direction = length
+        if layer.cost.size > 0:
+            total += layer_cost(field, layer, x, y, yaw, length, segments[i, 1], segments[i, 2])
+        x, y, yaw = advance(x, y, yaw, length, segments[i, 1], segments[i, 2])
     return total
 
 
 @njit(cache=True)
-def rows_free(field: FieldData, body: BodyData, car: Car, pose: Array, rows: Array, count: int) -> bool:
-    """Whether the footprint may drive the rows from a pose."""
+def segments_free(
+    field: FieldData, footprint: FootprintData, model: MotionModel, pose: Array, segments: Array, count: int
+) -> bool:
+    """Whether ``count`` segments driven from a pose are free of collisions."""
     x, y, yaw = pose[0], pose[1], pose[2]
+    margin, step = model.margin, model.check_step
     for i in range(count):
-        if not row_free(field, body, car.margin, car.step, x, y, yaw, rows[i, 0], rows[i, 1], rows[i, 2]):
+        length, curvature, sideslip = segments[i, 0], segments[i, 1], segments[i, 2]
+        if not segment_free(field, footprint, margin, step, x, y, yaw, length, curvature, sideslip):
             return False
-        x, y, yaw = advance(x, y, yaw, rows[i, 0], rows[i, 1], rows[i, 2])
+        x, y, yaw = advance(x, y, yaw, length, curvature, sideslip)
     return True

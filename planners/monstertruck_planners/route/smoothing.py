@@ -1,8 +1,12 @@
-"""Shortening a drivable path without leaving what is free: cut corners, and move poses in between. Compiled.
+"""Smoothing of a drivable path: shortcuts, and the best headings along it. Loads numba.
 
-Two kinds of trial, both on a random stretch of the path: replace it by the best motion between its ends; or by the two
-best motions over a pose in its middle, moved a little. A trial is kept if it costs less and is free, so the path stays
-drivable after every trial and its curvature never exceeds that of its arcs.
+Two kinds of shortcut trial, both on a random stretch of the path: replace it by the best motion between its ends; or by
+the two best motions over a pose in its middle, moved a little. A trial is kept if it costs less and is free, so the
+path stays drivable after every trial and its curvature never exceeds that of its arcs.
+
+Shortcuts find the nearest optimum only: they never turn a truck around that drives a long way forward where backward is
+shorter. Dynamic programming over places along the path decides at which of them the truck faces ahead and where it
+changes direction.
 """
 
 from math import inf, pi, sqrt
@@ -13,49 +17,47 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import BodyData, FieldData
+from monstertruck_planners.collision_kernels import FieldData, FootprintData
 from monstertruck_planners.route.motion import advance
-from monstertruck_planners.route.reeds_shepp import COST, MOST_ROWS, connect
-from monstertruck_planners.route.search import Car, Layer, rows_cost, rows_free
+from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
+from monstertruck_planners.route.search import CostLayer, IntArray, MotionModel, segments_cost, segments_free
 
-IntArray = NDArray[np.int64]
-
-LEAST_ROW = 1e-9
-"""Shorter rows are dropped, m."""
+MIN_SEGMENT = 1e-9
+"""Shorter segments are dropped, m."""
 
 
-class Draft(NamedTuple):
-    """A path under work."""
+class EditablePath(NamedTuple):
+    """A path that is changed in place."""
 
-    rows: Array
+    segments: Array
     """Shape (n, 3), of which ``used[0]`` are in use."""
     poses: Array
-    """Shape (n + 1, 3), before each row and after the last."""
+    """Shape (n + 1, 3), before each segment and after the last."""
     travelled: Array
-    """Shape (n + 1,)."""
+    """Shape (n + 1,), m."""
     used: IntArray
 
 
 @njit(cache=True)
-def measure(draft: Draft, first: int) -> None:
-    """Poses and lengths from row ``first`` on."""
+def _update_poses(path: EditablePath, first: int) -> None:
+    """Compute poses and lengths from segment ``first`` on."""
     if first == 0:
-        draft.travelled[0] = 0.0
-    for i in range(first, draft.used[0]):
-        length = draft.rows[i, 0]
+        path.travelled[0] = 0.0
+    for i in range(first, path.used[0]):
+        length = path.segments[i, 0]
         x, y, yaw = advance(
-            draft.poses[i, 0], draft.poses[i, 1], draft.poses[i, 2], length, draft.rows[i, 1], draft.rows[i, 2]
+            path.poses[i, 0], path.poses[i, 1], path.poses[i, 2], length, path.segments[i, 1], path.segments[i, 2]
         )
-        draft.poses[i + 1, 0], draft.poses[i + 1, 1], draft.poses[i + 1, 2] = x, y, yaw
-        draft.travelled[i + 1] = draft.travelled[i] + abs(length)
+        path.poses[i + 1, 0], path.poses[i + 1, 1], path.poses[i + 1, 2] = x, y, yaw
+        path.travelled[i + 1] = path.travelled[i] + abs(length)
 
 
 @njit(cache=True)
-def _row_at(draft: Draft, s: float) -> int:
-    low, high = 0, draft.used[0] - 1
+def _segment_at(path: EditablePath, s: float) -> int:
+    low, high = 0, path.used[0] - 1
     while low < high:
         middle = (low + high) >> 1
-        if draft.travelled[middle + 1] > s:
+        if path.travelled[middle + 1] > s:
             high = middle
         else:
             low = middle + 1
@@ -63,20 +65,20 @@ def _row_at(draft: Draft, s: float) -> int:
 
 
 @njit(cache=True)
-def _pose_at(draft: Draft, i: int, s: float, out: Array) -> None:
-    part = min(s - draft.travelled[i], abs(draft.rows[i, 0]))
-    if draft.rows[i, 0] < 0.0:
+def _pose_at(path: EditablePath, i: int, s: float, out: Array) -> None:
+    part = min(s - path.travelled[i], abs(path.segments[i, 0]))
+    if path.segments[i, 0] < 0.0:
         part = -part
     x, y, yaw = advance(
-        draft.poses[i, 0], draft.poses[i, 1], draft.poses[i, 2], part, draft.rows[i, 1], draft.rows[i, 2]
+        path.poses[i, 0], path.poses[i, 1], path.poses[i, 2], part, path.segments[i, 1], path.segments[i, 2]
     )
     out[0], out[1], out[2] = x, y, yaw
 
 
 @njit(cache=True)
 def _append(out: Array, used: int, length: float, curvature: float, sideslip: float) -> int:
-    """Add a row; one that only goes on as the last one did makes that longer."""
-    if abs(length) < LEAST_ROW:
+    """Add a segment; one that continues the last one makes that longer."""
+    if abs(length) < MIN_SEGMENT:
         return used
     if used > 0:
         k = used - 1
@@ -89,71 +91,88 @@ def _append(out: Array, used: int, length: float, curvature: float, sideslip: fl
 
 
 @njit(cache=True)
-def tidy(draft: Draft) -> None:
-    """Join rows that go on alike, and measure the whole."""
+def _merge_alike(path: EditablePath) -> None:
+    """Join segments that continue each other, and compute all poses."""
     used = 0
-    for k in range(draft.used[0]):
-        used = _append(draft.rows, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
-    draft.used[0] = used
-    measure(draft, 0)
+    for k in range(path.used[0]):
+        used = _append(path.segments, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
+    path.used[0] = used
+    _update_poses(path, 0)
+
+
+def editable(start: Array, segments: Array) -> EditablePath:
+    """An editable path of these segments, with room for more."""
+    room = len(segments) + 400
+    path = EditablePath(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(segments)]))
+    path.segments[: len(segments)] = segments
+    path.poses[0] = start
+    _merge_alike(path)
+    return path
+
+
+def current_segments(path: EditablePath) -> Array:
+    """Segments in use, shape (n, 3), not copied."""
+    return path.segments[: path.used[0]]
 
 
 @njit(cache=True)
-def _splice(draft: Draft, begin: float, i: int, end: float, j: int, middle: Array, many: int, spare: Array) -> None:
-    """Replace the stretch from ``begin`` (in row i) to ``end`` (in row j)."""
+def _splice(
+    path: EditablePath, begin: float, i: int, end: float, j: int, middle: Array, many: int, spare: Array
+) -> None:
+    """Replace the stretch from ``begin`` (in segment i) to ``end`` (in segment j)."""
     used = 0
     first = max(i - 1, 0)
-    # Rows before the stretch stay; the last of them may grow.
+    # Segments before the stretch stay; the last of them may grow.
     for k in range(first, i):
-        used = _append(spare, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
-    sign = 1.0 if draft.rows[i, 0] > 0.0 else -1.0
-    used = _append(spare, used, sign * (begin - draft.travelled[i]), draft.rows[i, 1], draft.rows[i, 2])
+        used = _append(spare, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
+    sign = 1.0 if path.segments[i, 0] > 0.0 else -1.0
+    used = _append(spare, used, sign * (begin - path.travelled[i]), path.segments[i, 1], path.segments[i, 2])
     for k in range(many):
         used = _append(spare, used, middle[k, 0], middle[k, 1], middle[k, 2])
-    sign = 1.0 if draft.rows[j, 0] > 0.0 else -1.0
-    used = _append(spare, used, sign * (draft.travelled[j + 1] - end), draft.rows[j, 1], draft.rows[j, 2])
-    for k in range(j + 1, draft.used[0]):
-        used = _append(spare, used, draft.rows[k, 0], draft.rows[k, 1], draft.rows[k, 2])
-    if first + used > len(draft.rows):
+    sign = 1.0 if path.segments[j, 0] > 0.0 else -1.0
+    used = _append(spare, used, sign * (path.travelled[j + 1] - end), path.segments[j, 1], path.segments[j, 2])
+    for k in range(j + 1, path.used[0]):
+        used = _append(spare, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
+    if first + used > len(path.segments):
         return
     for k in range(used):
-        draft.rows[first + k, 0] = spare[k, 0]
-        draft.rows[first + k, 1] = spare[k, 1]
-        draft.rows[first + k, 2] = spare[k, 2]
-    draft.used[0] = first + used
-    measure(draft, first)
+        path.segments[first + k, 0] = spare[k, 0]
+        path.segments[first + k, 1] = spare[k, 1]
+        path.segments[first + k, 2] = spare[k, 2]
+    path.used[0] = first + used
+    _update_poses(path, first)
 
 
 @njit(cache=True)
-def _stretch(draft: Draft, begin: float, i: int, end: float, j: int, out: Array) -> int:
-    """Rows of the present stretch."""
+def _stretch_segments(path: EditablePath, begin: float, i: int, end: float, j: int, out: Array) -> int:
+    """Segments of a stretch; returns their number."""
     used = 0
     for k in range(i, j + 1):
-        low, high = max(begin - draft.travelled[k], 0.0), min(end, draft.travelled[k + 1]) - draft.travelled[k]
-        sign = 1.0 if draft.rows[k, 0] > 0.0 else -1.0
-        used = _append(out, used, sign * (high - low), draft.rows[k, 1], draft.rows[k, 2])
+        low, high = max(begin - path.travelled[k], 0.0), min(end, path.travelled[k + 1]) - path.travelled[k]
+        sign = 1.0 if path.segments[k, 0] > 0.0 else -1.0
+        used = _append(out, used, sign * (high - low), path.segments[k, 1], path.segments[k, 2])
     return used
 
 
 @njit(cache=True)
-def shorten(
+def shortcut(
     field: FieldData,
-    body: BodyData,
-    layer: Layer,
-    car: Car,
-    draft: Draft,
+    footprint: FootprintData,
+    layer: CostLayer,
+    model: MotionModel,
+    path: EditablePath,
     reach: float,
     shift: float,
     random: Array,
 ) -> int:
-    """As many trials as there are rows of ``random``.
+    """Shortcut trials, one for each row of ``random``.
 
     Args:
         field: the grid.
-        body: the footprint.
-        layer: prices.
-        car: limits and costs.
-        draft: the path, changed in place.
+        footprint: of the vehicle.
+        layer: extra costs.
+        model: limits and costs.
+        path: changed in place.
         reach: longest stretch, m.
         shift: a pose in between moves by up to this share of the stretch.
         random: shape (n, 6), uniform in 0 to 1.
@@ -161,12 +180,12 @@ def shorten(
     Returns:
         Number of trials kept.
     """
-    old, new, word = np.empty((len(draft.rows), 3)), np.empty((2 * MOST_ROWS, 3)), np.empty((MOST_ROWS, 3))
-    spare, best, scratch = np.empty((len(draft.rows) + 12, 3)), np.empty(8), np.empty((4, 3))
+    old, new, word = np.empty((len(path.segments), 3)), np.empty((2 * MAX_SEGMENTS, 3)), np.empty((MAX_SEGMENTS, 3))
+    spare, best, scratch = np.empty((len(path.segments) + 12, 3)), np.empty(8), np.empty((4, 3))
     a, b, q = np.empty(3), np.empty(3), np.empty(3)
     kept = 0
     for n in range(len(random)):
-        total = draft.travelled[draft.used[0]]
+        total = path.travelled[path.used[0]]
         if total < 1e-6:
             break
         # Short stretches are tried oftener than long ones.
@@ -176,118 +195,126 @@ def shorten(
         begin = max(begin, 0.0)
         if end - begin < 0.01:
             continue
-        i, j = _row_at(draft, begin), _row_at(draft, end)
-        _pose_at(draft, i, begin, a)
-        _pose_at(draft, j, end, b)
+        i, j = _segment_at(path, begin), _segment_at(path, end)
+        _pose_at(path, i, begin, a)
+        _pose_at(path, j, end, b)
         before = (
-            draft.rows[i, 0] if begin - draft.travelled[i] > LEAST_ROW else (draft.rows[i - 1, 0] if i > 0 else 0.0)
+            path.segments[i, 0]
+            if begin - path.travelled[i] > MIN_SEGMENT
+            else (path.segments[i - 1, 0] if i > 0 else 0.0)
         )
-        after = draft.rows[j, 0] if draft.travelled[j + 1] - end > LEAST_ROW else (
-            draft.rows[j + 1, 0] if j + 1 < draft.used[0] else 0.0
+        after = path.segments[j, 0] if path.travelled[j + 1] - end > MIN_SEGMENT else (
+            path.segments[j + 1, 0] if j + 1 < path.used[0] else 0.0
         )  # fmt: skip
-        count = _stretch(draft, begin, i, end, j, old)
-        present = rows_cost(field, layer, car, a, old, count, before)
+        count = _stretch_segments(path, begin, i, end, j, old)
+        present = segments_cost(field, layer, model, a, old, count, before)
         if after * old[count - 1, 0] < 0.0:
-            present += car.weights[1] * car.radius
+            present += model.weights[1] * model.radius
         many = 0
         if random[n, 2] < 0.35:
-            many = connect(a, b, car.radius, car.crab, car.weights, new, best, scratch)
-            if best[COST] * car.radius >= present - 1e-6:
+            many = connect(a, b, model.radius, model.crab, model.weights, new, best, scratch)
+            if best[COST] * model.radius >= present - 1e-6:
                 continue
         else:
             middle = 0.5 * (begin + end)
-            _pose_at(draft, _row_at(draft, middle), middle, q)
+            _pose_at(path, _segment_at(path, middle), middle, q)
             size = shift * (end - begin) * random[n, 3] ** 2
             q[0] += size * (2.0 * random[n, 4] - 1.0)
             q[1] += size * (2.0 * random[n, 5] - 1.0)
             q[2] += 1.5 * min(size / max(end - begin, 1e-3), 0.5) * (2.0 * random[n, 2] - 1.35) / 0.65
-            many = connect(a, q, car.radius, car.crab, car.weights, new, best, scratch)
-            first = best[COST] * car.radius
+            many = connect(a, q, model.radius, model.crab, model.weights, new, best, scratch)
+            first = best[COST] * model.radius
             if first + sqrt((q[0] - b[0]) ** 2 + (q[1] - b[1]) ** 2) >= present - 1e-6:
                 continue
-            more = connect(q, b, car.radius, car.crab, car.weights, word, best, scratch)
-            if first + best[COST] * car.radius >= present - 1e-6:
+            more = connect(q, b, model.radius, model.crab, model.weights, word, best, scratch)
+            if first + best[COST] * model.radius >= present - 1e-6:
                 continue
             for k in range(more):
                 new[many, 0], new[many, 1], new[many, 2] = word[k, 0], word[k, 1], word[k, 2]
                 many += 1
-        cost = rows_cost(field, layer, car, a, new, many, before)
+        cost = segments_cost(field, layer, model, a, new, many, before)
         if many > 0 and after * new[many - 1, 0] < 0.0:
-            cost += car.weights[1] * car.radius
-        if cost >= present - 1e-6 or not rows_free(field, body, car, a, new, many):
+            cost += model.weights[1] * model.radius
+        if cost >= present - 1e-6 or not segments_free(field, footprint, model, a, new, many):
             continue
-        _splice(draft, begin, i, end, j, new, many, spare)
+        _splice(path, begin, i, end, j, new, many, spare)
         kept += 1
     return kept
 
 
 @njit(cache=True)
-def redraft(
-    field: FieldData, body: BodyData, layer: Layer, car: Car, places: Array, travelled: Array, reach: float
+def choose_headings(
+    field: FieldData,
+    footprint: FootprintData,
+    layer: CostLayer,
+    model: MotionModel,
+    places: Array,
+    travelled: Array,
+    reach: float,
 ) -> Array:
-    """Cheapest free chain from the first place to the last.
+    """Cheapest free chain of motions over places along a path, the truck facing either way at each.
 
     Args:
         field: the grid.
-        body: the footprint.
-        layer: prices.
-        car: limits and costs.
-        places: shape (n, 3), poses in the order driven.
+        footprint: of the vehicle.
+        layer: extra costs.
+        model: limits and costs.
+        places: shape (n, 3), poses in the order driven; at the last one the heading is kept.
         travelled: shape (n,), m.
         reach: a motion leads at most this far along the path, m.
 
     Returns:
-        Motion rows, shape (k, 3); none if no chain is free.
+        Motion segments, shape (k, 3); none if no chain is free.
     """
     n = len(places)
-    cost, sense = np.full((n, 2), inf), np.zeros((n, 2))
+    cost, direction = np.full((n, 2), inf), np.zeros((n, 2))
     before = np.full((n, 2), -1, np.int64)
     poses = np.empty((n, 2, 3))
     for i in range(n):
         for k in range(2):
             poses[i, k, 0], poses[i, k, 1], poses[i, k, 2] = places[i, 0], places[i, 1], places[i, 2] + k * pi
-    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
+    segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     cost[0, 0] = 0.0
     for j in range(1, n):
         for i in range(j - 1, -1, -1):
             if travelled[j] - travelled[i] > reach and i < j - 1:
                 break
             for k in range(4):
-                # At the end the truck faces as it has to.
+                # At the end the heading is given.
                 if j == n - 1 and k >= 2:
                     continue
                 a, b, limit = poses[i, k & 1], poses[j, k >> 1], cost[j, k >> 1] - cost[i, k & 1]
                 if limit <= sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2):
                     continue
-                many = connect(a, b, car.radius, car.crab, car.weights, rows, best, scratch)
-                if best[COST] * car.radius >= limit:
+                many = connect(a, b, model.radius, model.crab, model.weights, segments, best, scratch)
+                if best[COST] * model.radius >= limit:
                     continue
-                price = rows_cost(field, layer, car, a, rows, many, sense[i, k & 1])
-                if price < limit and rows_free(field, body, car, a, rows, many):
-                    cost[j, k >> 1], before[j, k >> 1] = cost[i, k & 1] + price, 2 * i + (k & 1)
-                    sense[j, k >> 1] = rows[many - 1, 0] if many > 0 else sense[i, k & 1]
-    return _spelled(car, poses, before)
+                total = segments_cost(field, layer, model, a, segments, many, direction[i, k & 1])
+                if total < limit and segments_free(field, footprint, model, a, segments, many):
+                    cost[j, k >> 1], before[j, k >> 1] = cost[i, k & 1] + total, 2 * i + (k & 1)
+                    direction[j, k >> 1] = segments[many - 1, 0] if many > 0 else direction[i, k & 1]
+    return _chain_segments(model, poses, before)
 
 
 @njit(cache=True)
-def _spelled(car: Car, poses: Array, before: NDArray[np.int64]) -> Array:
-    """Rows of the chain that ends at the last place."""
+def _chain_segments(model: MotionModel, poses: Array, before: NDArray[np.int64]) -> Array:
+    """Segments of the chain that ends at the last place."""
     n = len(poses)
     if before[n - 1, 0] < 0:
         return np.empty((0, 3))
-    rows, best, scratch = np.empty((MOST_ROWS, 3)), np.empty(8), np.empty((4, 3))
+    segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     chain = np.empty(n, np.int64)
     chain[0] = 2 * (n - 1)
     depth = 1
     while chain[depth - 1] > 0:
         chain[depth] = before[chain[depth - 1] // 2, chain[depth - 1] % 2]
         depth += 1
-    result = np.empty((depth * MOST_ROWS, 3))
+    result = np.empty((depth * MAX_SEGMENTS, 3))
     used = 0
     for m in range(depth - 1, 0, -1):
         a, b = poses[chain[m] // 2, chain[m] % 2], poses[chain[m - 1] // 2, chain[m - 1] % 2]
-        many = connect(a, b, car.radius, car.crab, car.weights, rows, best, scratch)
+        many = connect(a, b, model.radius, model.crab, model.weights, segments, best, scratch)
         for r in range(many):
-            result[used, 0], result[used, 1], result[used, 2] = rows[r, 0], rows[r, 1], rows[r, 2]
+            result[used, 0], result[used, 1], result[used, 2] = segments[r, 0], segments[r, 1], segments[r, 2]
             used += 1
     return result[:used].copy()

@@ -17,7 +17,7 @@ from monstertruck_planners.collision import (
     scan_points,
     swept_poses,
 )
-from monstertruck_planners.collision_kernels import row_free
+from monstertruck_planners.collision_kernels import segment_free
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import LaserScan
@@ -189,7 +189,7 @@ def test_the_outside_of_a_grid_is_occupied():
 
 def test_free_is_footprint_true():
     field = room()
-    beside = [2.025, 1.525 + 0.18 + 0.025 + 0.01, 0.0]  # long side to the cell: fits with 10 mm to spare
+    beside = [2.025, 1.525 + 0.18 + 0.025 + 0.01, 0.0]  # long side to the cell: footprint_fits with 10 mm to spare
     turned = [*beside[:2], math.pi / 2]  # nose at the cell: does not
     assert field.free(Footprint(), np.array([beside, turned])).tolist() == [True, False]
     assert field.free(Footprint(), np.array([beside]), margin=0.02).tolist() == [False]
@@ -247,13 +247,13 @@ def test_rows_are_checked_all_the_way():
     cells = np.zeros((60, 80), dtype=bool)
     cells[30, 40] = True
     field = DistanceField(cells, 0.05)
-    data, body = field.data(), Footprint().body()
-    assert row_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.0, 0.0, 0.0)
-    assert not row_free(data, body, 0.0, 0.01, 0.5, 1.5, 0.0, 3.0, 0.0, 0.0)
-    assert not row_free(data, body, 0.0, 0.01, 3.5, 1.5, 0.0, -3.0, 0.0, 0.0)
-    assert not row_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.4, 0.0, 0.0)  # leaves the grid
-    assert not row_free(data, body, 0.0, 0.01, 1.0, 1.1, 0.0, 2.0, 0.0, 0.4)
-    assert row_free(data, body, 0.0, 0.01, 1.0, 0.6, 0.0, 1.5, 0.3, 0.0)
+    data, body = field.data(), Footprint().data()
+    assert segment_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.0, 0.0, 0.0)
+    assert not segment_free(data, body, 0.0, 0.01, 0.5, 1.5, 0.0, 3.0, 0.0, 0.0)
+    assert not segment_free(data, body, 0.0, 0.01, 3.5, 1.5, 0.0, -3.0, 0.0, 0.0)
+    assert not segment_free(data, body, 0.0, 0.01, 0.5, 1.0, 0.0, 3.4, 0.0, 0.0)  # leaves the grid
+    assert not segment_free(data, body, 0.0, 0.01, 1.0, 1.1, 0.0, 2.0, 0.0, 0.4)
+    assert segment_free(data, body, 0.0, 0.01, 1.0, 0.6, 0.0, 1.5, 0.3, 0.0)
 
 
 def test_a_turned_grid_turns_its_obstacles():

@@ -25,7 +25,7 @@ def line(begin=0.8, end=6.0, y=2.0, step=0.08):
 
 def drivable(vehicle, path, angle=0.4):
     """Whether every piece stays within the vehicle's steering."""
-    turn, slip = path.rows[:, 1], path.rows[:, 2]
+    turn, slip = path.segments[:, 1], path.segments[:, 2]
     if not vehicle.crab_angle:
         return bool((np.abs(turn) <= 1 / vehicle.radius + 1e-9).all() and (slip == 0.0).all())
     half = 0.16 * turn / np.cos(slip)

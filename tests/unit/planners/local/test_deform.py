@@ -47,7 +47,7 @@ def test_goes_round_a_box_on_the_route_as_the_truck_can(car, config, y):
 @pytest.mark.parametrize("config", OURS, ids=name)
 def test_the_same_question_has_the_same_answer(config):
     paths = [
-        make_deformer(CARS["4ws"], config).deform(line(), window(BOX), START, Memory()).path.rows for _ in range(2)
+        make_deformer(CARS["4ws"], config).deform(line(), window(BOX), START, Memory()).path.segments for _ in range(2)
     ]
     assert np.array_equal(*paths)
 
@@ -92,7 +92,7 @@ def test_backward_routes_stay_backward_and_end_at_the_goal(config):
     session = Session(make_deformer(CARS["4ws"], config))
     result, pose = session.step(guide, window(), guide.poses[0]), guide.poses[0]
     for _ in range(60):
-        assert (result.path.rows[:, 0] < 0).all()
+        assert (result.path.segments[:, 0] < 0).all()
         if result.complete:
             break
         pose = result.path.part(0.0, 0.1).end

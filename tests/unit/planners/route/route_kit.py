@@ -30,7 +30,7 @@ def assert_drivable(path, where, vehicle, start, goal, off=1e-6):
     poses = path.sample(0.01).poses
     assert where.field.free(vehicle.footprint, poses).all()
     assert path.greatest_curvature <= 1 / vehicle.radius + 1e-9
-    assert np.abs(path.rows[:, 2]).max(initial=0.0) <= vehicle.crab_angle + 1e-9
+    assert np.abs(path.segments[:, 2]).max(initial=0.0) <= vehicle.crab_angle + 1e-9
     assert np.abs(poses[0] - start).max() < 1e-12
     error = path.end - goal
     assert math.hypot(error[0], error[1]) <= off

@@ -7,7 +7,7 @@ import pytest
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
-from monstertruck_planners.route.replan import KeepPolicy, Waypoint, plan_through, replan, rest_of
+from monstertruck_planners.route.replan import KeepPolicy, ViaPoint, plan_through, remaining_route, replan
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
@@ -38,7 +38,7 @@ def test_both_axles_are_never_longer():
 def test_equal_work_gives_equal_routes():
     where = ground(WALL)
     first, second = (HybridPlanner(CAR, QUICK).plan(where, START, GOAL) for _ in range(2))
-    assert np.array_equal(first.path.rows, second.path.rows)
+    assert np.array_equal(first.path.segments, second.path.segments)
     assert first.statistics == second.statistics
 
 
@@ -134,13 +134,13 @@ def test_margin_and_clearance_keep_off():
 
 def test_routes_over_waypoints():
     where = ground(WALL)
-    places = [Waypoint(1.0, 3.0), Waypoint(3.0, 3.4), Waypoint(5.0, 1.0, 0.0)]
+    places = [ViaPoint(1.0, 3.0), ViaPoint(3.0, 3.4), ViaPoint(5.0, 1.0, 0.0)]
     result = plan_through(BOTH, where, START, places)
     assert_drivable(result.path, where, TRUCK, START, GOAL)
     poses = result.path.sample(0.01).poses
     for place in places:
         assert np.hypot(poses[:, 0] - place.x, poses[:, 1] - place.y).min() < 0.02
-    blocked = plan_through(BOTH, where, START, [places[0], Waypoint(3.0, 1.0)])
+    blocked = plan_through(BOTH, where, START, [places[0], ViaPoint(3.0, 1.0)])
     assert (blocked.reason, blocked.text[:15]) == (Reason.GOAL_BLOCKED, "waypoint 2 of 2")
     with pytest.raises(InputError, match="waypoint"):
         plan_through(BOTH, where, START, [])
@@ -165,7 +165,7 @@ def test_a_good_route_is_kept():
     assert other.statistics["kept_route"] == 0.0
     assert replan(FRONT, where, None, pose, goal).statistics["kept_route"] == 0.0
     assert replan(FRONT, where, route, pose, (5.0, 3.0, 0.0)).statistics["kept_route"] == 0.0
-    assert rest_of(FRONT, where, route, (1.0, 3.0, 0.0), goal, KeepPolicy().reach) is None
+    assert remaining_route(FRONT, where, route, (1.0, 3.0, 0.0), goal, KeepPolicy().reach) is None
 
 
 def test_a_detour_is_given_up_for_a_much_better_way():

@@ -7,7 +7,7 @@ from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
 from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
-from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_moves
+from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_primitives
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
@@ -18,26 +18,25 @@ START, GOAL = np.array([1.0, 1.0, 0.0]), np.array([5.0, 1.0, 0.0])
 
 @pytest.mark.parametrize("cell", [0.02, 0.03, 0.04, 0.05, 0.1])
 @pytest.mark.parametrize(("radius", "crab"), [(0.757, 0.0), (0.378, 0.4)])
-def test_moves_end_on_cells_and_keep_the_radius(cell, radius, crab):
-    moves = make_moves(radius, crab, cell)
+def test_primitives_end_on_cells_and_keep_the_radius(cell, radius, crab):
+    primitives = make_primitives(radius, crab, cell)
     for h in range(16):
-        assert moves.number[h] == (7 if crab == 0.0 else 11)
-        for k in range(moves.number[h]):
-            path = MotionPath(np.array([0.0, 0.0, ANGLES[h]]), moves.rows[h, k])
-            dx, dy, turn = moves.shift[h, k].tolist()
+        assert primitives.used[h] == (7 if crab == 0.0 else 11)
+        for k in range(primitives.used[h]):
+            path = MotionPath(np.array([0.0, 0.0, ANGLES[h]]), primitives.segments[h, k])
+            dx, dy, turn = primitives.shift[h, k].tolist()
             assert path.end[:2] == pytest.approx((dx * cell, dy * cell), abs=1e-9)
             assert math.remainder(path.end[2] - ANGLES[(h + turn) % 16], math.tau) == pytest.approx(0.0, abs=1e-9)
             assert path.greatest_curvature <= 1 / radius + 1e-9
-            assert np.abs(path.rows[:, 2]).max() <= crab + 1e-9
+            assert np.abs(path.segments[:, 2]).max() <= crab + 1e-9
             assert path.cusps == 0
-            assert moves.cost[h, k] >= path.length - 1e-12
+            assert primitives.cost[h, k] >= path.length - 1e-12
 
 
 def test_costs_are_the_authors():
-    moves = make_moves(0.378, 0.4, 0.05)
-    factors = sorted(
-        {round(moves.cost[0, k] / np.abs(moves.rows[0, k, :, 0]).sum(), 6) for k in range(moves.number[0])}
-    )
+    primitives = make_primitives(0.378, 0.4, 0.05)
+    lengths = np.abs(primitives.segments[0, :, :, 0]).sum(axis=1)[: primitives.used[0]]
+    factors = np.unique(np.round(primitives.cost[0, : primitives.used[0]] / lengths, 6)).tolist()
     assert factors == [1.0, 2.0, 3.0, 5.0]
 
 
@@ -63,8 +62,8 @@ def test_lattice_and_grid_refuse_by_name():
 def test_the_authors_grid_costs():
     where = ground(WALL)
     planner = GridAstarPlanner(Vehicle.truck("counter"), GridAstarConfig())
-    toll = planner._tolls(np.array([0.1, 0.181, 0.3, 0.47, 0.5], np.float32))
-    assert toll.tolist() == [0, 0, 199, 91, 50]  # 252 exp(-0.01) is lethal, 252 exp(-1.2) and exp(-2.9) are not
+    cell_cost = planner._cell_costs(np.array([0.1, 0.181, 0.3, 0.47, 0.5], np.float32))
+    assert cell_cost.tolist() == [0, 0, 199, 91, 50]  # 252 exp(-0.01) is lethal, 252 exp(-1.2) and exp(-2.9) are not
     result = planner.plan(where, START, GOAL)
     assert result.ok
     assert result.poses[0] == pytest.approx(START)

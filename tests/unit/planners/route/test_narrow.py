@@ -7,10 +7,10 @@ import pytest
 
 from monstertruck_planners.collision import DistanceField, Footprint
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.corridors import fits
-from monstertruck_planners.route.hybrid import HybridPlanner, narrower
-from monstertruck_planners.route.hybrid_search import LEVELS, MOST_POSES
-from monstertruck_planners.route.replan import Waypoint, plan_through, replan
+from monstertruck_planners.route.corridors import footprint_fits
+from monstertruck_planners.route.hybrid import HybridPlanner, narrower_configs
+from monstertruck_planners.route.hybrid_search import MAX_TABLE_CELLS, RESOLUTIONS
+from monstertruck_planners.route.replan import ViaPoint, plan_through, replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
 
@@ -30,9 +30,11 @@ def test_a_footprint_fits_where_a_heading_is_free(vehicle, yaw):
     cells[:26], cells[43:] = True, True  # a corridor of 17 cells, 0.425 m
     field = DistanceField(cells, 0.025, (0.0, 0.0, yaw)).data()
     x, y = 0.75 * math.cos(yaw) - 0.8625 * math.sin(yaw), 0.75 * math.sin(yaw) + 0.8625 * math.cos(yaw)
-    assert fits(field, vehicle.footprint.body(), 0.025, x, y)
-    assert not fits(field, vehicle.footprint.body(), 0.035, x, y)
-    assert not fits(field, vehicle.footprint.body(), 0.025, x - 0.01 * math.sin(yaw), y + 0.01 * math.cos(yaw))
+    assert footprint_fits(field, vehicle.footprint.data(), 0.025, x, y)
+    assert not footprint_fits(field, vehicle.footprint.data(), 0.035, x, y)
+    assert not footprint_fits(
+        field, vehicle.footprint.data(), 0.025, x - 0.01 * math.sin(yaw), y + 0.01 * math.cos(yaw)
+    )
 
 
 def test_a_gap_too_narrow_by_less_than_a_cell_is_no_way_and_soon_known():
@@ -64,9 +66,9 @@ def test_less_margin_where_there_is_no_other_way():
 
 def test_margins_go_down_in_small_steps_to_the_least():
     config = HybridConfig(margin=0.04)
-    assert [round(c.margin, 4) for c in narrower(config)] == [0.035, 0.03]
-    assert all(c.clearance_cost > config.clearance_cost and not narrower(c) for c in narrower(config))
-    assert not narrower(HybridConfig(margin=0.02))
+    assert [round(c.margin, 4) for c in narrower_configs(config)] == [0.035, 0.03]
+    assert all(c.clearance_cost > config.clearance_cost and not narrower_configs(c) for c in narrower_configs(config))
+    assert not narrower_configs(HybridConfig(margin=0.02))
 
 
 def test_a_goal_beside_a_wall_needs_less_margin_only_there():
@@ -82,12 +84,12 @@ def test_a_narrow_route_is_kept_like_any_other():
     route = tight.plan(where, START, GOAL).path
     again = replan(tight, where, route, route.sample(0.3).poses[2], GOAL)
     assert again.statistics["kept_route"] == 1.0
-    assert tight.keeping(0.06) is tight
-    assert tight.keeping(0.04).config.margin == pytest.approx(0.04)
+    assert tight.planner_for(0.06) is tight
+    assert tight.planner_for(0.04).config.margin == pytest.approx(0.04)
 
 
 def test_the_margin_of_a_route_over_waypoints_is_that_of_its_narrowest_leg():
-    result = plan_through(planner(margin=0.06), ground(*DOOR), START, [Waypoint(1.5, 2.5), Waypoint(*GOAL)])
+    result = plan_through(planner(margin=0.06), ground(*DOOR), START, [ViaPoint(1.5, 2.5), ViaPoint(*GOAL)])
     assert result.statistics["margin"] == pytest.approx(0.04)
 
 
@@ -107,15 +109,15 @@ def test_footprints_of_another_shape_fit_too():
     cells = np.zeros((40, 40), bool)
     cells[:16] = cells[24:] = True
     field = DistanceField(cells, 0.05).data()
-    assert fits(field, long.body(), 0.0, 1.0, 1.0)
+    assert footprint_fits(field, long.data(), 0.0, 1.0, 1.0)
     cells[:, 28:] = True
-    assert not fits(DistanceField(cells, 0.05).data(), long.body(), 0.0, 1.0, 1.0)
+    assert not footprint_fits(DistanceField(cells, 0.05).data(), long.data(), 0.0, 1.0, 1.0)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_the_table_of_a_search_stays_small_on_any_map(level):
+@pytest.mark.parametrize("resolution", RESOLUTIONS)
+def test_the_table_of_a_search_stays_small_on_any_map(resolution):
     small, large = (DistanceField(np.zeros((n, n), bool), 0.1).data() for n in (100, 1500))
-    assert level.fitting(small, 0.378) == level
-    fitted = level.fitting(large, 0.378)
-    assert (150.0 / (fitted.cell * 0.378)) ** 2 * fitted.headings < 1.01 * MOST_POSES
-    assert fitted.move / fitted.cell == pytest.approx(level.move / level.cell)
+    assert resolution.fitted(small, 0.378) == resolution
+    fitted = resolution.fitted(large, 0.378)
+    assert (150.0 / (fitted.cell * 0.378)) ** 2 * fitted.headings < 1.01 * MAX_TABLE_CELLS
+    assert fitted.primitive / fitted.cell == pytest.approx(resolution.primitive / resolution.cell)

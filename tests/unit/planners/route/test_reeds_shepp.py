@@ -32,7 +32,7 @@ def test_paths_reach_the_goal_exactly(steer, start, goal):
     assert off(path, goal) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert path.length == pytest.approx(steer.distance(start, goal)[0], abs=1e-9)
     assert path.greatest_curvature <= 1 / steer.radius + 1e-12
-    assert np.abs(path.rows[:, 2]).max(initial=0.0) <= steer.crab_angle
+    assert np.abs(path.segments[:, 2]).max(initial=0.0) <= steer.crab_angle
 
 
 @given(start=poses, goal=poses)
@@ -64,15 +64,16 @@ def test_no_word_is_shorter_than_the_distance(pattern, backward, t, u, v, flip, 
         [0.0, pattern, -1.0 if flip else 1.0, -1.0 if mirror else 1.0, backward, st_ * t, su * u, sv * v]
     )
     rows = np.empty((5, 3))
-    word = MotionPath(np.zeros(3), rows[: words.spell(solution, R, rows, np.empty(5))])
-    assert len(word.rows) == words.PIECES[pattern]
+    word = MotionPath(np.zeros(3), rows[: words.write_segments(solution, R, rows, np.empty(5))])
+    assert len(word.segments) == words.PIECES[pattern]
     assert CAR.distance(np.zeros(3), word.end)[0] <= word.length + 1e-8
 
 
 def test_a_shuffle_sideways_is_two_crab_moves():
     path = TRUCK.path((0, 0, 0), (0, 0.2, 0))
-    assert [s.kind for s in path.segments] == ["crab", "crab"]
-    assert [s.steering for s in path.segments] == ["crab", "crab"]
+    assert (path.segments[:, 1] == 0.0).all()
+    assert np.abs(path.segments[:, 2]) == pytest.approx([0.4, 0.4])
+    assert path.steering == ("crab", "crab")
     assert path.length == pytest.approx(0.2 / math.sin(0.4))
     assert path.cusps == 1
 
@@ -95,8 +96,8 @@ def test_dear_cusps_and_crab_moves_are_left_out():
     assert CAR.path((0, 0, 0), beside).cusps > 0
     assert ReedsShepp(R, cusp_cost=3.0).path((0, 0, 0), beside).cusps < CAR.path((0, 0, 0), beside).cusps
     no_crab = ReedsShepp(0.378, crab_angle=0.4, crab_cost=3.0).path((0, 0, 0), (2, 0.5, 0))
-    assert {s.kind for s in TRUCK.path((0, 0, 0), (2, 0.5, 0)).segments} == {"crab"}
-    assert "crab" not in {s.kind for s in no_crab.segments}
+    assert set(TRUCK.path((0, 0, 0), (2, 0.5, 0)).steering) == {"crab"}
+    assert "crab" not in no_crab.steering
 
 
 def test_samples_lie_on_the_path():
@@ -143,7 +144,7 @@ def test_nonsense_is_refused():
         CAR.path((0, 0, math.nan), (0, 0, 0))
     with pytest.raises(InputError, match="motion path"):
         MotionPath(np.zeros(2), np.zeros((0, 3)))
-    with pytest.raises(InputError, match="ways of steering"):
+    with pytest.raises(InputError, match="steering modes"):
         MotionPath(np.zeros(3), np.ones((2, 3)), ("front",))
     with pytest.raises(InputError, match="step"):
         CAR.path((0, 0, 0), (1, 0, 0)).sample(0.0)
