@@ -22,10 +22,10 @@ from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Set
 from monstertruck_planners.goals.mission import apart
 from monstertruck_planners.goals.planning import PlanningStep
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import build_tracker
 from monstertruck_planners.track.config import LqrConfig
-from monstertruck_planners.track.line import Line
+from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import Path as DrivePath
@@ -93,16 +93,16 @@ def drive(where: Place, answer: PlanAnswer, pose: Pose) -> tuple[Pose, bool, flo
         steering=answer.steering,
     )  # fmt: skip
     try:
-        line = Line(path, pose, CONFIG.beyond)
+        line = SegmentedPath(path, pose, CONFIG.beyond)
     except InputError:  # nothing left to drive
         return pose, False, 0.0
-    law = build_tracker(CONFIG, TRUCK)
+    tracker = build_tracker(CONFIG, TRUCK)
     progress, speed, front, rear = line.start, 0.0, 0.0, 0.0
     limit = 60.0 + 20.0 * answer.length
     driven = [pose]
     for k in range(round(limit / PERIOD)):
         vx = speed * math.cos(math.atan((math.tan(front) + math.tan(rear)) / 2))
-        command = law.control(TruckState(driven[-1], vx), line, progress, k * PERIOD)
+        command = tracker.control(TruckState(driven[-1], vx), line, progress, k * PERIOD)
         progress = command.progress
         if command.outcome is not Reason.DRIVING and abs(speed) < 0.01:
             break
@@ -146,7 +146,7 @@ def run(options: Options) -> Part:
     if options.data is not None:
         files += sorted((options.data / "maps").glob("*.yaml"))
     places = [place(file) for file in files]
-    count = min(options.runs, 2 * len(places)) if options.quick else options.runs
+    count = min(options.segments, 2 * len(places)) if options.quick else options.segments
     begin = time.process_time()
     rows = [trip(places[i % len(places)], np.random.default_rng([1, i])) for i in range(count)]
     possible = [row for row in rows if row["reason"] is not Reason.GOAL_UNREACHABLE or "away" in row]

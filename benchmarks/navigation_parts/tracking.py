@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
-from monstertruck_planners.track.line import Line
+from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from navigation_parts import Options, Part
@@ -180,18 +180,18 @@ def drive(
             **more,
         }
     )
-    law = build_tracker(config, geometry)
+    tracker = build_tracker(config, geometry)
     plant = Plant(geometry, dead_time, lag, rate, config.angle)
     yaw = math.atan2(*(points[1] - points[0])[::-1])
     x, y = points[0] + 0.05 * np.array([-math.sin(yaw), math.cos(yaw)])
     direction = -1 if version == "backward" else 1
     plant.pose = (float(x), float(y), yaw if direction > 0 else yaw + math.pi)
-    line = Line(route(points, version), plant.pose, config.beyond)
-    progress, track, work, outcome = line.start, [plant.pose], [], Reason.DRIVING
+    path = SegmentedPath(route(points, version), plant.pose, config.beyond)
+    progress, track, work, outcome = path.start, [plant.pose], [], Reason.DRIVING
     plant.speed = 0.0 if version == "cusps" else direction * speed
-    for k in range(round(5 * line.length / speed / PERIOD) + 200):
+    for k in range(round(5 * path.length / speed / PERIOD) + 200):
         begin = time.thread_time()
-        command = law.control(TruckState(plant.pose, plant.speed), line, progress, k * PERIOD)
+        command = tracker.control(TruckState(plant.pose, plant.speed), path, progress, k * PERIOD)
         work.append(time.thread_time() - begin)
         progress, outcome = command.progress, command.outcome
         if outcome is not Reason.DRIVING:

@@ -17,8 +17,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.steps import STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
-from monstertruck_planners.track.service import TrackerService
-from monstertruck_planners.track.step import TrackSetup
+from monstertruck_planners.track.service import TrackerService, TrackSetup
 from monstertruck_runtime.actors.placement import Places
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import fifo, latest

@@ -3,7 +3,7 @@
 from typing import Final
 
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
-from monstertruck_planners.track.step import TrackInput, TrackOutput
+from monstertruck_planners.track.service import TrackInput, TrackOutput
 from monstertruck_runtime.actors.codec import StepCodec
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import Attitude, LaserScan
@@ -16,7 +16,7 @@ TRACKING: Final = "tracking"
 STEPS: Final = {
     PLANNING: "monstertruck_planners.goals.planning_worker:PlanningWorker",
     DEFORMING: "monstertruck_planners.goals.deforming_worker:DeformingWorker",
-    TRACKING: "monstertruck_planners.track.step:TrackingWorker",
+    TRACKING: "monstertruck_planners.track.service:TrackingWorker",
 }
 """``module:factory`` by name."""
 

@@ -1,13 +1,13 @@
 """The path trackers by ``kind``."""
 
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_runtime.plugins import Catalog, Plugin
 
 if TYPE_CHECKING:
-    from monstertruck_planners.track.api import Tracker
+    from monstertruck_planners.track.path_tracker import PathTracker
 
 TRACKERS: Final = Catalog(
     "monstertruck.trackers",
@@ -44,13 +44,13 @@ TRACKERS: Final = Catalog(
     ),
     base=TrackerConfig,
 )
-"""A tracker is made from its settings and the truck's geometry; it is a ``Tracker``."""
+"""A tracker is made from its settings and the truck's geometry; it is a ``PathTracker``."""
 
 AnyTracker = Annotated[TrackerConfig, TRACKERS.section()]
 """The configuration's section `tracker`."""
 
 
-def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "Tracker":
+def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "PathTracker[Any]":
     """The tracker of a configuration.
 
     Args:
@@ -60,4 +60,4 @@ def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "Tracke
     Raises:
         InputError: no such kind, or what it needs is not installed.
     """
-    return cast("Tracker", TRACKERS.implementation(config)(config, steering))
+    return cast("PathTracker[Any]", TRACKERS.implementation(config)(config, steering))

@@ -30,7 +30,7 @@ BASES: Final[dict[Steering, Array]] = {
 """Columns: axle tangents (front, rear) of one unit of input."""
 
 LEAST_LAG: Final = 1e-3
-"""Axles that obey at once are taken to need this long, s."""
+"""AxleModel that obey at once are taken to need this long, s."""
 
 
 @dataclass(frozen=True, slots=True)

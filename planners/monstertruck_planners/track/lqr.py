@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.actuator import Angles
 from monstertruck_planners.track.config import LqrConfig
 from monstertruck_planners.track.error_model import BASES, discretise, riccati
-from monstertruck_planners.track.law import Here, Law
+from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_schemas.plan import Steering
 
 Array = NDArray[np.float64]
@@ -44,7 +43,7 @@ class Gains:
     """Shape (n, n): of an error, for all time."""
 
 
-class Lqr(Law[LqrConfig]):
+class Lqr(PathTracker[LqrConfig]):
     """See the module."""
 
     def __init__(self, config: LqrConfig, geometry: FourWheelSteering) -> None:
@@ -54,25 +53,26 @@ class Lqr(Law[LqrConfig]):
         self._soon = self._times[: max(len(self._times) // 3, 1)]
         self._gains = GainTable(config, geometry, self._periods)
 
-    def steer(self, here: Here) -> Angles:
+    def steer(self, state: TrackingState) -> Angles:
         """Axle angles for the coming period."""
-        basis = BASES[here.steering]
-        gains = self._gains.at(here.steering, float(here.speeds(self._soon).mean()))
+        basis = BASES[state.steering]
+        gains = self._gains.at(state.steering, float(state.speeds(self._soon).mean()))
         onto = np.linalg.pinv(basis)
-        axles = onto @ np.tan(here.angles)
-        asked = onto @ np.tan(self.axles.asked)
-        offset = min(max(here.offset, -gains.furthest), gains.furthest)
-        error = np.concatenate(([offset, here.turned], axles, asked))
-        change = gains.preview @ self._reference(here) - gains.feedback @ error
+        axles = onto @ np.tan(state.angles)
+        asked = onto @ np.tan(self.axles.requested)
+        offset = min(max(state.lateral_error, -gains.furthest), gains.furthest)
+        error = np.concatenate(([offset, state.heading_error], axles, asked))
+        change = gains.preview @ self._reference(state) - gains.feedback @ error
         front, rear = np.arctan(basis @ (asked + change))
         return float(front), float(rear)
 
-    def _reference(self, here: Here) -> Array:
+    def _reference(self, state: TrackingState) -> Array:
         """Slip and turn of the coming periods, shape (2 k,)."""
         # What comes after a change of steering is not for these axles: as if the path went on as it is.
-        ahead = here.course.at(np.minimum(here.ways(self._times), here.course.section_end(here.s) - JUST_BEFORE))
-        if here.steering == "crab":
-            slip = np.remainder(ahead.heading - here.pose[2] + math.pi, math.tau) - math.pi
+        end = state.reference.section_end(state.s) - JUST_BEFORE
+        ahead = state.reference.at(np.minimum(state.distances(self._times), end))
+        if state.steering == "crab":
+            slip = np.remainder(ahead.heading - state.pose[2] + math.pi, math.tau) - math.pi
             slip, turn = np.clip(slip, -1.0, 1.0), np.zeros_like(slip)
         else:
             slip, turn = ahead.slip, ahead.turn / np.cos(ahead.slip)

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.actuator import Angles
 from monstertruck_planners.track.config import MpcConfig
-from monstertruck_planners.track.course import Reference
 from monstertruck_planners.track.error_model import BASES, LEAST_LAG
-from monstertruck_planners.track.law import Here, Law
 from monstertruck_planners.track.lqr import GainTable
+from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
+from monstertruck_planners.track.segments import ReferenceStates
 from monstertruck_schemas.plan import Steering
 
 Array = NDArray[np.float64]
@@ -59,7 +58,7 @@ class Terminal:
     """Shape (2, 2)."""
 
 
-class Mpc(Law[MpcConfig]):
+class Mpc(PathTracker[MpcConfig]):
     """See the module."""
 
     def __init__(self, config: MpcConfig, geometry: FourWheelSteering) -> None:
@@ -82,17 +81,17 @@ class Mpc(Law[MpcConfig]):
         self._plan = None
         self._solvers.clear()
 
-    def steer(self, here: Here) -> Angles:
+    def steer(self, state: TrackingState) -> Angles:
         """Axle angles for the coming period."""
-        modes = tuple(here.course.steerings(here.ways(self._times)))
-        modes = (here.steering, *modes[1:])
+        modes = tuple(state.reference.steerings(state.distances(self._times)))
+        modes = (state.steering, *modes[1:])
         bases = self._bases(modes)
-        last = np.linalg.pinv(bases[0]) @ np.array(self.axles.asked)
-        fine = here.course.at(here.ways(self._middles))
-        nominal = self._nominal(here, modes, bases)
-        rollout = self._roll(here, fine, bases, nominal)
+        last = np.linalg.pinv(bases[0]) @ np.array(self.axles.requested)
+        fine = state.reference.at(state.distances(self._middles))
+        nominal = self._nominal(state, modes, bases)
+        rollout = self._roll(state, fine, bases, nominal)
         weights = self._weights(modes)
-        end = self._end(here, modes[-1], rollout)
+        end = self._end(state, modes[-1], rollout)
         wanted = self._solve(rollout, weights, end, nominal, last)
         self._plan, self._planned = wanted, modes
         front, rear = bases[0] @ wanted[0]
@@ -104,12 +103,12 @@ class Mpc(Law[MpcConfig]):
         padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
         return np.array([padded[mode] for mode in modes])
 
-    def _nominal(self, here: Here, modes: tuple[Steering, ...], bases: Array) -> Array:
+    def _nominal(self, state: TrackingState, modes: tuple[Steering, ...], bases: Array) -> Array:
         """Plan to linearise about, shape (k, m): the last one, one period on; else what the path asks for."""
         old = self._plan
         if old is not None and old.shape == (len(modes), bases.shape[2]) and self._planned[1] == modes[0]:
             return np.vstack((old[1:], old[-1:]))
-        ahead = here.course.at(here.ways(self._times))
+        ahead = state.reference.at(state.distances(self._times))
         asked = np.column_stack(self.geometry.steer_for(ahead.turn, np.clip(ahead.slip, -1.0, 1.0)))
         inputs = np.array([np.linalg.pinv(basis) @ both for basis, both in zip(bases, asked, strict=True)])
         return np.asarray(np.clip(inputs, -self.config.angle, self.config.angle))
@@ -122,31 +121,31 @@ class Mpc(Law[MpcConfig]):
         risen = [1.0 - np.exp(-np.maximum(middle[:, None] - b, 0.0) / lag) for b in (begin, begin + self.period)]
         return risen[0] - risen[1], np.asarray(np.exp(-middle / lag))
 
-    def _roll(self, here: Here, reference: Reference, bases: Array, plan: Array) -> Rollout:
+    def _roll(self, state: TrackingState, reference: ReferenceStates, bases: Array, plan: Array) -> Rollout:
         asked = np.einsum("kij,kj->ki", bases, plan)
-        angles = self._fading[:, None] * np.array(here.angles) + self._lag @ asked
+        angles = self._fading[:, None] * np.array(state.angles) + self._lag @ asked
         tangents = np.tan(np.clip(angles, -1.4, 1.4))
         slopes = 1.0 + tangents**2
         c, base = self.geometry.cg_split, self.geometry.wheelbase
         slip_tangent = (1.0 - c) * tangents[:, 0] + c * tangents[:, 1]
         cosine = 1.0 / np.sqrt(1.0 + slip_tangent**2)
         turn = cosine * (tangents[:, 0] - tangents[:, 1]) / base
-        errors = self._integrate(here, reference, turn, np.arctan(slip_tangent))
+        errors = self._integrate(state, reference, turn, np.arctan(slip_tangent))
         # One column of axle angles per input, then sums along the way.
         effect = np.einsum("fk,kij->fikj", self._lag, bases).reshape(self._fine, 2, -1) * slopes[:, :, None]
-        ahead = (self._h * here.speeds(self._middles))[:, None]
+        ahead = (self._h * state.speeds(self._middles))[:, None]
         by_turn = np.cumsum(ahead * (cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
         halfway = by_turn - 0.5 * np.diff(by_turn, axis=0, prepend=0.0)
         by_slip = (cosine**2)[:, None] * ((1.0 - c) * effect[:, 0] + c * effect[:, 1])
         by_side = np.cumsum(ahead * (halfway + by_slip), axis=0)
         return Rollout(errors, np.vstack((by_side, by_turn)))
 
-    def _integrate(self, here: Here, reference: Reference, turn: Array, slip: Array) -> Array:
+    def _integrate(self, state: TrackingState, reference: ReferenceStates, turn: Array, slip: Array) -> Array:
         """Errors along the plan in the path's curved frame."""
-        furthest = APPROACH * float(here.ways(self._times[-1:])[0] - here.s)
-        side, turned = min(max(here.offset, -furthest), furthest), here.turned
-        steps = self._h * here.speeds(self._middles)
-        bend = here.run.direction * reference.curvature
+        furthest = APPROACH * float(state.distances(self._times[-1:])[0] - state.s)
+        side, turned = min(max(state.lateral_error, -furthest), furthest), state.heading_error
+        steps = self._h * state.speeds(self._middles)
+        bend = state.segment.direction * reference.curvature
         sides, yaws = [], []
         rows = np.column_stack((turn, slip - reference.slip, reference.turn, bend, steps)).tolist()
         for body_turn, beside, wanted_turn, curvature, ahead in rows:
@@ -165,11 +164,11 @@ class Mpc(Law[MpcConfig]):
         heading = np.where(free, 0.0, self._h / config.heading_scale**2)
         return np.concatenate((np.full(self._fine, self._h / config.lateral_scale**2), heading))
 
-    def _end(self, here: Here, mode: Steering, rollout: Rollout) -> Terminal | None:
+    def _end(self, state: TrackingState, mode: Steering, rollout: Rollout) -> Terminal | None:
         """What remains to be paid after the last period with the axles where they are best; None for crab."""
         if mode == "crab":
             return None
-        cost = self._gains.at(mode, float(here.speeds(self._times[-1:])[0])).cost
+        cost = self._gains.at(mode, float(state.speeds(self._times[-1:])[0])).cost
         least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
         rows = [self._fine - 1, 2 * self._fine - 1]
         return Terminal(rollout.errors[rows], rollout.by_plan[rows], least)

@@ -5,7 +5,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from monstertruck_planners.track.line import check_path
+from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription

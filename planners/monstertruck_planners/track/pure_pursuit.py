@@ -3,10 +3,9 @@
 import math
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.actuator import Angles
 from monstertruck_planners.track.config import PurePursuitConfig
-from monstertruck_planners.track.law import Here, Law
-from monstertruck_planners.track.line import Foot
+from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
+from monstertruck_planners.track.segments import Projection
 
 LEAST_WAY = 1e-6
 """Before a change of steering the path is that of the old one, m."""
@@ -14,27 +13,27 @@ LEAST_SQUARE = 1e-6
 """Goals nearer than the root of this are not divided by, m^2."""
 
 
-class PurePursuit(Law[PurePursuitConfig]):
+class PurePursuit(PathTracker[PurePursuitConfig]):
     """See the module; the arc begins where the truck will be when the wheels have turned."""
 
     def __init__(self, config: PurePursuitConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
-        self.lead = config.dead_time + config.lag
+        self.prediction = config.dead_time + config.lag
 
-    def steer(self, here: Here) -> Angles:
+    def steer(self, state: TrackingState) -> Angles:
         """Axle angles of the arc through the point ahead."""
-        x, y, yaw = here.pose
-        goal = self._goal(here, here.s + self._lookahead(here.speed))
+        x, y, yaw = state.pose
+        goal = self._goal(state, state.s + self._lookahead(state.speed))
         c, sn = math.cos(yaw), math.sin(yaw)
         dx, dy = goal.point[0] - x, goal.point[1] - y
         ahead, aside = c * dx + sn * dy, c * dy - sn * dx
-        direction = here.run.direction
-        if here.steering == "crab":
+        direction = state.segment.direction
+        if state.steering == "crab":
             bearing = math.atan2(direction * aside, direction * ahead)
             return bearing, bearing
-        if here.steering == "hybrid":
-            return self._hybrid(here, ahead, aside, goal.tangent)
-        arm = {"front": -self.geometry.l_r, "rear": self.geometry.l_f}.get(here.steering, 0.0)
+        if state.steering == "hybrid":
+            return self._hybrid(state, ahead, aside, goal.tangent)
+        arm = {"front": -self.geometry.l_r, "rear": self.geometry.l_f}.get(state.steering, 0.0)
         if arm == 0.0:
             # The turning centre lies beside the base point: the arc is tangent to the truck there.
             turn = 2 * aside / max(ahead**2 + aside**2, LEAST_SQUARE)
@@ -51,14 +50,14 @@ class PurePursuit(Law[PurePursuitConfig]):
         _, front, rear = self.geometry.steer_for_twist(1.0, -arm * turn, turn)
         return float(front), float(rear)
 
-    def _goal(self, here: Here, s: float) -> Foot:
+    def _goal(self, state: TrackingState, s: float) -> Projection:
         """Point at ``s`` metres; beyond a change of steering as if the path went on straight."""
-        end = here.course.section_end(here.s)
-        if s <= end or end >= here.run.end:
-            return here.run.at(s)
-        last = here.run.at(end - LEAST_WAY)
+        end = state.reference.section_end(state.s)
+        if s <= end or end >= state.segment.end:
+            return state.segment.at(s)
+        last = state.segment.at(end - LEAST_WAY)
         x, y, more = *last.point, s - end
-        return Foot(s, (x + more * math.cos(last.tangent), y + more * math.sin(last.tangent)), last.tangent)
+        return Projection(s, (x + more * math.cos(last.tangent), y + more * math.sin(last.tangent)), last.tangent)
 
     def _lookahead(self, speed: float) -> float:
         config = self.config
@@ -66,12 +65,12 @@ class PurePursuit(Law[PurePursuitConfig]):
             return config.lookahead
         return min(max(config.lookahead_time * abs(speed), config.min_lookahead), config.lookahead)
 
-    def _hybrid(self, here: Here, ahead: float, aside: float, tangent: float) -> Angles:
+    def _hybrid(self, state: TrackingState, ahead: float, aside: float, tangent: float) -> Angles:
         """Turn by the path's own heading at the goal, and go sideways by what is left."""
         distance = max(math.hypot(ahead, aside), LEAST_SQUARE)
-        heading = here.course.spot(here.s + distance).yaw
-        turn = here.run.direction * math.remainder(heading - here.pose[2], math.tau) / distance
-        forward = here.run.direction
+        heading = state.reference.state(state.s + distance).yaw
+        turn = state.segment.direction * math.remainder(heading - state.pose[2], math.tau) / distance
+        forward = state.segment.direction
         # An arc of this turn alone ends half its angle off the present heading.
         slip = math.atan2(forward * aside, forward * ahead) - 0.5 * forward * turn * distance
         slip = min(max(slip, -self.config.angle), self.config.angle)

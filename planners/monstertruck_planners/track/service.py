@@ -2,18 +2,314 @@
 
 import asyncio
 import functools
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+import math
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
-from monstertruck_planners.collision import ScanPoints
-from monstertruck_planners.track.step import Newest, TrackingStep, TrackInput, TrackOutput, TrackSetup
+import numpy as np
+
+from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
+from monstertruck_planners.track.catalog import AnyTracker, build_tracker
+from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
+from monstertruck_planners.track.segments import Progress, SegmentedPath
 from monstertruck_runtime.actors.placement import Actor
-from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
 from monstertruck_runtime.schedule import Schedule
-from monstertruck_schemas.plan import TrackerState
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.state import GateState
+from monstertruck_schemas.sensor import Attitude, LaserScan
+from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
+
+WINDOW = 2.0
+"""Time constant of the roughness, s."""
+
+
+class TerrainEstimator:
+    """Tilt, and its standard deviation over the last seconds (both axes together, exponentially weighted)."""
+
+    def __init__(self) -> None:
+        self.tilt = 0.0
+        """Angle between the truck's z axis and the vertical, rad."""
+        self._mean = (0.0, 0.0)
+        self._variance = 0.0
+        self._t: float | None = None
+
+    @property
+    def roughness(self) -> float:
+        """Standard deviation, rad."""
+        return math.sqrt(self._variance)
+
+    def add(self, t: float, roll: float, pitch: float) -> None:
+        """Count a sample taken at ``t`` seconds; one that is not newer than the last is left out."""
+        self.tilt = math.acos(min(math.cos(roll) * math.cos(pitch), 1.0))
+        if self._t is None:
+            self._mean = (roll, pitch)
+        elif t > self._t:
+            share = 1.0 - math.exp((self._t - t) / WINDOW)
+            off = (roll - self._mean[0], pitch - self._mean[1])
+            self._variance = (1.0 - share) * (self._variance + share * (off[0] ** 2 + off[1] ** 2))
+            self._mean = (self._mean[0] + share * off[0], self._mean[1] + share * off[1])
+        else:
+            return
+        self._t = t
+
+
+LOOKS: Final = 8
+"""Poses ahead whose clearance counts."""
+
+LONG: Final = 3 * 500
+"""Numbers of a path (x, y, yaw) from which on it is prepared within several turns of the loop."""
+
+AT_REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+
+MOVED: Final = 0.01
+"""A truck not armed and moved by more than this may begin its path elsewhere, m."""
+TURNED: Final = 0.02
+"""Or turned by more than this, rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackSetup:
+    """What the step is made for."""
+
+    config: AnyTracker
+    steering: FourWheelSteering
+    footprint: Footprint
+    lidar: Pose
+    """In base."""
+
+
+class Newest(NamedTuple):
+    """The newest message of each input; None before the first, or where the robot has no such input."""
+
+    pose: Odometry | None = None
+    """Of base in the paths' frame."""
+    path: Path | None = None
+    gate: GateState | None = None
+    scan: LaserScan | None = None
+    """Slows the truck down in narrow places."""
+    attitude: Attitude | None = None
+    """Slows it down on slopes and rough ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepEvent:
+    """An event of the step."""
+
+    reason: Reason
+    severity: Severity
+    text: str
+    values: dict[str, Value]
+
+
+@dataclass(slots=True)
+class TrackOutput:
+    """What one step decided."""
+
+    command: Command | None = None
+    """None = the tracker is silent."""
+    drive: bool = False
+    """Whether the gate is asked for the command."""
+    frame: str = ""
+    path: str = ""
+    along: float = 0.0
+    """Metres of the path driven."""
+    length: float = 0.0
+    """Of the whole path, m."""
+    events: tuple[StepEvent, ...] = ()
+
+
+class TrackingStep:
+    """Follows the newest path by the configured tracker.
+
+    Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
+    Once the path has ended or is lost it asks for standstill, then falls silent.
+
+    Args:
+        setup: the tracker and the truck.
+        points: of scans, in base, if they are computed for others as well.
+
+    Raises:
+        InputError: the tracker cannot be built.
+    """
+
+    def __init__(self, setup: TrackSetup, points: ScanPoints | None = None) -> None:
+        self._config = setup.config
+        self._path_tracker = build_tracker(setup.config, setup.steering)
+        self._footprint = setup.footprint
+        self._points = points or ScanPoints(setup.lidar)
+        self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
+        self._terrain = TerrainEstimator()
+        self._seen: tuple[LaserScan, SegmentedPath] | None = None
+        self._clearance_ahead = math.inf
+        """Clearance ahead on that path, in that scan."""
+        self._followed: Path | None = None
+        self._path: SegmentedPath | None = None
+        self._progress = Progress()
+        self._begun: tuple[float, float, float] | None = None
+        """Pose the path was begun from; None for one that may have to be begun anew."""
+        self._outcome = Reason.DRIVING
+        self._reported = Reason.DRIVING
+        """Outcome of the newest event since the path came or the truck was armed."""
+        self._active = False
+        self._events: list[StepEvent] = []
+
+    def step(self, now: int, newest: Newest) -> TrackOutput:
+        """One control step at ``now``, ns."""
+        *_, output = self.parts(now, newest)
+        assert output is not None
+        return output
+
+    def parts(self, now: int, newest: Newest) -> Iterator[TrackOutput | None]:
+        """The same in parts, for a loop that has to turn in between: None after each but the last, the output then.
+
+        Only a long path, when it comes, makes more than one part.
+        """
+        pose, path, gate = newest.pose, newest.path, newest.gate
+        if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
+            yield TrackOutput()
+            return
+        long = len(path.poses) > LONG
+        if self._choose_path(path, pose, armed=gate.mode.active) and long:
+            yield None
+        if self._path is None:
+            yield TrackOutput(events=self._drain())
+            return
+        if self._path_tracker.prepare(self._path, self._progress) and long:
+            yield None
+        yield self._control(self._path, pose, gate, newest, now)
+
+    def _control(self, path: SegmentedPath, pose: Odometry, gate: GateState, newest: Newest, now: int) -> TrackOutput:
+        at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        clearance = self._clearance(newest.scan, path, pose, now)
+        state = TruckState(at, pose.twist.vx, clearance, *self._terrain_at(newest.attitude, now))
+        try:
+            command = self._path_tracker.control(state, path, self._progress, now / SECOND)
+        except KinematicsError as error:
+            self._path = None
+            text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
+            self._report(Reason.BAD_INPUT, Severity.WARNING, text)
+            return TrackOutput(events=self._drain())
+        if active := gate.mode.active:
+            self._progress = command.progress
+        self._outcome = command.outcome
+        if command.outcome is not self._reported and (self._active or command.outcome is not Reason.DRIVING):
+            self._reported = command.outcome
+            severity = Severity.WARNING if command.outcome is Reason.PATH_LOST else Severity.INFO
+            self._report(command.outcome, severity, path=path.name, cross_track=command.cross_track)
+        drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
+        along = path.along(command.progress)
+        return TrackOutput(command, drive, path.frame, path.name, along, path.length, self._drain())
+
+    def _choose_path(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
+        """Take a new path, or start the present one over: until armed it may still begin anywhere; whether it did."""
+        idle, self._active = not self._active, armed
+        if armed and idle:
+            self._path_tracker.reset()
+            self._reported = Reason.DRIVING
+        elif not armed and not idle:
+            self._begun = None
+        here = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        if path is self._followed:
+            again = idle and (armed or self._moved(here))
+            if self._path is None or not again or not self._to_begin():
+                return False
+        else:
+            self._reported = Reason.DRIVING
+        self._followed, self._path, self._outcome, self._begun = path, None, Reason.DRIVING, here
+        try:
+            if path.frame != pose.frame:
+                msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
+                raise InputError(msg)
+            self._path = SegmentedPath(path, here, self._config.beyond)
+            self._progress = self._path.start
+        except InputError as error:
+            self._report(Reason.BAD_INPUT, Severity.WARNING, str(error))
+        return True
+
+    def _to_begin(self) -> bool:
+        """Whether the path has ended or not yet begun."""
+        return self._outcome is not Reason.DRIVING or (self._path is not None and self._progress == self._path.start)
+
+    def _moved(self, here: tuple[float, float, float]) -> bool:
+        """Whether the truck stands elsewhere than where the path was begun, so far as it matters."""
+        if self._begun is None:
+            return True
+        x, y, yaw = self._begun
+        return math.hypot(here[0] - x, here[1] - y) > MOVED or abs(math.remainder(here[2] - yaw, math.tau)) > TURNED
+
+    def _clearance(self, scan: LaserScan | None, path: SegmentedPath, pose: Odometry, now: int) -> float:
+        """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
+        if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
+            return math.inf
+        if self._seen is None or self._seen[0] is not scan or self._seen[1] is not path:
+            self._seen, self._clearance_ahead = (scan, path), self._measure_clearance(scan, path, pose)
+        return self._clearance_ahead
+
+    def _measure_clearance(self, scan: LaserScan, path: SegmentedPath, pose: Odometry) -> float:
+        ahead = path.ahead(self._progress, self._config.reach, LOOKS)
+        c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
+        dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
+        poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
+        near = points_near(self._points.of(scan), poses, self._near)
+        return float(clearance_to_points(self._footprint, poses, near).min())
+
+    def _terrain_at(self, attitude: Attitude | None, now: int) -> tuple[float, float]:
+        """Tilt and roughness, rad; 0 if they are not measured."""
+        if attitude is None or now - attitude.received > COMPASS.fresh_for() * SECOND:
+            return 0.0, 0.0
+        if attitude.tilt_valid:
+            self._terrain.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
+        return self._terrain.tilt, self._terrain.roughness
+
+    def _report(self, reason: Reason, severity: Severity, text: str = "", **values: Value) -> None:
+        self._events.append(StepEvent(reason, severity, text, values))
+
+    def _drain(self) -> tuple[StepEvent, ...]:
+        if not self._events:
+            return ()
+        events, self._events = tuple(self._events), []
+        return events
+
+
+@dataclass(frozen=True, slots=True)
+class TrackInput:
+    """One control step at ``now``, ns, with the messages that are newer than at the step before, by input."""
+
+    now: int
+    news: dict[str, Any]
+    setup: TrackSetup | None = None
+    """Comes first, and again after every restart."""
+
+
+class TrackingWorker:
+    """The tracking step behind an actor: keeps the messages that came before."""
+
+    def __init__(self) -> None:
+        self._step: TrackingStep | None = None
+        self._newest = Newest()
+
+    def step(self, inputs: TrackInput) -> TrackOutput:
+        """Do one control step.
+
+        Raises:
+            InputError: no setup came first, or the tracker cannot be built.
+        """
+        if inputs.setup is not None:
+            self._step, self._newest = TrackingStep(inputs.setup), Newest()
+        if self._step is None:
+            raise InputError("tracking: expected a setup before anything else")
+        self._newest = self._newest._replace(**inputs.news)
+        return self._step.step(inputs.now, self._newest)
 
 
 class TrackerService:

@@ -8,45 +8,44 @@ its own place. A leading axle that cannot steer is returned by the truck's headi
 import math
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.actuator import Angles
 from monstertruck_planners.track.config import StanleyConfig
-from monstertruck_planners.track.law import Here, Law
+from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 
 
-class Stanley(Law[StanleyConfig]):
+class Stanley(PathTracker[StanleyConfig]):
     """See the module; errors are those of where the truck will be when the wheels have turned."""
 
     def __init__(self, config: StanleyConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
-        self.lead = config.dead_time + config.lag
+        self.prediction = config.dead_time + config.lag
 
-    def steer(self, here: Here) -> Angles:
+    def steer(self, state: TrackingState) -> Angles:
         """Axle angles."""
-        if here.steering == "crab":
-            bearing = here.reference.slip - here.turned + self._back(here, 0.0)
+        if state.steering == "crab":
+            bearing = state.target.slip - state.heading_error + self._back(state, 0.0)
             return bearing, bearing
-        slip = min(max(here.reference.slip, -1.0), 1.0)
-        front, rear = self.geometry.steer_for(here.reference.turn, slip)
-        front = front - here.turned + self._back(here, self.geometry.l_f)
-        rear = rear - here.turned + self._back(here, -self.geometry.l_r)
-        forward = here.run.direction > 0
-        if here.steering == "hybrid":
+        slip = min(max(state.target.slip, -1.0), 1.0)
+        front, rear = self.geometry.steer_for(state.target.turn, slip)
+        front = front - state.heading_error + self._back(state, self.geometry.l_f)
+        rear = rear - state.heading_error + self._back(state, -self.geometry.l_r)
+        forward = state.segment.direction > 0
+        if state.steering == "hybrid":
             return front, rear
-        if here.steering == "counter":
+        if state.steering == "counter":
             return (front, -front) if forward else (-rear, rear)
-        if (here.steering == "front") is forward:
+        if (state.steering == "front") is forward:
             return (front, 0.0) if forward else (0.0, rear)
-        return self._by_heading(here, self.geometry.l_f if forward else -self.geometry.l_r)
+        return self._by_heading(state, self.geometry.l_f if forward else -self.geometry.l_r)
 
-    def _back(self, here: Here, x: float) -> float:
+    def _back(self, state: TrackingState, x: float) -> float:
         """Angle by which the axle at ``x`` steers towards its place."""
         config = self.config
-        offset = here.offset + x * math.sin(here.turned)
-        return -here.run.direction * math.atan(config.gain * offset / (abs(here.speed) + config.softening))
+        offset = state.lateral_error + x * math.sin(state.heading_error)
+        return -state.segment.direction * math.atan(config.gain * offset / (abs(state.speed) + config.softening))
 
-    def _by_heading(self, here: Here, x: float) -> Angles:
+    def _by_heading(self, state: TrackingState, x: float) -> Angles:
         """The fixed axle at ``x`` leads: turn the truck so that it goes to its place."""
-        wrong = here.turned - self._back(here, x)
-        turn = here.reference.turn - here.run.direction * self.config.heading_gain * wrong
+        wrong = state.heading_error - self._back(state, x)
+        turn = state.target.turn - state.segment.direction * self.config.heading_gain * wrong
         _, front, rear = self.geometry.steer_for_twist(1.0, -x * turn, turn)
         return float(front), float(rear)

@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
-from monstertruck_planners.track.line import Line
+from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 
@@ -52,18 +52,20 @@ class Follower:
 
     def __init__(self, route, pose=(0.0, 0.0, 0.0), **config):
         self.config = TRACKER.validate_python({"kind": "pure_pursuit"} | config)
-        self.law = build_tracker(self.config, STEERING)
+        self.tracker = build_tracker(self.config, STEERING)
         self.pose = pose
         self.speed, self.front, self.rear = 0.0, 0.0, 0.0
-        self.line = Line(route, pose, self.config.beyond)
+        self.path = SegmentedPath(route, pose, self.config.beyond)
         self.t = 0.0
-        self.progress = self.line.start
+        self.progress = self.path.start
         self.log = []
         self.clearance = math.inf
 
     def step(self):
         twist = STEERING.body_twist(self.speed, self.front, self.rear)
-        command = self.law.control(TruckState(self.pose, twist[0], self.clearance), self.line, self.progress, self.t)
+        command = self.tracker.control(
+            TruckState(self.pose, twist[0], self.clearance), self.path, self.progress, self.t
+        )
         self.t += 0.05
         self.progress = command.progress
         self.log.append(command)
@@ -83,7 +85,7 @@ class Follower:
 
     def cross_track(self, after=0.0):
         """Absolute cross-track errors once ``after`` metres are driven."""
-        return np.abs([c.cross_track for c in self.log if self.line.along(c.progress) >= after])
+        return np.abs([c.cross_track for c in self.log if self.path.along(c.progress) >= after])
 
     def along(self):
-        return np.array([self.line.along(c.progress) for c in self.log])
+        return np.array([self.path.along(c.progress) for c in self.log])

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_planners.track.line import MAX_POSES
 from monstertruck_planners.track.paths import PathService, load_path
+from monstertruck_planners.track.segments import MAX_POSES
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest

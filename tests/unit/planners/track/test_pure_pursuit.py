@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.config import PurePursuitConfig
-from monstertruck_planners.track.line import Progress
+from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.segments import Progress
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.kit import STEERING, Follower, circle, figure_eight, path, straight
 
@@ -27,8 +27,8 @@ def test_a_lap_ends_where_it_began(mode):
     assert truck.run() is Reason.GOAL_REACHED
     assert truck.cross_track().max() < 0.06
     assert math.hypot(truck.pose[0], truck.pose[1]) < 0.06
-    assert truck.along()[-1] == pytest.approx(truck.line.length, abs=0.03)
-    assert len(truck.log) * 0.05 == pytest.approx(truck.line.length / 0.18, rel=0.1)
+    assert truck.along()[-1] == pytest.approx(truck.path.length, abs=0.03)
+    assert len(truck.log) * 0.05 == pytest.approx(truck.path.length / 0.18, rel=0.1)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -74,7 +74,7 @@ def test_the_direction_changes_at_standstill():
 
 def test_a_truck_still_rolling_the_other_way_is_stopped_first():
     truck = Follower(path(straight(2.0)))
-    assert truck.law.control(TruckState((0.5, 0.0, 0.0), -0.1), truck.line, truck.progress, 0.0).speed == 0.0
+    assert truck.tracker.control(TruckState((0.5, 0.0, 0.0), -0.1), truck.path, truck.progress, 0.0).speed == 0.0
 
 
 def test_only_the_front_axle_steers_in_front_mode():
@@ -104,32 +104,32 @@ def test_the_arc_passes_through_its_goal(mode, direction):
 
 def test_errors_are_signed():
     truck = Follower(path(straight(2.0)))
-    left = truck.law.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.line, Progress(0, 0.9), 0.0)
+    left = truck.tracker.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.path, Progress(0, 0.9), 0.0)
     assert left.cross_track == pytest.approx(0.1)
     assert left.heading_error == pytest.approx(0.2)
     assert left.front < 0 < left.rear
     back = Follower(path(straight(2.0), [-1] * 41), pose=(0.0, 0.0, math.pi))
-    wrong = back.law.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.line, Progress(0, 0.9), 0.0)
+    wrong = back.tracker.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.path, Progress(0, 0.9), 0.0)
     assert wrong.cross_track == pytest.approx(0.1)
     assert wrong.heading_error == pytest.approx(-0.2)
 
 
 def test_progress_never_goes_back():
     truck = Follower(path(straight(2.0)))
-    command = truck.law.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.line, Progress(0, 0.8), 0.0)
+    command = truck.tracker.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.path, Progress(0, 0.8), 0.0)
     assert command.progress.s == pytest.approx(0.8)
 
 
 def test_a_truck_far_off_is_lost():
     truck = Follower(path(straight(2.0)))
-    command = truck.law.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.line, Progress(0, 0.9), 0.0)
+    command = truck.tracker.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.path, Progress(0, 0.9), 0.0)
     assert (command.outcome, command.speed) == (Reason.PATH_LOST, 0.0)
 
 
 def test_it_slows_down_before_the_end():
     truck = Follower(path(straight(2.0)))
     truck.run()
-    speeds = {round(truck.line.along(c.progress), 2): c.speed for c in truck.log}
+    speeds = {round(truck.path.along(c.progress), 2): c.speed for c in truck.log}
     assert max(speeds.values()) == pytest.approx(0.18)
     late = [v for s, v in speeds.items() if 1.95 < s < 1.97]
     assert late

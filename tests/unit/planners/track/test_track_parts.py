@@ -6,27 +6,25 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.track.actuator import Axles
 from monstertruck_planners.track.config import PurePursuitConfig
-from monstertruck_planners.track.course import Course
 from monstertruck_planners.track.error_model import discretise, exponential, riccati
-from monstertruck_planners.track.fuzzy_rules import Inputs, Rules
-from monstertruck_planners.track.ground import Ground
-from monstertruck_planners.track.line import Line
-from monstertruck_planners.track.speed import Pace
+from monstertruck_planners.track.fuzzy import Inputs, Rules
+from monstertruck_planners.track.path_tracker import AxleModel, SpeedProfile
+from monstertruck_planners.track.segments import Reference, SegmentedPath
+from monstertruck_planners.track.service import TerrainEstimator
 from tests.unit.planners.kit import STEERING, circle, figure_eight, path, straight
 
 
 def course(route, mode="counter", geometry=STEERING):
-    line = Line(route, (0.0, 0.0, 0.0), 0.8)
-    return Course(line.runs[0], geometry, mode)
+    line = SegmentedPath(route, (0.0, 0.0, 0.0), 0.8)
+    return Reference(line.segments[0], geometry, mode)
 
 
 @pytest.mark.parametrize(("lag", "rate"), [(0.1, 5.0), (0.1, 0.5), (0.0, 1.0)])
 def test_axles_follow_after_the_dead_time_by_lag_and_rate(lag, rate):
-    axles = Axles(0.05, lag, rate)
+    axles = AxleModel(0.05, lag, rate)
     axles.advance(0.0)
-    axles.ask(0.0, (0.3, -0.1))
+    axles.request(0.0, (0.3, -0.1))
     simulated, dt = 0.0, 1e-4
     for k in range(1, 61):
         axles.advance(0.01 * k)
@@ -36,22 +34,22 @@ def test_axles_follow_after_the_dead_time_by_lag_and_rate(lag, rate):
                 step = gap if lag == 0.0 else gap * dt / lag
                 simulated += math.copysign(min(abs(step), rate * dt), gap)
         assert axles.angles[0] == pytest.approx(simulated, abs=2e-3)
-    assert axles.asked == (0.3, -0.1)
+    assert axles.requested == (0.3, -0.1)
 
 
 def test_a_request_due_at_the_very_step_counts():
-    axles = Axles(0.05, 0.0, 100.0)
+    axles = AxleModel(0.05, 0.0, 100.0)
     axles.advance(0.0)
-    axles.ask(0.0, (0.2, 0.0))
+    axles.request(0.0, (0.2, 0.0))
     axles.advance(0.05)
     axles.advance(0.1)
     assert axles.angles == pytest.approx((0.2, 0.0))
 
 
 def test_the_pose_is_foretold_over_the_dead_time():
-    axles = Axles(0.2, 0.0, 100.0)
+    axles = AxleModel(0.2, 0.0, 100.0)
     axles.advance(0.0)
-    axles.ask(0.0, (0.3, -0.3))
+    axles.request(0.0, (0.3, -0.3))
     axles.advance(0.1)
     pose, angles = axles.ahead((0.0, 0.0, 0.0), 0.5, STEERING, 0.2)
     straight_on = (0.05, 0.0, 0.0)
@@ -63,7 +61,7 @@ def test_the_pose_is_foretold_over_the_dead_time():
 @pytest.mark.parametrize("mode", ["front", "rear", "counter", "hybrid"])
 def test_on_a_circle_the_reference_is_the_steady_turn(mode, direction):
     route = circle(1.0, 0.5, 0.005)
-    found = course(path(route, [direction] * len(route)), mode).spot(1.5)
+    found = course(path(route, [direction] * len(route)), mode).state(1.5)
     assert found.curvature == pytest.approx(1.0, rel=0.01)
     front, rear = STEERING.steer_for(found.turn, found.slip)
     fixed = {"front": rear, "rear": front}.get(mode, front + rear)
@@ -77,22 +75,22 @@ def test_one_spot_is_as_one_of_many():
         (np.random.default_rng(1).uniform(-0.5, found.places[-1] + 0.5, 100), found.places[[0, 7, -1]])
     )
     expected = np.column_stack(found.at(places))
-    assert np.array([found.spot(s) for s in places.tolist()]) == pytest.approx(expected, abs=1e-12)
+    assert np.array([found.state(s) for s in places.tolist()]) == pytest.approx(expected, abs=1e-12)
 
 
 def test_the_pace_lets_every_curve_ahead_be_reached_slowly_enough():
     config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, turn_within=0.1, steering_rate=0.5)
     found = course(path(figure_eight(), closed=True), "front")
-    pace = Pace(config, found)
+    pace = SpeedProfile(config, found)
     s = found.places
     speed = np.array([pace.at(place) for place in s.tolist()])
     curvature = np.maximum(np.abs(found.at(s).curvature), 1e-6)
     assert (speed**2 * curvature <= config.lateral_acceleration + 1e-9).all()
-    assert (speed * found.turned(config.turn_within) <= config.turn_within * config.steering_rate + 1e-9).all()
+    assert (speed * found.axle_change(config.turn_within) <= config.turn_within * config.steering_rate + 1e-9).all()
     assert (np.diff(speed**2) >= -2 * config.deceleration * np.diff(s) - 1e-9).all()
     for i in range(0, len(s), 25):  # and no slower than that
         bound = np.minimum(
-            config.lateral_acceleration / curvature[i:], (0.05 / np.maximum(found.turned(0.1)[i:], 1e-6)) ** 2
+            config.lateral_acceleration / curvature[i:], (0.05 / np.maximum(found.axle_change(0.1)[i:], 1e-6)) ** 2
         )
         assert speed[i] ** 2 == pytest.approx((bound + 0.1 * (s[i:] - s[i])).min())
     assert pace.at(-1.0) == speed[0]
@@ -113,7 +111,7 @@ def test_sections_end_where_the_steering_changes():
 
 
 def test_rough_ground_is_felt_and_forgotten():
-    ground = Ground()
+    ground = TerrainEstimator()
     for k in range(100):
         ground.add(0.05 * k, 0.05 * (-1) ** k, 0.0)
     assert ground.roughness == pytest.approx(0.05, rel=0.1)

@@ -8,10 +8,9 @@ from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.config import PurePursuitConfig
-from monstertruck_planners.track.line import Line
 from monstertruck_planners.track.pure_pursuit import PurePursuit
-from monstertruck_planners.track.service import TrackerService
-from monstertruck_planners.track.step import Newest, TrackingStep, TrackingWorker, TrackSetup
+from monstertruck_planners.track.segments import SegmentedPath
+from monstertruck_planners.track.service import Newest, TrackerService, TrackingStep, TrackingWorker, TrackSetup
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
@@ -232,7 +231,7 @@ def test_while_disarmed_a_path_is_prepared_anew_only_for_a_truck_that_moved(monk
 
     def line(*arguments):
         prepared.append(arguments)
-        return Line(*arguments)
+        return SegmentedPath(*arguments)
 
     async def scenario(bench):
         bench.gate(GateMode.ARMED)
@@ -246,7 +245,7 @@ def test_while_disarmed_a_path_is_prepared_anew_only_for_a_truck_that_moved(monk
         await bench.clock.sleep(2.0)
         assert len(prepared) == before + 1
 
-    monkeypatch.setattr("monstertruck_planners.track.step.Line", line)
+    monkeypatch.setattr("monstertruck_planners.track.service.SegmentedPath", line)
     bench = on_bench(scenario, route)
     assert [reason for reason, _ in bench.events] == [Reason.GOAL_REACHED]
 

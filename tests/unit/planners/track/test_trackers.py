@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_planners.track.api import TruckState
 from monstertruck_planners.track.catalog import TRACKERS, build_tracker
 from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.path_tracker import TruckState
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.kit import STEERING, TRACKER, Follower, circle, figure_eight, path, straight
@@ -57,7 +57,7 @@ def test_a_cusp_is_driven_to_a_full_stop_and_the_direction_changes_once(kind):
         if truck.speed and math.copysign(1, truck.speed) != signs[-1]:
             signs.append(math.copysign(1, truck.speed))
     assert signs == [0.0, 1.0, -1.0]
-    runs = [c.progress.run for c in truck.log]
+    runs = [c.progress.segment for c in truck.log]
     change = runs.index(1)
     assert truck.log[change - 1].speed == 0.0
     assert sorted(runs) == runs
@@ -75,16 +75,16 @@ def test_the_wheels_turn_before_the_truck_rolls():
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_about_a_cusp_does_not_change_the_direction_again(kind):
     truck = Follower(there_and_back(), kind=kind)
-    end = truck.line.runs[0].length
+    end = truck.path.segments[0].length
     rng = np.random.default_rng(1)
-    progress, runs = truck.line.start, []
-    x, y = truck.line.runs[0].at(end).point
+    progress, runs = truck.path.start, []
+    x, y = truck.path.segments[0].at(end).point
     progress = type(progress)(0, end - 0.05)
     for k in range(40):
         near = (x + 0.01 * rng.standard_normal(), y + 0.01 * rng.standard_normal(), math.pi / 2)
-        command = truck.law.control(TruckState(near, 0.0), truck.line, progress, 0.05 * k)
+        command = truck.tracker.control(TruckState(near, 0.0), truck.path, progress, 0.05 * k)
         progress = command.progress
-        runs.append(progress.run)
+        runs.append(progress.segment)
     assert sorted(runs) == runs
     assert runs[-1] == 1
     assert command.speed <= 0.0 or command.outcome is Reason.GOAL_REACHED
@@ -94,7 +94,7 @@ def test_noise_about_a_cusp_does_not_change_the_direction_again(kind):
 def test_a_pose_that_is_no_number_stops(kind):
     truck = Follower(path(straight(2.0)), kind=kind)
     truck.step()
-    command = truck.law.control(TruckState((math.nan, 0.0, 0.0), 0.1), truck.line, truck.progress, 0.1)
+    command = truck.tracker.control(TruckState((math.nan, 0.0, 0.0), 0.1), truck.path, truck.progress, 0.1)
     assert (command.outcome, command.speed) == (Reason.NOT_FINITE, 0.0)
     assert math.isfinite(command.front + command.rear + command.cross_track)
     assert truck.step().outcome is Reason.DRIVING
@@ -103,7 +103,7 @@ def test_a_pose_that_is_no_number_stops(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_truck_far_off_is_lost(kind):
     truck = Follower(path(straight(2.0)), kind=kind)
-    command = truck.law.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.line, truck.progress, 0.0)
+    command = truck.tracker.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.path, truck.progress, 0.0)
     assert (command.outcome, command.speed) == (Reason.PATH_LOST, 0.0)
 
 
@@ -131,7 +131,7 @@ def test_it_slows_down_on_slopes_and_rough_ground(kind):
     for more in ({}, {"tilt": 0.15}, {"roughness": 0.075}, {"tilt": 0.5}):
         truck = Follower(path(straight(4.0)), kind=kind)
         state = TruckState((0.5, 0.0, 0.0), 0.1, **more)
-        speeds.append(truck.law.control(state, truck.line, truck.progress, 0.0).speed)
+        speeds.append(truck.tracker.control(state, truck.path, truck.progress, 0.0).speed)
     assert speeds == pytest.approx([0.18, 0.09, 0.09, 0.03])
 
 
@@ -140,7 +140,7 @@ def test_it_brakes_before_a_curve():
     route = np.concatenate((x, circle(0.5, 0.5, 0.025)[1:] + x[-1]))
     truck = Follower(path(route), kind="lqr", speed=0.5, lateral_acceleration=0.1, steering="counter")
     truck.run()
-    inside = [c.speed for c in truck.log if 1.1 < truck.line.along(c.progress) < 2.0]
+    inside = [c.speed for c in truck.log if 1.1 < truck.path.along(c.progress) < 2.0]
     assert max(inside) < 0.24
     assert max(c.speed for c in truck.log) > 0.35
 
@@ -153,11 +153,15 @@ def test_the_path_says_where_to_crab(kind):
     steering = ["counter"] * len(out) + ["crab"] * (len(aside) - 1) + ["counter"] * 20
     truck = Follower(path(points, steering=steering), kind=kind)
     assert truck.run() is Reason.GOAL_REACHED
-    crabbing = [c for c in truck.log if 1.3 < truck.line.along(c.progress) < 2.2]
+    crabbing = [c for c in truck.log if 1.3 < truck.path.along(c.progress) < 2.2]
     assert all(c.front == pytest.approx(c.rear, abs=0.05) and c.front > 0.1 for c in crabbing)
     assert max(abs(c.heading_error) for c in crabbing) < (0.17 if kind == "mpc" else 0.1)
     assert truck.cross_track().max() < 0.06
-    stops = [b.progress.run for a, b in pairwise(truck.log) if a.progress.run != b.progress.run and a.speed == 0.0]
+    stops = [
+        b.progress.segment
+        for a, b in pairwise(truck.log)
+        if a.progress.segment != b.progress.segment and a.speed == 0.0
+    ]
     assert stops == [1, 2], "it stands while the wheels turn"
 
 
@@ -175,7 +179,7 @@ def test_where_the_curve_changes_sides_the_truck_waits_for_its_axles(kind):
     turn = MotionPath(np.zeros(3), np.array([[1.0, 2.0, 0.0], [0.3, -2.0, 0.0]]))
     truck = Follower(path(turn.sample(0.05).poses[:, :2]), kind=kind, steering_rate=0.5, speed=0.2)
     assert truck.run() is Reason.GOAL_REACHED
-    bend = [c for c in truck.log if 0.95 < truck.line.along(c.progress) < 1.05]
+    bend = [c for c in truck.log if 0.95 < truck.path.along(c.progress) < 1.05]
     assert min(c.speed for c in bend) < 0.1
     assert abs(truck.log[-1].heading_error) < 0.05
 
@@ -209,7 +213,7 @@ class Delayed:
     def run(self):
         truck, errors = self.truck, []
         for k in range(300):
-            command = truck.law.control(TruckState(truck.pose, 0.6), truck.line, truck.progress, 0.05 * k)
+            command = truck.tracker.control(TruckState(truck.pose, 0.6), truck.path, truck.progress, 0.05 * k)
             if command.outcome is not Reason.DRIVING:
                 break
             truck.progress = command.progress

@@ -12,7 +12,7 @@ from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.steps import CODEC
 from monstertruck_planners.track.config import LqrConfig
-from monstertruck_planners.track.step import TrackInput, TrackSetup
+from monstertruck_planners.track.service import TrackInput, TrackSetup
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import LaserScan

@@ -12,7 +12,7 @@ import pytest
 from monstertruck_planners.goals.exchange import PlanAnswer
 from monstertruck_planners.goals.planning import PlanningStep
 from monstertruck_planners.steps import CODEC, STEPS
-from monstertruck_planners.track.step import TrackingWorker, TrackInput
+from monstertruck_planners.track.service import TrackingWorker, TrackInput
 from monstertruck_runtime.actors import server as plan_server
 from monstertruck_runtime.actors.remote import RemoteDesk
 from monstertruck_runtime.clock import Clock, run_wall

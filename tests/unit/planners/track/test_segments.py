@@ -3,91 +3,91 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.track.line import Line, Progress
+from monstertruck_planners.track.segments import Progress, SegmentedPath
 from monstertruck_runtime.errors import InputError
 from tests.unit.planners.kit import circle, figure_eight, path, straight
 
 
-def line(route, pose=(0.0, 0.0, 0.0)):
-    return Line(route, pose, 0.8)
+def segmented(route, pose=(0.0, 0.0, 0.0)):
+    return SegmentedPath(route, pose, 0.8)
 
 
 def test_an_open_path_goes_on_straight_behind_its_end():
-    run = line(path(straight(1.0))).runs[0]
-    assert run.length == pytest.approx(1.0)
-    assert run.at(0.525).point == pytest.approx((0.525, 0.0))
-    assert run.at(1.5).point == pytest.approx((1.5, 0.0))
-    assert run.at(99.0).tangent == 0.0
+    segment = segmented(path(straight(1.0))).segments[0]
+    assert segment.length == pytest.approx(1.0)
+    assert segment.at(0.525).point == pytest.approx((0.525, 0.0))
+    assert segment.at(1.5).point == pytest.approx((1.5, 0.0))
+    assert segment.at(99.0).tangent == 0.0
 
 
 def test_projection_looks_only_where_it_is_told():
-    run = line(path(straight(2.0))).runs[0]
-    assert run.project(0.73, 0.2, 0.0, 2.0).s == pytest.approx(0.73)
-    assert run.project(0.73, 0.2, 1.0, 2.0).s == pytest.approx(1.0)
-    assert run.project(0.73, 0.2, 0.0, 0.4).s == pytest.approx(0.4)
-    assert run.project(5.0, 0.0, 2.0, 2.0).s == pytest.approx(2.0)
+    segment = segmented(path(straight(2.0))).segments[0]
+    assert segment.project(0.73, 0.2, 0.0, 2.0).s == pytest.approx(0.73)
+    assert segment.project(0.73, 0.2, 1.0, 2.0).s == pytest.approx(1.0)
+    assert segment.project(0.73, 0.2, 0.0, 0.4).s == pytest.approx(0.4)
+    assert segment.project(5.0, 0.0, 2.0, 2.0).s == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("low", [0.0, 0.31, 1.7])
 def test_few_and_many_steps_are_searched_alike(low, monkeypatch):
-    run = line(path(figure_eight(count=80))).runs[0]
-    feet = {}
+    segment = segmented(path(figure_eight(count=80))).segments[0]
+    found = {}
     for many in (10**6, 0):
-        monkeypatch.setattr("monstertruck_planners.track.line.MANY", many)
+        monkeypatch.setattr("monstertruck_planners.track.segments.MANY", many)
         points = np.random.default_rng(1).uniform(-1.5, 1.5, (200, 2)).tolist()
-        feet[many] = [run.project(x, y, low, low + 2.0) for x, y in points]
-    assert feet[0] == feet[10**6]
-    assert len({foot.s for foot in feet[0]}) > 20
+        found[many] = [segment.project(x, y, low, low + 2.0) for x, y in points]
+    assert found[0] == found[10**6]
+    assert len({one.s for one in found[0]}) > 20
 
 
 def test_a_lap_begins_at_the_truck_and_goes_on_where_it_began():
-    lap = line(path(circle(), closed=True), pose=(1.0, 1.0, math.pi / 2))
+    lap = segmented(path(circle(), closed=True), pose=(1.0, 1.0, math.pi / 2))
     assert lap.length == pytest.approx(math.tau, abs=0.02)
     assert lap.start == Progress(0, 0.0)
-    run = lap.runs[0]
-    assert run.at(0.0).point == pytest.approx((1.0, 1.0), abs=0.05)
-    assert run.at(run.length).point == pytest.approx(run.at(0.0).point)
-    assert run.at(run.length + 0.4).point == pytest.approx(run.at(0.4).point)
+    segment = lap.segments[0]
+    assert segment.at(0.0).point == pytest.approx((1.0, 1.0), abs=0.05)
+    assert segment.at(segment.length).point == pytest.approx(segment.at(0.0).point)
+    assert segment.at(segment.length + 0.4).point == pytest.approx(segment.at(0.4).point)
 
 
 def test_a_lap_that_repeats_its_first_pose_is_the_same():
     points = circle()
     repeated = np.concatenate((points, points[:1]))
-    assert line(path(repeated, closed=True)).length == pytest.approx(line(path(points, closed=True)).length)
+    assert segmented(path(repeated, closed=True)).length == pytest.approx(segmented(path(points, closed=True)).length)
 
 
 def test_an_open_path_is_joined_where_the_truck_stands():
-    joined = line(path(straight(2.0)), pose=(1.21, 0.03, 0.0))
+    joined = segmented(path(straight(2.0)), pose=(1.21, 0.03, 0.0))
     assert joined.along(joined.start) == pytest.approx(1.2)
 
 
 def test_there_and_back_begins_at_the_beginning():
     out = straight(1.0)
-    joined = line(path(np.concatenate((out, out[::-1][1:])), [1] * 21 + [-1] * 20))
+    joined = segmented(path(np.concatenate((out, out[::-1][1:])), [1] * 21 + [-1] * 20))
     assert joined.along(joined.start) == 0.0
-    assert [run.direction for run in joined.runs] == [1.0, -1.0]
+    assert [segment.direction for segment in joined.segments] == [1.0, -1.0]
     assert joined.length == pytest.approx(2.0)
 
 
 def test_at_a_crossing_the_branch_with_the_trucks_heading_counts():
     points = figure_eight()
     for heading in (math.pi / 4, -math.pi / 4 + math.pi):
-        lap = line(path(points, closed=True), pose=(0.0, 0.0, heading))
-        assert lap.runs[0].at(0.1).tangent == pytest.approx(heading, abs=0.3)
+        lap = segmented(path(points, closed=True), pose=(0.0, 0.0, heading))
+        assert lap.segments[0].at(0.1).tangent == pytest.approx(heading, abs=0.3)
 
 
 def test_joining_in_a_later_run():
     out = straight(1.0)
     back = out[::-1][1:] - (0.0, 0.0)
     sideways = back + np.column_stack((np.zeros(20), np.linspace(0, -0.5, 20)))
-    joined = line(path(np.concatenate((out, sideways)), [1] * 21 + [-1] * 20), pose=(0.1, -0.45, -0.3))
-    assert joined.start.run == 1
+    joined = segmented(path(np.concatenate((out, sideways)), [1] * 21 + [-1] * 20), pose=(0.1, -0.45, -0.3))
+    assert joined.start.segment == 1
     assert joined.along(joined.start) > 1.5
 
 
 def test_poses_ahead_look_where_the_truck_looks():
     out = straight(1.0)
-    forward, backward = line(path(out)), line(path(out, [-1] * 21), pose=(0, 0, math.pi))
+    forward, backward = segmented(path(out)), segmented(path(out, [-1] * 21), pose=(0, 0, math.pi))
     assert forward.ahead(Progress(0, 0.2), 0.4, 3) == pytest.approx(np.array([[0.2, 0, 0], [0.4, 0, 0], [0.6, 0, 0]]))
     assert backward.ahead(Progress(0, 0.2), 0.4, 2)[:, 2] == pytest.approx(math.pi)
 
@@ -104,4 +104,4 @@ def test_poses_ahead_look_where_the_truck_looks():
 )
 def test_impossible_paths_are_refused(bad, hint):
     with pytest.raises(InputError, match=hint):
-        line(bad)
+        segmented(bad)

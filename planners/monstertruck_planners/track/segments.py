@@ -1,4 +1,4 @@
-"""A path prepared for tracking: runs of one direction, all crab or none of it, measured by arc length.
+"""A path prepared for tracking: segments of one direction, all crab or none of it, measured by arc length.
 
 Progress along it only grows and is looked for near the present one, so a path may cross or repeat itself.
 """
@@ -11,6 +11,7 @@ from typing import Final, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
 
@@ -30,8 +31,8 @@ MAX_COORDINATE: Final = 10_000.0
 """Metres from the frame's origin."""
 MAX_STEP: Final = 100.0
 """Metres between two poses."""
-MAX_RUNS: Final = 64
-"""Runs; each costs some 20 us to prepare."""
+MAX_SEGMENTS: Final = 64
+"""Segments; each costs some 20 us to prepare."""
 MAX_NAME: Final = 128
 MANY: Final = 40
 """Steps from which on arrays find the nearest one sooner than floats do."""
@@ -39,16 +40,16 @@ MANY: Final = 40
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Place on a line."""
+    """Place on a segmented path."""
 
-    run: int = 0
-    """Index of the run."""
+    segment: int = 0
+    """Index of the segment."""
     s: float = 0.0
-    """Metres from the run's beginning."""
+    """Metres from the segment's beginning."""
 
 
-class Foot(NamedTuple):
-    """Point of a run nearest to the truck."""
+class Projection(NamedTuple):
+    """Point of a segment nearest to the truck."""
 
     s: float
     point: tuple[float, float]
@@ -56,7 +57,7 @@ class Foot(NamedTuple):
     """Direction of travel there, rad."""
 
 
-class Steps(NamedTuple):
+class PathSteps(NamedTuple):
     """A path without repeated points."""
 
     points: Array
@@ -69,14 +70,14 @@ class Steps(NamedTuple):
     """Of each step, or empty."""
 
 
-class Run:
+class Segment:
     """Part of a path driven without a stop, with a straight or given way on beyond its end.
 
     Args:
         points: shape (n, 2), n >= 2, m; from index ``last`` on they are the way beyond.
-        last: index of the run's own last point.
+        last: index of the segment's own last point.
         direction: +1 forward, -1 backward.
-        before: metres of the runs before this one.
+        before: metres of the segments before this one.
         yaws: of the own points, shape (last + 1,), rad.
         steering: of each own step, or empty.
         lap: the way beyond is the path's own beginning.
@@ -116,21 +117,21 @@ class Run:
         x, y = self._points.T
         return np.column_stack((np.interp(s, self._s, x), np.interp(s, self._s, y)))
 
-    def at(self, s: float) -> Foot:
+    def at(self, s: float) -> Projection:
         """Point at ``s`` metres."""
         i = min(max(int(self._s.searchsorted(s, "right")) - 1, 0), len(self._steps) - 1)
         x, y, dx, dy, length, begin, tangent = self._steps[i].tolist()
         share = (s - begin) / length
-        return Foot(s, (x + share * dx, y + share * dy), tangent)
+        return Projection(s, (x + share * dx, y + share * dy), tangent)
 
-    def project(self, x: float, y: float, low: float, high: float) -> Foot:
+    def project(self, x: float, y: float, low: float, high: float) -> Projection:
         """Nearest point between ``low`` and ``high`` metres."""
         first = max(int(self._s.searchsorted(low, "right")) - 1, 0)
         end = max(int(self._s.searchsorted(high, "left")), first + 1)
         steps = self._steps[first:end]
         if len(steps) > MANY:
             steps = steps[_nearest_step(steps, x, y, low, high)]
-        best, foot = math.inf, (0.0, x, y, 0.0)
+        best, nearest = math.inf, (0.0, x, y, 0.0)
         for px, py, dx, dy, length, begin, tangent in steps.tolist():
             along = ((x - px) * dx + (y - py) * dy) / length
             along = 0.0 if along < 0.0 else min(along, length)
@@ -139,8 +140,8 @@ class Run:
             fx, fy = px + share * dx, py + share * dy
             gap = math.hypot(fx - x, fy - y)
             if gap < best:
-                best, foot = gap, (s, fx, fy, tangent)
-        return Foot(foot[0], foot[1:3], foot[3])
+                best, nearest = gap, (s, fx, fy, tangent)
+        return Projection(nearest[0], nearest[1:3], nearest[3])
 
 
 def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> list[int]:
@@ -151,7 +152,7 @@ def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> 
     return [int(np.argmin(np.hypot(px + share * dx - x, py + share * dy - y)))]
 
 
-class Line:
+class SegmentedPath:
     """A whole path, to be driven from its vertex nearest to the start pose.
 
     A closed path is driven once around from there; an open one from there to its end.
@@ -174,26 +175,26 @@ class Line:
         self.name = path.name
         self.frame = path.frame
         self.closed = path.closed
-        self.runs = _runs(steps, beyond, closed=path.closed)
-        self.length = sum(run.length for run in self.runs)
+        self.segments = _segments(steps, beyond, closed=path.closed)
+        self.length = sum(segment.length for segment in self.segments)
         self.start = self._progress_of(steps.points, first)
 
     def along(self, progress: Progress) -> float:
         """Metres from the line's beginning."""
-        return self.runs[progress.run].before + progress.s
+        return self.segments[progress.segment].before + progress.s
 
     def ahead(self, progress: Progress, horizon: float, count: int) -> Array:
-        """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
-        run = self.runs[progress.run]
-        turned = 0.0 if run.direction > 0 else math.pi
-        feet = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
-        return np.array([(*foot.point, foot.tangent + turned) for foot in feet])
+        """Poses of the truck along the present segment's next ``horizon`` metres, shape (count, 3)."""
+        segment = self.segments[progress.segment]
+        turned = 0.0 if segment.direction > 0 else math.pi
+        projections = [segment.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
+        return np.array([(*nearest.point, nearest.tangent + turned) for nearest in projections])
 
     def _progress_of(self, points: Array, vertex: int) -> Progress:
         steps = np.diff(points[: vertex + 1], axis=0)
         along = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
-        i = max(i for i, run in enumerate(self.runs) if run.before <= along)
-        return Progress(i, along - self.runs[i].before)
+        i = max(i for i, segment in enumerate(self.segments) if segment.before <= along)
+        return Progress(i, along - self.segments[i].before)
 
 
 def check_path(path: Path) -> None:
@@ -210,8 +211,8 @@ def check_path(path: Path) -> None:
         _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
     if len(path.steering) not in (0, count):
         _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
-    if np.count_nonzero(_stops(path.directions, path.steering)) >= MAX_RUNS:
-        _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
+    if np.count_nonzero(_stops(path.directions, path.steering)) >= MAX_SEGMENTS:
+        _refuse(path, f"direction or crab changes too often: expected at most {MAX_SEGMENTS} segments")
     if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
         _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m from the origin")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
@@ -226,7 +227,7 @@ def _refuse(path: Path, text: str) -> NoReturn:
     raise InputError(f"path {path.name[:MAX_NAME]!r}: {text}")
 
 
-def _steps(path: Path) -> Steps:
+def _steps(path: Path) -> PathSteps:
     """What the path says of each step; a closed path ends on its beginning."""
     check_path(path)
     points, yaws = path.poses.reshape(-1, 3)[:, :2], path.poses[2::3]
@@ -240,15 +241,15 @@ def _steps(path: Path) -> Steps:
     kept = np.concatenate(([True], real))
     if steering:
         steering = tuple(mode for mode, is_real in zip(steering, real.tolist(), strict=True) if is_real)
-    return Steps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering)
+    return PathSteps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering)
 
 
-def _rolled(steps: Steps, first: int) -> Steps:
+def _rolled(steps: PathSteps, first: int) -> PathSteps:
     """A closed path from another vertex on."""
     points = np.concatenate((steps.points[first:-1], steps.points[: first + 1]))
     yaws = np.unwrap(np.concatenate((steps.yaws[first:-1], steps.yaws[: first + 1])))
     steering = steps.steering[first:] + steps.steering[:first]
-    return Steps(points, yaws, np.roll(steps.directions, -first), steering)
+    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering)
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
@@ -266,10 +267,10 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
     return int(groups[0][np.argmin(distance[groups[0]])])
 
 
-def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
+def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment, ...]:
     cuts = [0, *(np.flatnonzero(_stops(steps.directions, steps.steering)) + 1).tolist(), len(steps.directions)]
     lap = closed and len(cuts) == 2
-    runs: list[Run] = []
+    segments: list[Segment] = []
     before = 0.0
     for begin, end in pairwise(cuts):
         own = steps.points[begin : end + 1]
@@ -278,7 +279,7 @@ def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
         else:
             way = own[-1] - own[-2]
             extension = own[-1:] + beyond * way / np.hypot(*way)
-        run = Run(
+        segment = Segment(
             np.concatenate((own, extension)),
             end - begin,
             float(steps.directions[begin]),
@@ -287,9 +288,9 @@ def _runs(steps: Steps, beyond: float, *, closed: bool) -> tuple[Run, ...]:
             steps.steering[begin:end],
             lap=lap,
         )
-        runs.append(run)
-        before += run.length
-    return tuple(runs)
+        segments.append(segment)
+        before += segment.length
+    return tuple(segments)
 
 
 def _stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
@@ -312,3 +313,163 @@ def _reach(points: Array, beyond: float) -> int:
     step = np.diff(points, axis=0)
     travelled = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
     return int(np.searchsorted(travelled, beyond)) + 1
+
+
+STEP: Final = 0.025
+"""Spacing of the reference and half the chord a heading is taken from, m."""
+MOST: Final = 5000
+"""Greatest number of reference points of a segment."""
+QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
+"""Of the exponential distribution: a mean over them is a first-order lag."""
+
+
+class ReferenceStates(NamedTuple):
+    """Values at places of a segment, arrays of one shape."""
+
+    heading: Array
+    """Direction of the body-forward motion, rad: the path's tangent, turned round backwards."""
+    yaw: Array
+    """Of the body, rad."""
+    slip: Array
+    """Heading less yaw: sideslip at C, rad."""
+    turn: Array
+    """Yaw per metre of forward motion, 1/m."""
+    curvature: Array
+    """Of the path in the direction of travel, 1/m."""
+
+
+class ReferenceState(NamedTuple):
+    """``ReferenceStates`` at one place."""
+
+    heading: float
+    yaw: float
+    slip: float
+    turn: float
+    curvature: float
+
+
+class Reference:
+    """Reference along one segment.
+
+    Args:
+        segment: part of a line.
+        geometry: the truck's.
+        steering: where the segment does not say.
+    """
+
+    def __init__(self, segment: Segment, geometry: FourWheelSteering, steering: Steering) -> None:
+        self._segment = segment
+        self._default: Steering = steering
+        count = min(max(math.ceil(segment.end / STEP), 4), MOST) + 1
+        self._s = np.linspace(0.0, segment.end, count)
+        tangent, curvature = _tangents(segment, self._s)
+        heading = tangent if segment.direction > 0 else tangent + math.pi
+        self.given = bool(segment.steering)
+        names: list[Steering] = sorted(set(segment.steering)) if self.given else [steering]
+        number = {mode: i for i, mode in enumerate(names)}
+        modes = np.array([number[mode] for mode in segment.steering] if self.given else [0])
+        self._changes = segment.vertices[np.flatnonzero(np.diff(modes)) + 1]
+        modes = modes[self._step_at(self._s)] if self.given else np.zeros(count, np.intp)
+        yaw, turn = heading.copy(), segment.direction * curvature
+        for mode in names:
+            where = modes == number[mode]
+            if self.given and mode in ("crab", "hybrid"):
+                own = np.interp(self._s, segment.vertices, segment.yaws)
+                yaw[where] = own[where]
+                turn[where] = (segment.direction * np.gradient(own, self._s))[where]
+            elif mode != "crab":
+                lagged, bend = self._lagged(heading, curvature, _slip_free(mode, geometry))
+                yaw[where], turn[where] = lagged[where], bend[where]
+        slip = np.remainder(heading - yaw + math.pi, math.tau) - math.pi
+        self._table = ReferenceStates(heading, yaw, slip, turn, curvature)
+        self._rows = np.column_stack((self._s, *self._table))
+        side = np.tan(slip)
+        lever = turn / np.cos(slip)
+        self._axles = np.arctan([side + geometry.l_f * lever, side - geometry.l_r * lever])
+
+    @property
+    def places(self) -> Array:
+        """Metres from the segment's beginning where the reference was computed: from 0 to the end of the way."""
+        return self._s
+
+    def steering(self, s: float) -> Steering:
+        """How the axles steer at ``s`` metres."""
+        return self._modes(np.array([s]))[0] if self.given else self._default
+
+    def steerings(self, s: Array) -> list[Steering]:
+        """The same at several places."""
+        return self._modes(s) if self.given else [self._default] * len(s)
+
+    def at(self, s: Array) -> ReferenceStates:
+        """Values at ``s`` metres; outside the segment those of its ends."""
+        return ReferenceStates(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
+
+    def state(self, s: float) -> ReferenceState:
+        """The same at one place."""
+        last = len(self._rows) - 1
+        i = int(self._s.searchsorted(s, "right")) - 1
+        if not 0 <= i < last:
+            return ReferenceState(*self._rows[min(max(i, 0), last)].tolist()[1:])
+        (begin, *here), (end, *there) = self._rows[i : i + 2].tolist()
+        width, past = end - begin, s - begin
+        return ReferenceState(*[(b - a) / width * past + a for a, b in zip(here, there, strict=True)])
+
+    def axle_change(self, ahead: float) -> Array:
+        """How far the axles have to turn in the ``ahead`` metres after each of the places, rad; the further one's."""
+        change = [np.abs(np.interp(self._s + ahead, self._s, axle) - axle) for axle in self._axles]
+        return np.asarray(np.maximum(*change))
+
+    def section_end(self, s: float) -> float:
+        """Where the steering changes next, m; the end of the way if it does not."""
+        i = int(self._changes.searchsorted(s, "right"))
+        return float(self._changes[i]) if i < len(self._changes) else self._segment.end
+
+    def _modes(self, s: Array) -> list[Steering]:
+        return [self._segment.steering[i] for i in self._step_at(s).tolist()]
+
+    def _step_at(self, s: Array) -> NDArray[np.intp]:
+        """Index of the segment's step at each of the places."""
+        segment = self._segment
+        index = np.searchsorted(
+            segment.vertices, np.remainder(s, segment.length) if segment.end > segment.length else s, side="right"
+        )
+        return np.clip(index - 1, 0, len(segment.steering) - 1)
+
+    def _lagged(self, heading: Array, curvature: Array, a: float) -> tuple[Array, Array]:
+        """Yaw and turn of a body that does not slip sideways at its point ``a``."""
+        direction = self._segment.direction
+        if abs(a) < 1e-9:
+            return heading, direction * curvature
+        back = math.copysign(abs(a), -a * direction)
+        yaw, turn = np.zeros_like(heading), np.zeros_like(heading)
+        for quantile in QUANTILES.tolist():
+            s = self._s - back * quantile
+            inside = np.clip(s, 0.0, self._s[-1])
+            bend = np.interp(inside, self._s, curvature)
+            yaw += np.interp(inside, self._s, heading) + bend * (s - inside)
+            turn += bend
+        slip = np.arcsin(np.clip(heading - yaw / len(QUANTILES), -1.0, 1.0))
+        return heading - slip, direction * turn / len(QUANTILES)
+
+
+def _slip_free(mode: Steering, geometry: FourWheelSteering) -> float:
+    """Where the point is that never slips sideways, x in m."""
+    if mode == "front":
+        return -geometry.l_r
+    return geometry.l_f if mode == "rear" else 0.5 * (geometry.l_f - geometry.l_r)
+
+
+def _tangents(segment: Segment, s: Array) -> tuple[Array, Array]:
+    """Tangent (continuous) and curvature from chords."""
+    half = min(STEP, segment.end / 4)
+    at = np.clip(s, half, segment.end - half)
+    tangent = np.unwrap(_chord(segment, at - half, at + half))
+    middle = np.clip(s, 2 * half, segment.end - 2 * half)
+    change = _chord(segment, middle, middle + 2 * half) - _chord(segment, middle - 2 * half, middle)
+    curvature = (np.remainder(change + math.pi, math.tau) - math.pi) / (2 * half)
+    return tangent + curvature * (s - at), curvature
+
+
+def _chord(segment: Segment, begin: Array, end: Array) -> Array:
+    x, y = (segment.points(end) - segment.points(begin)).T
+    return np.asarray(np.arctan2(y, x))

@@ -1,0 +1,404 @@
+"""What all trackers have in common: progress, cusps, speed, prediction over the dead time, limits.
+
+A segment ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
+the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.segments import (
+    MAX_SEGMENTS,
+    Progress,
+    Projection,
+    Reference,
+    ReferenceState,
+    Segment,
+    SegmentedPath,
+)
+from monstertruck_schemas.plan import Steering
+from monstertruck_schemas.reasons import Reason
+
+Array = NDArray[np.float64]
+
+Angles = tuple[float, float]
+Pose = tuple[float, float, float]
+
+LONGEST: Final = 0.05
+"""Of the steps the future is computed in, s."""
+FORGET: Final = 1.0
+"""After a pause of this length nothing is known of the axles, s."""
+
+
+class AxleModel:
+    """Both axles' present angles, computed from the requests: servos report what they are told, not where they are.
+
+    Args:
+        dead_time: s.
+        lag: time constant, s; 0: none.
+        rate: greatest turning rate, rad/s.
+    """
+
+    def __init__(self, dead_time: float, lag: float, rate: float) -> None:
+        self.dead_time = dead_time
+        self.lag = lag
+        self.rate = rate
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all requests."""
+        self.angles: Angles = (0.0, 0.0)
+        self.requested: Angles = (0.0, 0.0)
+        """By the newest request."""
+        self._due: deque[tuple[float, Angles]] = deque()
+        self._target: Angles = (0.0, 0.0)
+        self._t: float | None = None
+
+    def request(self, t: float, angles: Angles) -> None:
+        """Note a request made at ``t``."""
+        self.requested = angles
+        self._due.append((t + self.dead_time, angles))
+
+    def advance(self, t: float) -> None:
+        """Bring the angles to the time ``t``."""
+        if self._t is None or not 0.0 <= t - self._t <= FORGET:
+            asked = self.requested
+            self.reset()
+            self.angles = self._target = self.requested = asked
+            self._t = t
+            return
+        for _, until, target in self._pieces(self._t, t):
+            self.angles = self._turned(self.angles, target, until)
+            self._target = target
+        while self._due and self._due[0][0] <= t:
+            self._target = self._due.popleft()[1]
+        self._t = t
+
+    def ahead(self, pose: Pose, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose, Angles]:
+        """Pose and angles in ``seconds``, at a constant speed and if nothing else is asked for."""
+        angles = self.angles
+        begin = self._t or 0.0
+        for _, duration, target in self._pieces(begin, begin + seconds):
+            count = max(math.ceil(duration / LONGEST), 1)
+            for _ in range(count):
+                middle = self._turned(angles, target, 0.5 * duration / count)
+                pose = geometry.integrate(pose, *geometry.body_twist(speed, *middle), duration / count)
+                angles = self._turned(angles, target, duration / count)
+        return pose, angles
+
+    def _pieces(self, begin: float, end: float) -> list[tuple[float, float, Angles]]:
+        """Times in which the axles turn to one target: when, how long, which."""
+        pieces = []
+        target, at = self._target, begin
+        for due, angles in self._due:
+            if due >= end:
+                break
+            if due > at:
+                pieces.append((at, due - at, target))
+                at = due
+            target = angles
+        if end > at:
+            pieces.append((at, end - at, target))
+        return pieces
+
+    def _turned(self, angles: Angles, target: Angles, dt: float) -> Angles:
+        return self._one(angles[0], target[0], dt), self._one(angles[1], target[1], dt)
+
+    def _one(self, angle: float, target: float, dt: float) -> float:
+        """First-order lag with a limited rate, exactly."""
+        gap = target - angle
+        linear = self.rate * self.lag
+        if abs(gap) > linear:
+            # At full rate until the lag alone would be slower.
+            ramp = min(dt, (abs(gap) - linear) / self.rate)
+            angle += math.copysign(self.rate * ramp, gap)
+            gap, dt = target - angle, dt - ramp
+        if dt <= 0.0:
+            return angle
+        return target if self.lag == 0.0 else target - gap * math.exp(-dt / self.lag)
+
+
+class TruckState(NamedTuple):
+    """What a tracker knows of the truck."""
+
+    pose: tuple[float, float, float]
+    """x, y (m), yaw (rad) in the path's frame."""
+    speed: float
+    """Forward speed, m/s."""
+    clearance: float = math.inf
+    """Room around the footprint along the next part of the path, m."""
+    tilt: float = 0.0
+    """Angle between the truck's z axis and the vertical, rad."""
+    roughness: float = 0.0
+    """Standard deviation of the tilt over the last seconds, rad."""
+
+
+@dataclass(slots=True)
+class Command:
+    """What to do now, and how the tracking goes."""
+
+    speed: float
+    """Of the base point along its direction of travel, m/s; negative backwards."""
+    front: float
+    rear: float
+    progress: Progress
+    cross_track: float
+    """Distance of the base point from the path, m; positive left of it, seen in the direction of travel."""
+    heading_error: float
+    """Yaw less the path's, rad."""
+    outcome: Reason
+    """DRIVING, GOAL_REACHED, PATH_LOST or NOT_FINITE."""
+
+
+LEAST: Final = 1e-6
+"""Curvatures (1/m) and turns (rad) are taken to be no smaller."""
+
+
+class SpeedProfile:
+    """Speed from which every curve ahead is reached at what its curvature allows, and at which the axles keep up.
+
+    Args:
+        config: accelerations, and the distance within which the axles can turn.
+        reference: of a segment.
+    """
+
+    def __init__(self, config: TrackerConfig, reference: Reference) -> None:
+        s = reference.places
+        allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), LEAST)
+        change = np.maximum(reference.axle_change(config.turn_within), LEAST)
+        turning = config.turn_within * config.steering_rate / change
+        gained = 2 * config.deceleration * s
+        least = np.minimum.accumulate((np.minimum(allowed, turning**2) + gained)[::-1])[::-1]
+        self._rows = np.column_stack((s, np.maximum(least - gained, 0.0)))
+
+    def at(self, s: float) -> float:
+        """Greatest speed at ``s`` metres, m/s."""
+        last = len(self._rows) - 1
+        i = min(max(int(self._rows[:, 0].searchsorted(s, "right")) - 1, 0), last - 1)
+        (begin, here), (end, there) = self._rows[i : i + 2].tolist()
+        share = min(max((s - begin) / (end - begin), 0.0), 1.0)
+        return math.sqrt(here + share * (there - here))
+
+
+def target_speed(config: TrackerConfig, truck: TruckState, segment: Segment, profile: SpeedProfile, s: float) -> float:
+    """Speed along the segment, m/s, at ``s`` metres; its sign is the segment's direction."""
+    if truck.speed * segment.direction < -config.min_speed:
+        return 0.0  # still rolling the other way
+    speed = config.speed if segment.direction > 0 else config.reverse_speed
+    speed *= min(max(truck.clearance, 0.0) / config.slow_clearance, 1.0)
+    speed *= speed_share(truck.tilt, config.slow_tilt) * speed_share(truck.roughness, config.slow_roughness)
+    left = segment.length - s - config.goal_tolerance - abs(truck.speed) * config.dead_time
+    speed = min(speed, math.sqrt(2 * config.deceleration * max(left, 0.0)), profile.at(s))
+    return segment.direction * max(speed, config.min_speed)
+
+
+def speed_share(amount: float, limit: float) -> float:
+    """Share of the speed: 1 up to the limit, falling to 0 at twice as much; 0 for what is not a number."""
+    return min(max(2.0 - amount / limit, 0.0), 1.0) if math.isfinite(amount) else 0.0
+
+
+C = TypeVar("C", bound=TrackerConfig)
+
+REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+STEEPEST: Final = 1.4
+"""Angles are cut to this before their curvature is kept, rad."""
+TURNED: Final = 0.03
+"""Axles this near to what is requested count as turned, rad."""
+
+
+class TrackingState(NamedTuple):
+    """The predicted state at which a request made at this step begins to act, and the reference there."""
+
+    pose: Pose
+    """x, y (m), yaw (rad)."""
+    angles: Angles
+    """Of the axles, rad."""
+    speed: float
+    """Forward, m/s; at least ``min_speed`` in size."""
+    target_speed: float
+    """That will be requested, m/s."""
+    acceleration: float
+    """With which it is reached, m/s^2."""
+    segment: Segment
+    reference: Reference
+    """Along the segment."""
+    s: float
+    """Metres from the segment's beginning."""
+    steering: Steering
+    lateral_error: float
+    """Distance left of the reference, seen along ``target.heading``, m."""
+    target: ReferenceState
+    """The reference at ``s``."""
+    heading_error: float
+    """Yaw less the reference's, rad."""
+
+    def speeds(self, times: Array) -> Array:
+        """Forward speed after ``times`` seconds: gained, never lost, as braking depends on what lies ahead."""
+        size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
+        return self.segment.direction * np.minimum(size + self.acceleration * times, most)
+
+    def distances(self, times: Array) -> Array:
+        """Metres from the segment's beginning after ``times`` seconds."""
+        size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
+        gaining = np.minimum(times, (most - size) / self.acceleration)
+        return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
+
+
+class PathTracker(ABC, Generic[C]):
+    """Follows segmented paths; subclasses steer. It remembers its own requests only, to predict the axles.
+
+    Args:
+        config: speeds, distances, the axles' behaviour.
+        geometry: the truck's.
+    """
+
+    def __init__(self, config: C, geometry: FourWheelSteering) -> None:
+        self.config = config
+        self.geometry = geometry
+        self.axles = AxleModel(config.dead_time, config.lag, config.steering_rate)
+        self.period = 1.0 / config.rate
+        self.prediction = config.dead_time
+        """Seconds ahead for which ``steer`` is asked."""
+        self._prepared: dict[int, tuple[Segment, Reference, SpeedProfile]] = {}
+
+    def reset(self) -> None:
+        """Forget the requests: they were not obeyed."""
+        self.axles.reset()
+        self._prepared.clear()
+
+    @abstractmethod
+    def steer(self, state: TrackingState) -> Angles:
+        """Wanted angles of front and rear axle, rad, not yet limited."""
+
+    def prepare(self, path: SegmentedPath, progress: Progress) -> bool:
+        """Compute what ``control`` needs of a path's present segment, once; whether that had to be done."""
+        segment = path.segments[progress.segment]
+        known = self._prepared.get(id(segment))
+        if known is not None and known[0] is segment:
+            return False
+        self._prepare(segment)
+        return True
+
+    def control(self, truck: TruckState, path: SegmentedPath, progress: Progress, t: float) -> Command:
+        """One control step.
+
+        Args:
+            truck: its state at ``t``.
+            path: what to follow.
+            progress: place reached at the step before, ``path.start`` at first.
+            t: s, growing.
+        """
+        self.axles.advance(t)
+        if not all(map(math.isfinite, (*truck.pose, truck.speed))):
+            return Command(0.0, *self.axles.requested, progress, 0.0, 0.0, Reason.NOT_FINITE)
+        config = self.config
+        segment = path.segments[progress.segment]
+        nearest = self._project(truck, segment, progress.s)
+        ended = segment.length - nearest.s <= config.goal_tolerance
+        last = progress.segment + 1 == len(path.segments)
+        if ended and not last and abs(truck.speed) <= REST:
+            progress = Progress(progress.segment + 1)
+            segment = path.segments[progress.segment]
+            nearest, ended = self._project(truck, segment, 0.0), False
+            last = progress.segment + 1 == len(path.segments)
+        state = self._predict(truck, segment, nearest.s)
+        outcome = Reason.DRIVING
+        if math.hypot(truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]) > config.lost_distance:
+            outcome = Reason.PATH_LOST
+        elif ended and last:
+            outcome = Reason.GOAL_REACHED
+        angles = self.limited(state.steering, *self.steer(state))
+        if ended and not last:
+            angles = self.axles.requested  # coming to rest at a cusp
+        speed = 0.0
+        if outcome is Reason.DRIVING and not ended and not self._turning_at_rest(truck, angles):
+            speed = self.speed(state)
+        self.axles.request(t, angles)
+        dx, dy = truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]
+        return Command(
+            speed=speed,
+            front=angles[0],
+            rear=angles[1],
+            progress=Progress(progress.segment, nearest.s),
+            cross_track=math.cos(nearest.tangent) * dy - math.sin(nearest.tangent) * dx,
+            heading_error=wrap_angle(truck.pose[2] - state.reference.state(nearest.s).yaw),
+            outcome=outcome,
+        )
+
+    def speed(self, state: TrackingState) -> float:
+        """Speed to request, m/s."""
+        return state.target_speed
+
+    def limited(self, steering: Steering, front: float, rear: float) -> Angles:
+        """Angles within the limits of a way of steering."""
+        angle = self.config.angle
+        front, rear = min(max(front, -STEEPEST), STEEPEST), min(max(rear, -STEEPEST), STEEPEST)
+        if steering == "crab":
+            front = rear = min(max(0.5 * (front + rear), -angle), angle)
+            return front, rear
+        ahead, behind = (0.0 if steering == "rear" else angle), (0.0 if steering == "front" else angle)
+        if ahead == 0.0:
+            return 0.0, min(max(rear, -angle), angle)
+        front, rear = self.geometry.limit_keeping_curvature(front, rear, ahead, behind)
+        return float(front), float(rear)
+
+    def _prepare(self, segment: Segment) -> tuple[Reference, SpeedProfile]:
+        """Reference and greatest speeds of a segment, computed once."""
+        known = self._prepared.get(id(segment))
+        if known is None or known[0] is not segment:
+            if len(self._prepared) >= MAX_SEGMENTS:
+                self._prepared.clear()
+            reference = Reference(segment, self.geometry, self.config.steering)
+            known = self._prepared[id(segment)] = (segment, reference, SpeedProfile(self.config, reference))
+        return known[1:]
+
+    def _project(self, truck: TruckState, segment: Segment, s: float) -> Projection:
+        low = min(s, segment.length)
+        return segment.project(truck.pose[0], truck.pose[1], low, min(low + self.config.reach, segment.length))
+
+    def _predict(self, truck: TruckState, segment: Segment, s: float) -> TrackingState:
+        reference, profile = self._prepare(segment)
+        speed = truck.speed if truck.speed * segment.direction > self.config.min_speed else 0.0
+        pose, angles = truck.pose, self.axles.angles
+        if self.prediction:
+            pose, angles = self.axles.ahead(pose, speed, self.geometry, self.prediction)
+        nearest = segment.project(pose[0], pose[1], s, s + self.config.reach)
+        target = reference.state(nearest.s)
+        dx, dy = pose[0] - nearest.point[0], pose[1] - nearest.point[1]
+        return TrackingState(
+            pose=pose,
+            angles=angles,
+            speed=speed or segment.direction * self.config.min_speed,
+            target_speed=target_speed(self.config, truck, segment, profile, s),
+            acceleration=self.config.acceleration,
+            segment=segment,
+            reference=reference,
+            s=nearest.s,
+            steering=_steering_at(reference, nearest.s),
+            lateral_error=math.cos(target.heading) * dy - math.sin(target.heading) * dx,
+            target=target,
+            heading_error=wrap_angle(pose[2] - target.yaw),
+        )
+
+    def _turning_at_rest(self, truck: TruckState, angles: Angles) -> bool:
+        """Whether the truck stands with its wheels still turning to where they are wanted."""
+        if abs(truck.speed) > REST:
+            return False
+        now = self.axles.angles
+        return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > TURNED
+
+
+def _steering_at(reference: Reference, s: float) -> Steering:
+    """How the axles steer: where a path crabs its headings are meant, so they may differ to keep them."""
+    steering = reference.steering(s)
+    return "hybrid" if steering == "crab" and reference.given else steering
