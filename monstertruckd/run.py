@@ -13,7 +13,6 @@ from monstertruck_runtime.errors import PortBusyError
 from monstertruck_runtime.memory import settle
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
-from monstertruckd.config.calibration import store_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.host.logging_queue import start_logging
@@ -32,7 +31,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     config, tree = load_truck(config_file)
     faulthandler.enable()
     listener = start_logging(verbose=verbose)
-    log.info("calibration: %s", tree.calibration or f"none in {store_of(config).folder}")
+    log.info("calibration: %s", tree.calibration or f"none in {config.calibration_folder}")
 
     async def main(clock: Clock) -> None:
         stop = asyncio.Event()

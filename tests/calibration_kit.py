@@ -12,7 +12,7 @@ from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
-from monstertruckd.config.calibration import Result, Value, WizardName, store_of, with_values
+from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.calibrate.guide import Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Confirm, Number
@@ -257,7 +257,7 @@ def run_session(
     Raises:
         TruckError: whatever ended the wizard.
     """
-    current = store_of(config).current()
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
     known = current.results if current is not None else {}
     calibrated = with_values(config, known.values(), "calibration")
 

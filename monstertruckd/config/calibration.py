@@ -254,11 +254,6 @@ def _first_mistake(error: ValidationError) -> str:
     return f"{'.'.join(map(str, detail['loc'])) or 'file'}: {detail['msg'][:1].lower()}{detail['msg'][1:]}"
 
 
-def store_of(config: TruckConfig) -> CalibrationStore:
-    """Where the calibration of a configured truck is kept."""
-    return CalibrationStore(config.calibration or config.state_directory / "calibration", config.robot)
-
-
 def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
     """``config`` with the values of ``results``; values of devices that this truck has not are left out.
 

@@ -15,7 +15,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.config.calibration import Result, WizardName, store_of, with_values
+from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, with_values
 from monstertruckd.config.truck import TruckConfig
 
 SHOW: Final = "calibration"
@@ -43,7 +43,7 @@ def register(
         offload: where files are read and written.
         mode: the gate's present one; nothing is written while the truck may move.
     """
-    store = store_of(config)
+    store = CalibrationStore(config.calibration_folder, config.robot)
 
     def real_time() -> int:
         return clock.now() + clock.real_offset()

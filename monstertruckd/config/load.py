@@ -21,7 +21,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
-from monstertruckd.config.calibration import store_of, with_values
+from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.config.truck import TruckConfig
 
 Key = tuple[str | int, ...]
@@ -98,7 +98,7 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     Raises:
         ConfigError: the file is damaged, of another truck, or its values do not fit the configuration.
     """
-    store = store_of(config)
+    store = CalibrationStore(config.calibration_folder, config.robot)
     path = store.newest()
     if path is None:
         return config, tree

@@ -135,6 +135,11 @@ class TruckConfig(Schema):
         )
 
     @property
+    def calibration_folder(self) -> Path:
+        """Where calibration files are kept."""
+        return self.calibration or self.state_directory / "calibration"
+
+    @property
     def black_box_folder(self) -> Path | None:
         """Where black boxes go; None = nowhere."""
         if self.blackbox is not None and self.blackbox.directory is not None:

@@ -17,7 +17,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruck_sim.world.obstacles import Box
-from monstertruckd.config.calibration import Estimate, Result, WizardName, store_of
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
 from monstertruckd.tools.calibrate.drive import DriveWizard
@@ -64,7 +64,7 @@ def test_battery(seed: int, tmp_path: Path):
     again = run_session(config, battery_wizard(), rng, charges=(0.2,))
     judged(again, config)
     assert len(again.result.readings) == 3, "the earlier reading counts too"
-    current = store_of(config).current()
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
     assert current.number == 2
 
@@ -160,7 +160,7 @@ class Bench:
         self.rig = rig
         self.clock = clock
         self.truck = Falling(rig.daemon, clock)
-        self.store = store_of(rig.config)
+        self.store = CalibrationStore(rig.config.calibration_folder, rig.config.robot)
         self.files = {path: path.read_bytes() for path in self.store.files()}
         self.gate = rig.bus.subscribe(topics.GATE, latest())
         self.drives = rig.bus.subscribe(topics.CMD_DRIVE, fifo(1 << 14))
@@ -190,7 +190,7 @@ class Bench:
 @asynccontextmanager
 async def driving(config: SimulatedTruckConfig, clock: VirtualClock) -> AsyncIterator[tuple[Bench, asyncio.Task[Any]]]:
     """The drive wizard in the middle of its first run."""
-    store_of(config).save(OLD, 0)
+    CalibrationStore(config.calibration_folder, config.robot).save(OLD, 0)
     rig = VirtualRig(config, clock)
     async with rig.running():
         await clock.sleep(3.0)

@@ -234,11 +234,12 @@ def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
 
 
 def _store(config: Path) -> Any:
-    from monstertruckd.config.calibration import store_of
+    from monstertruckd.config.calibration import CalibrationStore
     from monstertruckd.config.load import load_config
     from monstertruckd.config.truck import TruckConfig
 
-    return store_of(load_config(config, TruckConfig)[0])
+    loaded, _ = load_config(config, TruckConfig)
+    return CalibrationStore(loaded.calibration_folder, loaded.robot)
 
 
 def _json(value: Any) -> str:

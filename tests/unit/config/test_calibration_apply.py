@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.errors import ConfigError
-from monstertruckd.config.calibration import Estimate, Result, WizardName, store_of, value_at
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName, value_at
 from monstertruckd.config.load import load_truck, resolved
 from monstertruckd.tools.cli.main import main
 
@@ -37,7 +37,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def save(config: Path, *results: Result) -> Path:
-    store = store_of(load_truck(config)[0])
+    store = CalibrationStore(load_truck(config)[0].calibration_folder, "truck")
     return [store.save(one, 0) for one in results][-1]
 
 
