@@ -26,9 +26,8 @@ from monstertruck_schemas.topics import BY_NAME, TOPICS
 from monstertruckd.config.load import load_config
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.config import BlackBoxConfig
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
 SAMPLE = 4.0

@@ -39,7 +39,7 @@ from monstertruckd.daemon import Daemon
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 SOURCES: Final = ("monstertruckd", "drivers", "planners", "schemas")

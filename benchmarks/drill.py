@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]

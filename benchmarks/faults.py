@@ -24,10 +24,8 @@ from rich.table import Table
 
 from monstertruck_runtime.clock import run_virtual
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.goal_scenarios import COLUMNS, GOALS, cells, shortcomings
-from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario
+from monstertruckd.tools.drill.scenario import COLUMNS, GOALS, Expect, Reaction, Scenario, cells, measure, shortcomings
 from monstertruckd.tools.drill.scenarios import SCENARIOS
-from monstertruckd.tools.drill.stages import measure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,7 +77,7 @@ def figures(runs: Iterable[Run]) -> dict[str, float]:
             take("stop_after_sample_s", got.stop_bytes_after_sample_s)
             take("standstill_after_stop_s", (got.standstill_after_s or 99.0) - max(got.stop_bytes_after_s, noticed))
         if expect is Expect.STOP_AGAIN:
-            take("standstill_after_return_s", (got.standstill_after_s or 99.0) - got.healed_after_s)
+            take("standstill_after_return_s", (got.standstill_after_s or 99.0) - got.ended_after_s)
         if expect is Expect.STOP_BY_LINE:
             take("standstill_by_line_s", got.standstill_after_s)
         if one.scenario.name.endswith("unplugged"):

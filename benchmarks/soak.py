@@ -22,10 +22,9 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas.req import Order
 from monstertruck_sim.faults import hubs_of
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[1]
 WARM = 1 / 6

@@ -16,10 +16,9 @@ from monstertruckd.config.calibration import CalibrationStore, Result, Value, Wi
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.calibrate.guide import Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Confirm, Number
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 STOPPED: Final = 0.2
 """Chance that something stops a servo on its way to one side."""

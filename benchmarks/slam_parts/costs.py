@@ -14,7 +14,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.logs.scans import read_scans
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[2]
 ROUNDS = 400

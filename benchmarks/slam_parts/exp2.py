@@ -44,7 +44,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "recorded-urg.yaml"

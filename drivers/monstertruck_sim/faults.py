@@ -1,15 +1,18 @@
-"""What can go wrong, drawn at random: one device's cable or self, a hub, a supply rail, the computer around them."""
+"""Faults of the simulation: what can be injected, where, and the catalog from which random ones are drawn.
+
+A fault is a pair of actions on a ``SimContext``: one starts it, one ends it. Scripted scenarios and random drills both
+are made of the actions defined here.
+"""
 
 import errno
 import math
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.config import Devices
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import Clock, VirtualClock
@@ -20,16 +23,18 @@ from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.obstacles import Disc
 
 SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser")
-"""Roles that hang on a line of bytes."""
+"""Roles of devices on a serial line."""
 VITAL: Final = ("drive", "steering", "lidar", "compass")
-"""The truck stops when one of these falls silent."""
+"""The truck stops when one of these sends nothing."""
 HOT: Final = 92.0
-"""Degrees Celsius of a computer whose fan stands."""
+"""Temperature of a computer whose fan stands, degrees Celsius."""
 COOL: Final = 48.0
+POST_RADIUS: Final = 0.1
+"""Radius of an obstacle, m."""
 
 
-class Kind(StrEnum):
-    """What a fault is, by its name in the report."""
+class FaultKind(StrEnum):
+    """Kinds of faults in the catalog, by their names in reports."""
 
     UNPLUG = "unplug"
     HUB_LOSS = "hub loss"
@@ -53,16 +58,16 @@ class Kind(StrEnum):
 
 
 class Disk(Protocol):
-    """What can refuse to record."""
+    """A recorder whose disk can fail."""
 
     def refuse(self, error: OSError) -> None:
-        """Fail from now on."""
+        """Fail every write that follows."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
-    """What faults may lay hands on: the simulated side, never the daemon (but for its disk).
+class SimContext:
+    """What faults act on: the simulated side, and of the daemon its disk only.
 
     Args:
         config: of the simulation.
@@ -80,35 +85,34 @@ class Site:
     clock: Clock
     disk: Disk | None = None
 
-    def port(self, role: str) -> EmulatedPort:
-        """The cable of a device."""
-        return self.computer.ports[role]
+    def device(self, role: str) -> Emulated:
+        """Emulator and cable of a device."""
+        return Emulated(self.robot.emulators[role], self.computer.ports[role])
 
-    def say(self, role: str, *lines: str) -> None:
-        """Words for the fault console of a device; nothing where the truck has none."""
+    def command(self, role: str, *lines: str) -> None:
+        """Give commands of the fault console to a device; nothing where the truck has none."""
         if role in self.robot.emulators:
-            emulated = Emulated(self.robot.emulators[role], self.port(role))
             for line in lines:
-                emulated.command(line.split())
+                self.device(role).command(line.split())
 
-    def heat(self, degrees: float) -> None:
-        """Temperature of the computer, where it is watched."""
+    def set_temperature(self, degrees: float) -> None:
+        """Temperature of the computer, degrees Celsius, where it is monitored."""
         if "host" in self.robot.monitored:
             self.robot.monitored["host"].inject("temperature", str(degrees))
 
     def lose_hubs(self, *hubs: str) -> None:
-        """Hubs drop off the bus."""
+        """Take hubs off the bus."""
         for hub in hubs:
             self.computer.usb.lose_hub(hub)
 
     async def return_hubs(self, *hubs: str) -> None:
-        """They come back, one after the other."""
+        """Bring them back, one after the other."""
         for hub in hubs:
             await self.computer.usb.return_hub(hub, self.clock)
 
-    def exchange(self, one: str, other: str) -> None:
-        """Pull two cables and plug each into the other's place."""
-        ports = [self.port(role) for role in (one, other)]
+    def exchange_cables(self, one: str, other: str) -> None:
+        """Unplug two cables and plug each into the other's port."""
+        ports = [self.computer.ports[role] for role in (one, other)]
         for port in ports:
             port.unplug()
         ports[0].device, ports[1].device = ports[1].device, ports[0].device
@@ -116,42 +120,94 @@ class Site:
             port.plug()
 
 
-Act = Callable[[Site], Awaitable[None] | None]
+C = TypeVar("C", bound=SimContext)
+Action = Callable[[C], Awaitable[None] | None]
+"""One end of a fault."""
+
+
+async def apply(action: Action[C], context: C) -> None:
+    """Carry out one end of a fault."""
+    waiting = action(context)
+    if waiting is not None:
+        await waiting
+
+
+def nothing(_: SimContext) -> None:
+    """End of a fault that passes by itself."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
-    """One fault, ready to happen.
+class Fault(Generic[C]):
+    """Something that goes wrong for a while.
 
     Args:
-        kind: of its kind.
-        where: device, hub or rail; for the report.
+        name: for reports.
         start: makes it.
         end: takes it away.
         hold: seconds it lasts.
-        stops: the truck must stand soon, and stay so.
     """
 
-    kind: Kind
-    where: str
-    start: Act
-    end: Act
-    hold: float
-    stops: bool = False
+    name: str
+    start: Action[C]
+    end: Action[C] = nothing
+    hold: float = 2.5
 
-    @property
-    def name(self) -> str:
-        """For the report."""
-        return f"{self.kind.value}: {self.where}" if self.where else self.kind.value
+
+# Actions
+
+
+def command(role: str, *lines: str) -> Action[SimContext]:
+    """Commands of the fault console to a device."""
+    return lambda context: context.command(role, *lines)
+
+
+def exchange_cables(one: str, other: str) -> Action[SimContext]:
+    """Each device's cable in the other's port; the same again undoes it."""
+    return lambda context: context.exchange_cables(one, other)
+
+
+def place_obstacle(gap: float) -> Action[SimContext]:
+    """A post ``gap`` metres before the front bumper."""
+
+    def place(context: SimContext) -> None:
+        now = context.clock.now()
+        truth = context.robot.world.truth(now)
+        ahead = context.config.world.truck.length / 2 + gap + POST_RADIUS
+        post = Disc(truth.x + ahead * math.cos(truth.yaw), truth.y + ahead * math.sin(truth.yaw), POST_RADIUS)
+        context.robot.world.add(now, post)
+
+    return place
+
+
+def clear_obstacles(context: SimContext) -> None:
+    """Take everything away that was put into the world."""
+    for post in context.robot.world.obstacles:
+        context.robot.world.remove(context.clock.now(), post)
+
+
+# The catalog
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CatalogFault(Fault[SimContext]):
+    """A fault as the catalog draws it.
+
+    Args:
+        kind: of its kind.
+        must_stop: the truck must stand soon, and stay so.
+    """
+
+    kind: FaultKind
+    must_stop: bool = False
 
 
 def hubs_of(devices: Devices) -> tuple[str, ...]:
-    """Hubs that devices hang on."""
+    """Hubs that devices are connected to."""
     ports = (device.port for device in devices.present().values())
     return tuple(sorted({port.hub for port in ports if isinstance(port, UsbPortConfig)}))
 
 
-class Menu:
+class FaultCatalog:
     """Faults that a robot can have.
 
     Args:
@@ -166,41 +222,47 @@ class Menu:
         self._makers = dict(self._list())
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[FaultKind, ...]:
         """What ``draw`` can give."""
         return tuple(self._makers)
 
-    def draw(self, rng: np.random.Generator, *, without: frozenset[Kind] = frozenset()) -> Fault:
-        """One fault, all kinds alike."""
+    def draw(self, rng: np.random.Generator, *, without: frozenset[FaultKind] = frozenset()) -> CatalogFault:
+        """One fault; all kinds are equally likely."""
         kinds = [kind for kind in self._makers if kind not in without]
         return self._makers[kinds[rng.integers(len(kinds))]](rng)
 
-    def _list(self) -> Iterator[tuple[Kind, Callable[[np.random.Generator], Fault]]]:
+    def _list(self) -> Iterator[tuple[FaultKind, Callable[[np.random.Generator], CatalogFault]]]:
         serial = tuple(role for role in SERIAL if role in self._roles)
-        yield Kind.UNPLUG, lambda rng: _cable(rng, Kind.UNPLUG, _pick(rng, self._roles), ("unplug",), ("plug",))
-        yield Kind.STALL, lambda rng: _cable(rng, Kind.STALL, _pick(rng, serial), *_switch("line stalled"))
-        yield Kind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
-        yield Kind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
-        yield Kind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
-        yield Kind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial))
-        yield Kind.RESET, lambda rng: _once(rng, Kind.RESET, _pick(rng, serial), "power-cycle")
-        yield Kind.WRONG_DEVICE, lambda rng: _wrong(rng, serial)
-        yield Kind.CLOCK_JUMP, _clock_jump
-        yield Kind.OBSTACLE, _obstacle
-        yield Kind.RAIL_SERVOS, _servo_rail
-        yield Kind.BATTERY_OFF, _battery_off
+        yield (
+            FaultKind.UNPLUG,
+            lambda rng: _unplug(rng, _pick(rng, self._roles)),
+        )
+        yield FaultKind.STALL, lambda rng: _cable(rng, FaultKind.STALL, _pick(rng, serial), *_switch("line stalled"))
+        yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
+        yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
+        yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
+        yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial))
+        yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
+        yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, serial)
+        yield FaultKind.CLOCK_JUMP, _clock_jump
+        yield FaultKind.OBSTACLE, _obstacle
+        yield FaultKind.RAIL_SERVOS, _servo_rail
+        yield FaultKind.BATTERY_OFF, _battery_off
         if "steering" in self._roles:
-            yield Kind.BROWN_OUT, lambda rng: _brown_out(rng, self._roles)
+            yield FaultKind.BROWN_OUT, lambda rng: _brown_out(rng, self._roles)
         if "compass" in self._roles:
-            yield Kind.FROZEN, lambda rng: _cable(rng, Kind.FROZEN, "compass", *_switch("frozen"), stops=False)
+            yield (
+                FaultKind.FROZEN,
+                _frozen,
+            )
         if "stabiliser" in self._roles:
-            yield Kind.ECHO, lambda rng: _cable(rng, Kind.ECHO, "stabiliser", *_switch("echo"))
-            yield Kind.RAIL_12V, _rail_12v
+            yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
+            yield FaultKind.RAIL_12V, _rail_12v
         if self._hubs:
-            yield Kind.HUB_LOSS, lambda rng: _hubs(rng, Kind.HUB_LOSS, (_pick(rng, self._hubs),))
-            yield Kind.RAIL_ELECTRONICS, lambda rng: _hubs(rng, Kind.RAIL_ELECTRONICS, self._hubs)
+            yield FaultKind.HUB_LOSS, lambda rng: _hubs(rng, FaultKind.HUB_LOSS, (_pick(rng, self._hubs),))
+            yield FaultKind.RAIL_ELECTRONICS, lambda rng: _hubs(rng, FaultKind.RAIL_ELECTRONICS, self._hubs)
         if self._records:
-            yield Kind.DISK_FULL, _disk_full
+            yield FaultKind.DISK_FULL, _disk_full
 
 
 def _pick(rng: np.random.Generator, among: tuple[str, ...]) -> str:
@@ -211,12 +273,18 @@ def _hold(rng: np.random.Generator) -> float:
     return float(rng.uniform(0.7, 1.5))
 
 
-def _says(role: str, *lines: str) -> Act:
-    return lambda site: site.say(role, *lines)
-
-
-def _nothing(_: Site) -> None:
-    return None
+def _fault(
+    kind: FaultKind,
+    where: str,
+    start: Action[SimContext],
+    end: Action[SimContext],
+    hold: float,
+    *,
+    must_stop: bool = False,
+) -> CatalogFault:
+    """A fault at a device, hub or rail."""
+    name = f"{kind.value}: {where}" if where else kind.value
+    return CatalogFault(name=name, start=start, end=end, hold=hold, kind=kind, must_stop=must_stop)
 
 
 def _switch(words: str) -> tuple[tuple[str], tuple[str]]:
@@ -224,47 +292,57 @@ def _switch(words: str) -> tuple[tuple[str], tuple[str]]:
 
 
 def _cable(
-    rng: np.random.Generator, kind: Kind, role: str, start: tuple[str, ...], end: tuple[str, ...], *, stops: bool = True
-) -> Fault:
-    return Fault(kind, role, _says(role, *start), _says(role, *end), _hold(rng), stops and role in VITAL)
+    rng: np.random.Generator,
+    kind: FaultKind,
+    role: str,
+    start: tuple[str, ...],
+    end: tuple[str, ...],
+    *,
+    stops: bool = True,
+) -> CatalogFault:
+    must_stop = stops and role in VITAL
+    return _fault(kind, role, command(role, *start), command(role, *end), _hold(rng), must_stop=must_stop)
 
 
-def _once(rng: np.random.Generator, kind: Kind, role: str, *words: str) -> Fault:
-    return Fault(kind, role, _says(role, *words), _nothing, _hold(rng))
+def _once(rng: np.random.Generator, kind: FaultKind, role: str, *lines: str) -> CatalogFault:
+    return _fault(kind, role, command(role, *lines), nothing, _hold(rng))
 
 
-def _garbage(rng: np.random.Generator, role: str) -> Fault:
+def _unplug(rng: np.random.Generator, role: str) -> CatalogFault:
+    return _cable(rng, FaultKind.UNPLUG, role, ("unplug",), ("plug",))
+
+
+def _frozen(rng: np.random.Generator) -> CatalogFault:
+    return _cable(rng, FaultKind.FROZEN, "compass", *_switch("frozen"), stops=False)
+
+
+def _garbage(rng: np.random.Generator, role: str) -> CatalogFault:
     burst = rng.bytes(int(rng.integers(1, 300))).hex()
-    return _once(rng, Kind.GARBAGE, role, f"line garbage {burst}")
+    return _once(rng, FaultKind.GARBAGE, role, f"line garbage {burst}")
 
 
-def _bit_errors(rng: np.random.Generator, role: str) -> Fault:
-    rate = 10 ** rng.uniform(-4, -1.3)
-    return _cable(
-        rng, Kind.BIT_ERRORS, role, (f"line flip_rate {rate}",), ("line flip_rate 0", "line drop_rate 0"), stops=False
-    )
+def _bit_errors(rng: np.random.Generator, role: str) -> CatalogFault:
+    start, end = (f"line flip_rate {10 ** rng.uniform(-4, -1.3)}",), ("line flip_rate 0", "line drop_rate 0")
+    return _cable(rng, FaultKind.BIT_ERRORS, role, start, end, stops=False)
 
 
-def _slow(rng: np.random.Generator, role: str) -> Fault:
+def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
     start = "line chunk 1" if rng.random() < 0.5 else f"line delay {rng.uniform(0.005, 0.15):.3f}"
-    return _cable(rng, Kind.SLOW, role, (start,), ("line chunk off", "line delay 0"), stops=False)
+    return _cable(rng, FaultKind.SLOW, role, (start,), ("line chunk off", "line delay 0"), stops=False)
 
 
-def _short_write(rng: np.random.Generator, role: str) -> Fault:
+def _short_write(rng: np.random.Generator, role: str) -> CatalogFault:
     start, end = (f"line short_writes {rng.integers(1, 20)}",), ("line short_writes 0",)
-    return _cable(rng, Kind.SHORT_WRITE, role, start, end, stops=False)
+    return _cable(rng, FaultKind.SHORT_WRITE, role, start, end, stops=False)
 
 
-def _wrong(rng: np.random.Generator, serial: tuple[str, ...]) -> Fault:
+def _wrong(rng: np.random.Generator, serial: tuple[str, ...]) -> CatalogFault:
     one, other = (str(role) for role in rng.choice(serial, 2, replace=False))
-
-    def swap(site: Site) -> None:
-        site.exchange(one, other)
-
-    return Fault(Kind.WRONG_DEVICE, f"{one}, {other}", swap, swap, _hold(rng), bool({one, other} & {*VITAL}))
+    swap, stops = exchange_cables(one, other), bool({one, other} & {*VITAL})
+    return _fault(FaultKind.WRONG_DEVICE, f"{one}, {other}", swap, swap, _hold(rng), must_stop=stops)
 
 
-def _brown_out(rng: np.random.Generator, roles: tuple[str, ...]) -> Fault:
+def _brown_out(rng: np.random.Generator, roles: tuple[str, ...]) -> CatalogFault:
     role = _pick(rng, tuple(role for role in ("steering", "drive", "stabiliser") if role in roles))
     hold = _hold(rng)
     if role == "steering":
@@ -272,126 +350,116 @@ def _brown_out(rng: np.random.Generator, roles: tuple[str, ...]) -> Fault:
         end: tuple[str, ...] = ()
     else:
         start, end = ("power off",), ("power on",)
-    return Fault(Kind.BROWN_OUT, role, _says(role, *start), _says(role, *end), hold, role == "drive")
+    starts, ends = command(role, *start), command(role, *end)
+    return _fault(FaultKind.BROWN_OUT, role, starts, ends, hold, must_stop=role == "drive")
 
 
-def _clock_jump(rng: np.random.Generator) -> Fault:
+def _clock_jump(rng: np.random.Generator) -> CatalogFault:
     seconds = float(rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(-1, 8))
 
-    def jump(site: Site) -> None:
-        if isinstance(site.clock, VirtualClock):  # nobody sets the real clock of the computer this runs on
-            site.clock.step_real(seconds)
+    def jump(context: SimContext) -> None:
+        if isinstance(context.clock, VirtualClock):  # the real clock of this computer is not set
+            context.clock.step_real(seconds)
 
-    return Fault(Kind.CLOCK_JUMP, f"{seconds:+.3g} s", jump, _nothing, _hold(rng))
-
-
-def _disk_full(rng: np.random.Generator) -> Fault:
-    def fill(site: Site) -> None:
-        if site.disk is not None:
-            site.disk.refuse(OSError(errno.ENOSPC, "No space left on device"))
-
-    return Fault(Kind.DISK_FULL, "", fill, _nothing, _hold(rng))
+    return _fault(FaultKind.CLOCK_JUMP, f"{seconds:+.3g} s", jump, nothing, _hold(rng))
 
 
-def _obstacle(rng: np.random.Generator) -> Fault:
-    gap, radius = float(rng.uniform(0.15, 0.5)), 0.1
-    posts: list[Disc] = []
+def _disk_full(rng: np.random.Generator) -> CatalogFault:
+    def fill(context: SimContext) -> None:
+        if context.disk is not None:
+            context.disk.refuse(OSError(errno.ENOSPC, "No space left on device"))
 
-    def put(site: Site) -> None:
-        now = site.clock.now()
-        truth = site.robot.world.truth(now)
-        ahead = site.config.world.truck.length / 2 + gap + radius
-        posts.append(Disc(truth.x + ahead * math.cos(truth.yaw), truth.y + ahead * math.sin(truth.yaw), radius))
-        site.robot.world.add(now, posts[0])
+    return _fault(FaultKind.DISK_FULL, "", fill, nothing, _hold(rng))
 
-    def take(site: Site) -> None:
-        site.robot.world.remove(site.clock.now(), posts.pop())
 
-    return Fault(Kind.OBSTACLE, f"{gap:.2f} m ahead", put, take, 2 * _hold(rng))
+def _obstacle(rng: np.random.Generator) -> CatalogFault:
+    gap = float(rng.uniform(0.15, 0.5))
+    return _fault(FaultKind.OBSTACLE, f"{gap:.2f} m ahead", place_obstacle(gap), clear_obstacles, 2 * _hold(rng))
 
 
 # Supply rails: battery -> EPOS; 12 V -> stabiliser, fan; 5 V -> servos; electronics -> lidar and hubs
 
 
-def _rail_12v(rng: np.random.Generator) -> Fault:
-    def lose(site: Site) -> None:
-        site.say("stabiliser", "power off")
-        site.heat(HOT)
+def _rail_12v(rng: np.random.Generator) -> CatalogFault:
+    def lose(context: SimContext) -> None:
+        context.command("stabiliser", "power off")
+        context.set_temperature(HOT)
 
-    def give(site: Site) -> None:
-        site.say("stabiliser", "power on")
-        site.heat(COOL)
+    def give(context: SimContext) -> None:
+        context.command("stabiliser", "power on")
+        context.set_temperature(COOL)
 
-    return Fault(Kind.RAIL_12V, "", lose, give, _hold(rng))
+    return _fault(FaultKind.RAIL_12V, "", lose, give, _hold(rng))
 
 
-def _servo_rail(rng: np.random.Generator) -> Fault:
-    return Fault(
-        Kind.RAIL_SERVOS,
+def _servo_rail(rng: np.random.Generator) -> CatalogFault:
+    return _fault(
+        FaultKind.RAIL_SERVOS,
         "",
-        lambda site: site.robot.world.supply_servos(site.clock.now(), on=False),
-        lambda site: site.robot.world.supply_servos(site.clock.now(), on=True),
+        lambda context: context.robot.world.supply_servos(context.clock.now(), on=False),
+        lambda context: context.robot.world.supply_servos(context.clock.now(), on=True),
         float(rng.uniform(4.0, 6.0)),
     )
 
 
-def _hubs(rng: np.random.Generator, kind: Kind, hubs: tuple[str, ...]) -> Fault:
-    where = hubs[0] if kind is Kind.HUB_LOSS else ""
-    return Fault(
-        kind, where, lambda site: site.lose_hubs(*hubs), lambda site: site.return_hubs(*hubs), _hold(rng), stops=True
-    )
+def _hubs(rng: np.random.Generator, kind: FaultKind, hubs: tuple[str, ...]) -> CatalogFault:
+    where = hubs[0] if kind is FaultKind.HUB_LOSS else ""
+
+    def lose(context: SimContext) -> None:
+        context.lose_hubs(*hubs)
+
+    def give_back(context: SimContext) -> Awaitable[None]:
+        return context.return_hubs(*hubs)
+
+    return _fault(kind, where, lose, give_back, _hold(rng), must_stop=True)
 
 
-def _battery_off(rng: np.random.Generator) -> Fault:
-    """The computer lives on through its bench supply; motor, servos and stabiliser do not."""
+def _battery_off(rng: np.random.Generator) -> CatalogFault:
+    """Motor, servos and stabiliser lose their supply; the computer keeps its own."""
 
-    def pull(site: Site) -> None:
-        site.robot.world.connect_battery(site.clock.now(), connected=False)
-        site.robot.world.supply_servos(site.clock.now(), on=False)
-        site.say("drive", "power off")
-        site.say("stabiliser", "power off")
+    def pull(context: SimContext) -> None:
+        context.robot.world.connect_battery(context.clock.now(), connected=False)
+        context.robot.world.supply_servos(context.clock.now(), on=False)
+        context.command("drive", "power off")
+        context.command("stabiliser", "power off")
 
-    def plug(site: Site) -> None:
-        site.robot.world.connect_battery(site.clock.now(), connected=True)
-        site.robot.world.supply_servos(site.clock.now(), on=True)
-        site.say("drive", "power on")
-        site.say("stabiliser", "power on")
+    def plug(context: SimContext) -> None:
+        context.robot.world.connect_battery(context.clock.now(), connected=True)
+        context.robot.world.supply_servos(context.clock.now(), on=True)
+        context.command("drive", "power on")
+        context.command("stabiliser", "power on")
 
-    return Fault(Kind.BATTERY_OFF, "", pull, plug, _hold(rng), stops=True)
+    return _fault(FaultKind.BATTERY_OFF, "", pull, plug, _hold(rng), must_stop=True)
 
 
-class Mishaps:
-    """Lets faults happen to a running simulation, by its configuration's ``sim.drill``.
+class FaultInjector:
+    """Injects random faults into a running simulation, by its configuration's ``sim.drill``.
 
     Args:
-        site: where.
+        context: where.
         config: seed and period.
-        say: told of each fault.
+        report: called with a line for each fault.
     """
 
-    def __init__(self, site: Site, config: DrillConfig, say: Callable[[str], None] = lambda _: None) -> None:
-        self._site = site
+    def __init__(
+        self, context: SimContext, config: DrillConfig, report: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._context = context
         self._period = config.period
         self._rng = np.random.default_rng(config.seed)
-        self._menu = Menu(site.devices, records=site.disk is not None)
-        self._say = say
+        self._catalog = FaultCatalog(context.devices, records=context.disk is not None)
+        self._report = report
 
     async def run(self) -> None:
         """One after another until cancelled."""
-        full = frozenset[Kind]() if self._site.disk is not None else frozenset({Kind.DISK_FULL})
+        clock = self._context.clock
+        full = frozenset[FaultKind]()
         while True:
-            await self._site.clock.sleep(self._period * float(self._rng.uniform(0.5, 1.5)))
-            fault = self._menu.draw(self._rng, without=full)
-            if fault.kind is Kind.DISK_FULL:
-                full = frozenset({Kind.DISK_FULL})
-            self._say(f"fault: {fault.name} for {fault.hold:.1f} s")
-            await happen(fault.start, self._site)
-            await self._site.clock.sleep(fault.hold)
-            await happen(fault.end, self._site)
-
-
-async def happen(act: Act, site: Site) -> None:
-    """Carry out one end of a fault."""
-    waiting = act(site)
-    if waiting is not None:
-        await waiting
+            await clock.sleep(self._period * float(self._rng.uniform(0.5, 1.5)))
+            fault = self._catalog.draw(self._rng, without=full)
+            if fault.kind is FaultKind.DISK_FULL:
+                full = frozenset({FaultKind.DISK_FULL})
+            self._report(f"fault: {fault.name} for {fault.hold:.1f} s")
+            await apply(fault.start, self._context)
+            await clock.sleep(fault.hold)
+            await apply(fault.end, self._context)

@@ -12,10 +12,9 @@ from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK = {

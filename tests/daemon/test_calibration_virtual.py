@@ -23,10 +23,9 @@ from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard
 from monstertruckd.tools.calibrate.drive import DriveWizard
 from monstertruckd.tools.calibrate.guide import calibrate
 from monstertruckd.tools.calibrate.steering import SteeringWizard
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.calibration_kit import LocalTruck, Session, SimulatedOperator, hidden, run_session, verdicts
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
@@ -226,13 +225,13 @@ async def interrupt(_: Bench, wizard: asyncio.Task[Any]) -> None:
 
 
 async def pull_the_drive(bench: Bench, _: asyncio.Task[Any]) -> None:
-    bench.rig.device("drive").port.unplug()
+    bench.rig.context.device("drive").port.unplug()
     await bench.clock.sleep(1.0)
-    bench.rig.device("drive").port.plug()  # its motor kept its speed: the driver's first bytes stop it
+    bench.rig.context.device("drive").port.plug()  # its motor kept its speed: the driver's first bytes stop it
 
 
 async def pull_the_steering(bench: Bench, _: asyncio.Task[Any]) -> None:
-    bench.rig.device("steering").port.unplug()
+    bench.rig.context.device("steering").port.unplug()
 
 
 async def emergency_stop(bench: Bench, _: asyncio.Task[Any]) -> None:

@@ -17,15 +17,14 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_sim.faults import Kind, Menu
+from monstertruck_sim.faults import FaultCatalog, FaultKind
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.drill import Drill, Outcome, Report
 from monstertruckd.tools.drill.observer import Observer, Violation
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -42,8 +41,8 @@ def demo() -> SimulatedTruckConfig:
     return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
 
 
-def menu_of(config: SimulatedTruckConfig) -> Menu:
-    return Menu(config.devices, records=config.recorder is not None)
+def catalog_of(config: SimulatedTruckConfig) -> FaultCatalog:
+    return FaultCatalog(config.devices, records=config.recorder is not None)
 
 
 def test_random_faults_end_safely_and_leave_nothing_behind():
@@ -61,15 +60,15 @@ def test_one_seed_is_one_report():
     assert {o.fault for o in Drill(8, 3, demo()).run().outcomes} != {o.fault for o in runs[0].outcomes}
 
 
-def test_every_kind_is_on_the_menu_of_the_whole_truck_and_what_needs_hubs_is_not_without():
-    assert set(menu_of(full()).kinds) == set(Kind)
-    missing = set(Kind) - set(menu_of(demo()).kinds)
-    assert missing == {Kind.HUB_LOSS, Kind.RAIL_ELECTRONICS, Kind.RAIL_12V, Kind.ECHO}
+def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_not_without():
+    assert set(catalog_of(full()).kinds) == set(FaultKind)
+    missing = set(FaultKind) - set(catalog_of(demo()).kinds)
+    assert missing == {FaultKind.HUB_LOSS, FaultKind.RAIL_ELECTRONICS, FaultKind.RAIL_12V, FaultKind.ECHO}
 
 
 def test_draws_are_the_seeds():
-    menu = menu_of(full())
-    names = [[menu.draw(rng).name for _ in range(50)] for rng in map(np.random.default_rng, (1, 1, 2))]
+    catalog = catalog_of(full())
+    names = [[catalog.draw(rng).name for _ in range(50)] for rng in map(np.random.default_rng, (1, 1, 2))]
     assert names[0] == names[1] != names[2]
     assert len(set(names[0])) > 20
 
@@ -178,10 +177,10 @@ def test_a_truck_before_something_is_told_from_one_in_the_open():
 
 
 def test_the_score_counts_motion_first():
-    safe = Outcome("a", Kind.STALL, True, recovered_s=0.5)
-    late = Outcome("b", Kind.STALL, True, recovered_s=6.0)
-    stuck = Outcome("c", Kind.STALL, True, stuck=("lidar",))
-    unsafe = Outcome("d", Kind.STALL, True, recovered_s=0.5, violations=(Violation(0.7, "stop", ""),))
+    safe = Outcome("a", FaultKind.STALL, True, recovered_s=0.5)
+    late = Outcome("b", FaultKind.STALL, True, recovered_s=6.0)
+    stuck = Outcome("c", FaultKind.STALL, True, stuck=("lidar",))
+    unsafe = Outcome("d", FaultKind.STALL, True, recovered_s=0.5, violations=(Violation(0.7, "stop", ""),))
     assert [o.score for o in (safe, late, stuck, unsafe)] == [100, 80, 50, 0]
     report = Report(1, (safe, late, stuck, unsafe))
     assert (report.unsafe, report.stuck, report.score) == (1, 1, 57.5)

@@ -8,13 +8,13 @@ import pytest
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.faults import Fault, nothing
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.summary import GOAL_CLOSING
-from monstertruckd.tools.drill.goal_scenarios import shortcomings
-from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario
+from monstertruckd.tools.drill.observer import Violation
+from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario, measure, shortcomings
 from monstertruckd.tools.drill.scenarios import SCENARIOS
-from monstertruckd.tools.drill.stages import measure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
@@ -46,10 +46,11 @@ def test_a_worker_that_really_hangs_is_killed_and_driving_goes_on(monkeypatch: p
 
 def test_a_reaction_that_is_too_late_or_wrong_is_seen():
     scenario = BY_NAME["lidar: unplugged"]
-    assert shortcomings(scenario, drill(Scenario("nothing happens", lambda _: None, Expect.STOP))) != []
-    late = Reaction("x", 0.0, 0.06, 0.31, 0.4, reason=Reason.SCAN_STALE, seen=(Reason.SCAN_STALE,), collided=True)
+    assert shortcomings(scenario, drill(Scenario(Fault("nothing happens", nothing), Expect.STOP))) != []
+    unsafe = (Violation(0.5, "contact", "ran into something"),)
+    late = Reaction("x", 0.0, 0.06, 0.31, 0.4, reason=Reason.SCAN_STALE, seen=(Reason.SCAN_STALE,), violations=unsafe)
     found = " ".join(shortcomings(scenario, late))
-    for word in ("ran into", "stop bytes after 0.06", "from the last sample", "lidar down", "not back", "again"):
+    for word in ("ran into", "stop bytes after 0.06", "from the last sample", "lidar down", "not recovered", "again"):
         assert word in found, found
 
 

@@ -13,7 +13,7 @@ from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 

@@ -9,9 +9,8 @@ from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTION
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.daemon.goal_kit import CONFIGS
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(60)]

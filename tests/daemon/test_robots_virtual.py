@@ -17,7 +17,7 @@ from monstertruck_schemas.state import Odometry
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, load_robot
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

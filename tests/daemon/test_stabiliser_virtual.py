@@ -11,7 +11,7 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -68,13 +68,13 @@ def test_a_lidar_whose_joints_tell_nothing_is_not_trusted():
             await clock.sleep(3.0)
             assert gate.latest is not None
             assert Reason.SCAN_STALE not in gate.latest.reasons
-            rig.device("stabiliser").command(["power", "off"])
+            rig.context.device("stabiliser").command(["power", "off"])
             await clock.sleep(1.5)
             assert state() is not ServiceState.READY
             assert scans.latest is not None
             assert scans.latest.tilt == pytest.approx(math.pi / 2)
             assert Reason.SCAN_STALE in gate.latest.reasons
-            rig.device("stabiliser").command(["power", "on"])
+            rig.context.device("stabiliser").command(["power", "on"])
             await clock.sleep(2.5)
             assert state() is ServiceState.READY
             assert Reason.SCAN_STALE not in gate.latest.reasons

@@ -17,10 +17,9 @@ from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
 from monstertruckd.recorder.black_box import black_boxes
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

@@ -18,9 +18,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruck_schemas.usb import UsbState
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.stages import with_overlay
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -176,7 +175,7 @@ def test_two_adapters_of_one_kind_in_each_others_ports_are_refused_by_their_hand
 def test_one_cable_pulled_is_no_lost_hub():
     async def scene(robot: Robot) -> None:
         robot.events()
-        lidar = robot.rig.device("lidar")
+        lidar = robot.rig.context.device("lidar")
         lidar.port.unplug()
         await robot.clock.sleep(1.0)
         assert robot.down() == {"lidar"}
@@ -223,7 +222,7 @@ def test_a_camera_sees_the_world_and_comes_back():
         taken = pictures.drain()
         assert 14 <= len(taken) <= 16
         assert all(picture.data.startswith(b"\xff\xd8") and picture.data.endswith(b"\xff\xd9") for picture in taken)
-        robot.rig.device("camera").command(["vanish", "0.5"])
+        robot.rig.context.device("camera").command(["vanish", "0.5"])
         await robot.clock.sleep(0.3)
         assert "camera" in robot.down()
         await robot.ready()

@@ -81,7 +81,7 @@ def simulate(
     name, or `usb` (an unknown word lists what it knows).
     """
     from monstertruckd.tools.simulation.config import load_simulated
-    from monstertruckd.tools.simulation.host import serve
+    from monstertruckd.tools.simulation.simulate import serve
 
     simulated = load_simulated(config)
     until_stopped(lambda clock: serve(clock, simulated, truth))

@@ -39,7 +39,7 @@ def emulate(
     """
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_sim.console import FaultConsole
-    from monstertruckd.tools.simulation.single import emulate_device
+    from monstertruckd.tools.simulation.emulate import emulate_device
 
     async def main(clock: Clock) -> None:
         async with emulate_device(device, link, clock, seed) as emulated:

@@ -11,7 +11,7 @@ from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.drill.drill import Drill, Outcome, Report
+    from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
 
 FULL_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "full.yaml"
 
@@ -23,12 +23,12 @@ def drill(
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Break the emulated truck again and again while it drives, and score how it takes it.
+    """Inject random faults into the emulated truck while it drives, and score its reactions.
 
     Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
-    did not come back.
+    did not recover.
     """
-    from monstertruckd.tools.drill.drill import Drill
+    from monstertruckd.tools.drill.random_drill import Drill
     from monstertruckd.tools.simulation.config import load_simulated
 
     report = _run(Drill(seed, count, load_simulated(config)), jobs or os.cpu_count() or 1)
@@ -44,16 +44,16 @@ def _run(drill: "Drill", jobs: int) -> "Report":
     finished = 0
     with progress("faults", drill.count) as done:
 
-        def tell(outcomes: "Sequence[Outcome]") -> None:
+        def show(outcomes: "Sequence[Outcome]") -> None:
             nonlocal finished
             finished += len(outcomes)
             done(finished)
 
-        return drill.run(jobs=jobs, tell=tell)
+        return drill.run(jobs=jobs, report=show)
 
 
 def _print(report: "Report") -> None:
-    numbers = ("stop bytes s", "standstill s", "metres", "back s", "score")
+    numbers = ("stop bytes s", "standstill s", "metres", "recovered s", "score")
     rows = [_cells(outcome) for outcome in report.outcomes]
     print_table(("fault", "reaction", "reason", *numbers), rows, right=numbers)
     out = console()
@@ -62,11 +62,11 @@ def _print(report: "Report") -> None:
             text = f"{outcome.fault}: after {violation.seconds:.2f} s {violation.rule}: {violation.text}"
             out.print(text, style="red")
         if outcome.stuck:
-            out.print(f"{outcome.fault}: not back: {', '.join(outcome.stuck)}", style="yellow")
+            out.print(f"{outcome.fault}: not recovered: {', '.join(outcome.stuck)}", style="yellow")
     out.print(
         f"{len(report.outcomes)} faults: {report.unsafe} with unsafe motion, {report.stuck} with something stuck, "
-        f"{report.blocked} times set back by hand; "
-        f"back after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "
+        f"{report.blocked} times moved by hand; "
+        f"recovered after {_seconds(report.recovery(50))} s (p50), {_seconds(report.recovery(99))} s (p99); "
         f"score [bold]{report.score:.1f}[/bold] of 100"
     )
 

@@ -9,7 +9,7 @@ from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.demo.wall import write_overlay
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
-from monstertruckd.tools.simulation.rig import VirtualRig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 
 def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:

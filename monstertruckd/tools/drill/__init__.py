@@ -1,1 +1,1 @@
-"""Faults on the simulated truck, scored."""
+"""Drills: faults injected into the simulated truck while it drives, scripted or random, and judged."""

@@ -1,15 +1,21 @@
-"""The judge of a drill: sees bytes on two wires, the world's truth, the operator's orders; nothing of the daemon."""
+"""The observer of a drill: checks invariants by the bytes on two wires and the world's truth, not by the daemon's word.
+
+It sees the wires of drive and steering, the true state of the truck and the operator's orders.
+"""
 
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_drivers.maestro.protocol import Code, Command, Decoder
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
@@ -17,25 +23,27 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_sim.world.config import ServoConfig
 from monstertruck_sim.world.truck_plant import TruthState
 from monstertruck_sim.world.world import World
-from monstertruckd.tools.drill.scenario import AT_REST
-from monstertruckd.tools.drill.wire import WireTap, stop_bytes, written
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 SAMPLE: Final = SECOND // 100
+AT_REST: Final = 0.01
+"""True speed of a truck that stands, m/s."""
 STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
 CLOSEST: Final = 0.03
-"""Nothing nearer than this, m, may be driven towards."""
+"""Least distance, m, of anything that is driven towards."""
 NEAR: Final = 0.6
-"""Metres from the camera within which things are near."""
+"""Distance from the camera, m, within which an obstacle may keep the truck from starting."""
 SPEED_MARGIN: Final = 1.05
 """True speed over the greatest commanded one: the motor's overshoot."""
 ANGLE_MARGIN: Final = 0.01
 """Rounding of pulses, rad."""
-STRAYED: Final = 0.5
-"""Greatest difference of the true turn from the one the pulses ask for within ``STRAY_WINDOW`` s, rad."""
-STRAY_WINDOW: Final = 2.0
+TURN_ERROR: Final = 0.5
+"""Greatest difference of the true turn from the one the pulses ask for within ``TURN_WINDOW`` s, rad."""
+TURN_WINDOW: Final = 2.0
 FAN: Final = np.linspace(-1.2, 1.2, 49)
+"""Directions of the distances that are checked ahead, rad."""
+STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +56,54 @@ class Violation:
     text: str
 
 
+class WireTap:
+    """Everything that passes a device's cable; stays with the device when it is plugged in elsewhere.
+
+    Args:
+        port: where the device is plugged in.
+        clock: time.
+    """
+
+    def __init__(self, port: MemoryPort, clock: Clock) -> None:
+        self.to_device: list[tuple[int, bytes]] = []
+        """(ns, bytes) as the last of them reached the device."""
+        self.to_host: list[tuple[int, bytes]] = []
+        """(ns, bytes) as the last of them reached the host."""
+        self._clock = clock
+        port.device.on_bytes = self._pass
+
+    def _pass(self, to_device: bool, data: bytes) -> None:
+        (self.to_device if to_device else self.to_host).append((self._clock.now(), data))
+
+
+def written(tap: WireTap, since: int = 0) -> list[tuple[int, int, int]]:
+    """Objects the host wrote to an EPOS: (ns, index, raw value); whatever is not a whole frame is skipped."""
+    found = []
+    for instant, data in tap.to_device:
+        if instant < since:
+            continue
+        with suppress(FrameError):
+            words = decode_body(Opcode.WRITE, data).words
+            if len(words) == 4:
+                found.append((instant, words[0], join(words[2], words[3])))
+    return found
+
+
+def stop_bytes(tap: WireTap, since: int) -> int | None:
+    """Instant at which the first write that stops the motor has reached an EPOS: target 0, quick stop, halt, off."""
+    for instant, index, value in written(tap, since):
+        target = index == od.TARGET_VELOCITY.index and value == 0
+        if target or (index == od.CONTROLWORD.index and value in STOP_CONTROLS):
+            return instant
+    return None
+
+
 class Observer:
-    """Watches one truck; ``begin`` and ``end_fault`` bound one fault.
+    """Checks the invariants of one truck, and measures how it reacts; ``begin`` and ``end_fault`` bound one fault.
 
     Args:
         config: of the truck, for its limits.
-        world: what is true.
+        world: the simulated world.
         ports: whose wires are tapped: drive and steering.
         clock: time.
     """
@@ -64,7 +114,7 @@ class Observer:
         assert config.devices.steering is not None
         self._world = world
         self._clock = clock
-        self._drive = WireTap(ports["drive"], clock)
+        self.drive = WireTap(ports["drive"], clock)
         self._steering = WireTap(ports["steering"], clock)
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
         self._truck = truck = config.sim.world.truck
@@ -77,54 +127,58 @@ class Observer:
         self._rpm = drivetrain.motor_rate(config.gate.speed) * 30 / math.pi
         self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
         """Axle angles that the newest pulses ask for, rad."""
-        self._strayed: deque[tuple[int, float]] = deque()
+        self._turn_errors: deque[tuple[int, float]] = deque()
         self._disarmed: int | None = None
         self._began = 0
-        self._heard = 0
+        self._read_until = 0
         self._must_stop = False
         self._stood: int | None = None
         self._path: list[tuple[float, float]] = []
+        self.top_speed = 0.0
+        """Greatest true speed since the fault began, m/s."""
         self._violations: dict[str, Violation] = {}
         self.speed = 0.0
         """True speed, m/s."""
 
     async def run(self) -> None:
-        """Look a hundred times a second until cancelled."""
+        """Sample a hundred times a second until cancelled."""
         due = self._clock.now()
         turn = 0
         while True:
             now = self._clock.now()
             truth = self._world.truth(now)
             self.speed = truth.v
-            self._look(now, truth)
-            self._listen(now)
-            self._compare(now, truth)
+            self.top_speed = max(self.top_speed, abs(truth.v))
+            self._check_motion(now, truth)
+            self._check_bytes(now)
+            self._check_steering(now, truth)
             if turn % 5 == 0 and truth.v > 2 * AT_REST:
-                self._look_ahead(now)
+                self._check_ahead(now)
             turn += 1
             due += SAMPLE
             await self._clock.sleep_until(due)
 
-    # What the drill tells
+    # Called by the drill
 
     def disarm(self) -> None:
-        """The operator disarms: soon nothing may move."""
+        """The operator disarms: the truck must stand soon."""
         self._disarmed = self._clock.now()
 
     def arm(self) -> None:
-        """The operator arms: from now on the truck may move."""
+        """The operator arms: the truck may move."""
         self._disarmed = None
 
     def begin(self, *, stops: bool) -> None:
-        """A fault happens now; with ``stops`` the truck must stand soon."""
+        """A fault begins; with ``stops`` the truck must stand soon."""
         self._began = self._clock.now()
         self._must_stop = stops
         self._stood = None
         self._path.clear()
-        self._strayed.clear()
+        self.top_speed = 0.0
+        self._turn_errors.clear()
         self._violations.clear()
-        self._drive.to_device.clear()
-        self._drive.to_host.clear()
+        self.drive.to_device.clear()
+        self.drive.to_host.clear()
 
     def end_fault(self) -> None:
         """The fault is over."""
@@ -136,7 +190,7 @@ class Observer:
 
     def stop_bytes_after(self) -> float | None:
         """Seconds from the fault to the first bytes that stop the motor."""
-        instant = stop_bytes(self._drive, self._began)
+        instant = stop_bytes(self.drive, self._began)
         return None if instant is None else (instant - self._began) / SECOND
 
     def standstill_after(self) -> float | None:
@@ -144,19 +198,19 @@ class Observer:
         return None if self._stood is None else (self._stood - self._began) / SECOND
 
     def before_something(self) -> bool:
-        """Whether anything in front is so near that a truck may be right not to set off."""
+        """Whether an obstacle in front is so near that the truck may rightly not start."""
         return bool(self._world.view.ranges(self._clock.now(), FAN).min() < NEAR)
 
     def metres(self) -> float:
-        """Truly travelled since the fault, to standstill or until now."""
-        return sum(math.dist(a, b) for a, b in zip(self._path, self._path[1:], strict=False))
+        """Truly travelled since the fault, m, to standstill or until the call."""
+        return sum(math.dist(a, b) for a, b in pairwise(self._path))
 
     # Rules
 
     def _violate(self, now: int, rule: str, text: str) -> None:
         self._violations.setdefault(rule, Violation((now - self._began) / SECOND, rule, text))
 
-    def _look(self, now: int, truth: TruthState) -> None:
+    def _check_motion(self, now: int, truth: TruthState) -> None:
         moving = abs(truth.v) > AT_REST
         if self._stood is None:
             self._path.append((truth.x, truth.y))
@@ -172,16 +226,16 @@ class Observer:
         if moving and self._must_stop and now > self._began + limit:
             self._violate(now, "stop", f"{truth.v:.3f} m/s: must stand")
 
-    def _listen(self, now: int) -> None:
-        """What the bytes ask of motor and servos."""
-        since, self._heard = self._heard, now + 1
-        for _, index, value in written(self._drive, since):
+    def _check_bytes(self, now: int) -> None:
+        """Commands to motor and servos, within their limits."""
+        since, self._read_until = self._read_until, now + 1
+        for _, index, value in written(self.drive, since):
             rpm = value - (1 << 32) if value >= 1 << 31 else value
             if index == od.TARGET_VELOCITY.index and abs(rpm) > self._rpm * 1.01:
                 self._violate(now, "speed bytes", f"{rpm} rpm: at most {self._rpm:.0f}")
-        heard, self._steering.to_device[:] = list(self._steering.to_device), []
+        received, self._steering.to_device[:] = list(self._steering.to_device), []
         self._steering.to_host.clear()
-        for _, data in heard:
+        for _, data in received:
             for command in self._maestro.feed(data):
                 if isinstance(command, Command) and command.code is Code.SET_TARGET and command.value:
                     self._pulse(now, command.data[0], command.value / 4)
@@ -196,20 +250,20 @@ class Observer:
                 if abs(angle) > self._angle:
                     self._violate(now, "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}")
 
-    def _compare(self, now: int, truth: TruthState) -> None:
-        """The steering's truth against its bytes, while the truck drives."""
-        wanted = self._kinematics.body_twist(truth.v, *self._pulses.values())[2]
-        self._strayed.append((now, (truth.wz - wanted) * SAMPLE / SECOND))
-        while now - self._strayed[0][0] > STRAY_WINDOW * SECOND:
-            self._strayed.popleft()
-        if abs(strayed := sum(row[1] for row in self._strayed)) > STRAYED:
-            self._violate(now, "steering", f"turned {strayed:+.2f} rad off within {STRAY_WINDOW:g} s")
+    def _check_steering(self, now: int, truth: TruthState) -> None:
+        """The true rate of turn against the one that the pulses ask for, while the truck drives."""
+        commanded = self._kinematics.body_twist(truth.v, *self._pulses.values())[2]
+        self._turn_errors.append((now, (truth.wz - commanded) * SAMPLE / SECOND))
+        while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
+            self._turn_errors.popleft()
+        if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
+            self._violate(now, "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s")
 
-    def _look_ahead(self, now: int) -> None:
-        """Driving forwards: how near is what stands before the whole width of the truck?"""
+    def _check_ahead(self, now: int) -> None:
+        """Driving forwards: the nearest obstacle before the width of the truck."""
         ranges = self._world.view.ranges(now, FAN)
-        ahead, beside = ranges * np.cos(FAN), ranges * np.sin(FAN)
-        before = ahead[np.abs(beside) < self._truck.width / 2]
+        ahead, aside = ranges * np.cos(FAN), ranges * np.sin(FAN)
+        before = ahead[np.abs(aside) < self._truck.width / 2]
         room = float(before.min(initial=math.inf)) + self._camera - self._truck.length / 2
         if room < CLOSEST:
             self._violate(now, "obstacle", f"{self.speed:.3f} m/s towards something {room:.3f} m ahead")

@@ -1,7 +1,8 @@
 """Configuration of a run in the simulated world: the daemon's own, and the world behind the emulators."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import model_validator
 
@@ -46,3 +47,16 @@ def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
     tree = load_tree(path)
     model = TruckConfig if tree.data.get("sim") is None else SimulatedTruckConfig
     return calibrated(*validated(tree, path, model))
+
+
+def with_overlay(config: SimulatedTruckConfig, overlay: Mapping[str, Any]) -> SimulatedTruckConfig:
+    """``config`` with some values replaced."""
+    return SimulatedTruckConfig.model_validate(_merged(config.model_dump(), overlay))
+
+
+def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    deep = {
+        k: _merged(base[k], v) if isinstance(v, Mapping) and isinstance(base.get(k), Mapping) else v
+        for k, v in top.items()
+    }
+    return {**base, **deep}

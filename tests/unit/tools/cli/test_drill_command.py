@@ -7,16 +7,18 @@ from typing import Any
 
 import pytest
 
-from monstertruck_sim.faults import Kind
+from monstertruck_sim.faults import FaultKind
 from monstertruckd.tools.cli import drill as command
 from monstertruckd.tools.cli.main import main
-from monstertruckd.tools.drill.drill import Drill, Outcome, Report
 from monstertruckd.tools.drill.observer import Violation
+from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
 
 DEMO = Path(__file__).resolve().parents[4] / "configs" / "demo.yaml"
-SAFE = Outcome("stall: lidar", Kind.STALL, True, stop_bytes_s=0.27, standstill_s=0.56, metres=0.07, recovered_s=0.9)
-UNSAFE = Outcome("stall: drive", Kind.STALL, True, violations=(Violation(0.7, "stop", "0.2 m/s: must stand"),))
-STUCK = Outcome("reset: compass", Kind.RESET, False, stuck=("compass",))
+SAFE = Outcome(
+    "stall: lidar", FaultKind.STALL, True, stop_bytes_s=0.27, standstill_s=0.56, metres=0.07, recovered_s=0.9
+)
+UNSAFE = Outcome("stall: drive", FaultKind.STALL, True, violations=(Violation(0.7, "stop", "0.2 m/s: must stand"),))
+STUCK = Outcome("reset: compass", FaultKind.RESET, False, stuck=("compass",))
 
 
 def run(monkeypatch: pytest.MonkeyPatch, outcomes: tuple[Outcome, ...], *arguments: str) -> int:
@@ -39,7 +41,7 @@ def test_a_report_names_fault_reaction_time_way_and_score(
         assert word in out
 
 
-@pytest.mark.parametrize(("outcome", "text"), [(UNSAFE, "must stand"), (STUCK, "not back: compass")])
+@pytest.mark.parametrize(("outcome", "text"), [(UNSAFE, "must stand"), (STUCK, "not recovered: compass")])
 def test_what_is_unsafe_or_stuck_is_the_exit_code_and_a_line(
     outcome: Outcome, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

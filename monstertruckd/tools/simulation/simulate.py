@@ -21,7 +21,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
-from monstertruck_sim.faults import Mishaps, Site
+from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -106,8 +106,8 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
     if config.sim.drill is not None:
-        mishaps = Mishaps(Site(config.sim, config.devices, robot, computer, clock), config.sim.drill, _say)
-        tasks.append(asyncio.create_task(mishaps.run(), name="faults"))
+        context = SimContext(config.sim, config.devices, robot, computer, clock)
+        tasks.append(asyncio.create_task(FaultInjector(context, config.sim.drill, _say).run(), name="faults"))
     if robot.recorded is not None:
         tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
     waiting = asyncio.create_task(stop.wait())

@@ -11,13 +11,12 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline
 from monstertruck_sim.computer import EmulatedComputer
-from monstertruck_sim.console import Emulated
-from monstertruck_sim.faults import Mishaps, Site
+from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.host import TruthLog
+from monstertruckd.tools.simulation.simulate import TruthLog
 
 
 class VirtualRig:
@@ -57,12 +56,10 @@ class VirtualRig:
             config, clock, ports=by_path, computer=self.computer.computer(), tree=tree, seed=config.sim.seed
         )
         self.bus = self.daemon.bus
+        self.context = SimContext(config.sim, config.devices, self.robot, self.computer, clock, self.daemon.recorder)
+        """What faults act on."""
         self._stop = asyncio.Event()
         self._daemon_task: asyncio.Task[None] | None = None
-
-    def device(self, role: str) -> Emulated:
-        """Emulator and port of one role, to make it fail."""
-        return Emulated(self.robot.emulators[role], self.computer.ports[role])
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["VirtualRig"]:
@@ -76,10 +73,7 @@ class VirtualRig:
             asyncio.create_task(self.truth.run(), name="truth"),
         ]
         if (drill := self.config.sim.drill) is not None:
-            site = Site(
-                self.config.sim, self.config.devices, self.robot, self.computer, self.clock, self.daemon.recorder
-            )
-            around.append(asyncio.create_task(Mishaps(site, drill).run(), name="faults"))
+            around.append(asyncio.create_task(FaultInjector(self.context, drill).run(), name="faults"))
         self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
         try:
             yield self

@@ -1,0 +1,313 @@
+"""Random drills: seeded faults of the catalog, one after another, on a truck that drives; judged by the observer.
+
+A drill consists of legs. Each leg has a truck and a virtual clock of its own and draws from its own stream of the
+seed, so that legs can run in parallel and still give the same report.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import HealthTable
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateState
+from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
+from monstertruckd.tools.drill.observer import STOPS_WITHIN, Violation
+from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+
+LEG: Final = 25
+"""Faults of one truck."""
+PATIENCE: Final = 15.0
+"""Seconds after which a service that has not recovered is stuck."""
+RECOVERS_WITHIN: Final = 4.0
+"""Seconds within which everything should be back: the goal of a lost hub."""
+QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.OBSTACLE_SLOW})
+"""Reasons that explain nothing."""
+DEADMAN: Final[dict[str, Any]] = {
+    "map": None,
+    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
+    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
+}
+"""The deadman line is wired: without it a truck drives on when its drive controller cannot be reached."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one fault led to. Seconds count from the fault, ``recovered_s`` from its end; None: it did not happen."""
+
+    fault: str
+    kind: FaultKind
+    must_stop: bool
+    reason: Reason | None = None
+    """First one that gate, services or events gave."""
+    stop_bytes_s: float | None = None
+    standstill_s: float | None = None
+    metres: float = 0.0
+    """Truly travelled to standstill, or until the fault's end."""
+    recovered_s: float | None = None
+    """All services ready, and the truck drives again when armed; 0: nothing was lost."""
+    stuck: tuple[str, ...] = ()
+    """Services that did not recover, or reasons that keep the truck from driving."""
+    blocked: bool = False
+    """The truck works, but stands before an obstacle: it has to be moved by hand."""
+    violations: tuple[Violation, ...] = ()
+
+    @property
+    def reaction(self) -> str:
+        """In one word."""
+        if self.violations:
+            return "UNSAFE"
+        if self.stuck:
+            return "stuck"
+        if self.blocked:
+            return "blocked"
+        return "drove on" if self.standstill_s is None else "stopped"
+
+    @property
+    def score(self) -> int:
+        """100: safe, recovered in time; 80: safe, late; 50: safe, not recovered; 0: unsafe."""
+        if self.violations:
+            return 0
+        if self.stuck or self.recovered_s is None:
+            return 50
+        return 100 if self.recovered_s <= RECOVERS_WITHIN else 80
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A whole drill."""
+
+    seed: int
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def unsafe(self) -> int:
+        """Faults with unsafe motion."""
+        return sum(bool(outcome.violations) for outcome in self.outcomes)
+
+    @property
+    def stuck(self) -> int:
+        """Faults after which something did not recover."""
+        return sum(bool(outcome.stuck) for outcome in self.outcomes)
+
+    @property
+    def score(self) -> float:
+        """Mean, 0..100."""
+        return float(np.mean([outcome.score for outcome in self.outcomes])) if self.outcomes else 0.0
+
+    @property
+    def blocked(self) -> int:
+        """Faults after which the truck stood before an obstacle."""
+        return sum(outcome.blocked for outcome in self.outcomes)
+
+    def recovery(self, percent: float) -> float | None:
+        """Percentile of the recoveries, s, of those faults after which anything had to recover."""
+        times = [outcome.recovered_s for outcome in self.outcomes if outcome.recovered_s]
+        return float(np.percentile(times, percent)) if times else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Figures and outcomes as plain data."""
+        outcomes = [
+            {**asdict(outcome), "reaction": outcome.reaction, "score": outcome.score} for outcome in self.outcomes
+        ]
+        return {**self.figures(), "outcomes": outcomes}
+
+    def figures(self) -> dict[str, Any]:
+        """The totals."""
+        return {
+            "seed": self.seed,
+            "faults": len(self.outcomes),
+            "unsafe": self.unsafe,
+            "stuck": self.stuck,
+            "blocked": self.blocked,
+            "score": round(self.score, 2),
+            "recovery_p50_s": self.recovery(50),
+            "recovery_p99_s": self.recovery(99),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One truck's share of a drill; can be sent to another process."""
+
+    config: dict[str, Any]
+    """Of the simulated truck, as plain values."""
+    seed: int
+    number: int
+    count: int
+
+
+class Drill:
+    """``count`` faults of one seed.
+
+    Args:
+        seed: everything random comes from it.
+        count: how many faults.
+        config: the simulated truck.
+        leg: faults of one truck.
+    """
+
+    def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
+        self.seed = seed
+        self.count = count
+        self._config = config
+        self._leg = leg
+
+    def legs(self) -> list[Leg]:
+        """The parts that can run in parallel."""
+        starts = range(0, self.count, self._leg)
+        return [
+            Leg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start))
+            for number, start in enumerate(starts)
+        ]
+
+    def run(self, *, jobs: int = 1, report: Callable[[list[Outcome]], None] = lambda _: None) -> Report:
+        """Run all of it.
+
+        Args:
+            jobs: processes; 1 = this one alone.
+            report: called with the outcomes of each finished leg.
+        """
+        outcomes: list[Outcome] = []
+        for part in self._parts(jobs):
+            report(part)
+            outcomes += part
+        return Report(self.seed, tuple(outcomes))
+
+    def _parts(self, jobs: int) -> Iterator[list[Outcome]]:
+        legs = self.legs()
+        if jobs == 1:
+            yield from map(run_leg, legs)
+            return
+        with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
+            yield from pool.map(run_leg, legs)
+
+
+def run_leg(leg: Leg) -> list[Outcome]:
+    """All faults of one leg, on the virtual clock."""
+    quiet = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with TemporaryDirectory(prefix="monstertruck-") as folder:
+            return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
+    finally:
+        logging.disable(quiet)
+
+
+class _LegRun:
+    """Drives, starts a fault, ends it and drives again, fault by fault."""
+
+    def __init__(self, leg: Leg, clock: VirtualClock, folder: str) -> None:
+        self._clock = clock
+        self._rng = np.random.default_rng([leg.seed, leg.number])
+        base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
+        self._faults = _draw(FaultCatalog(base.devices, records=base.recorder is not None), leg.count, self._rng)
+        records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
+        recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None
+        seed = int(self._rng.integers(2**31))
+        self._config = base.model_copy(
+            update={"recorder": recorder, "sim": base.sim.model_copy(update={"seed": seed, "drill": None})}
+        )
+        self._outcomes: list[Outcome] = []
+
+    async def run(self) -> list[Outcome]:
+        """All faults; a truck that is stuck is replaced by a new one."""
+        left = self._faults
+        while left:
+            before = len(self._outcomes)
+            async with DrillTruck.running(self._config, self._clock) as truck:
+                await truck.until(lambda: not truck.blockers(), PATIENCE)  # called within this turn only
+                for fault in left:
+                    outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)))
+                    if outcome is None:
+                        break
+                    self._outcomes.append(outcome)
+                    if outcome.stuck or outcome.blocked:
+                        break
+            done = len(self._outcomes) - before
+            if not done:  # a new truck cannot be driven either
+                self._outcomes.append(Outcome(left[0].name, left[0].kind, left[0].must_stop, stuck=("drive",)))
+                done = 1
+            left = left[done:]
+        return self._outcomes
+
+
+def _draw(catalog: FaultCatalog, count: int, rng: np.random.Generator) -> list[CatalogFault]:
+    """The faults of a leg; a disk becomes full once."""
+    faults: list[CatalogFault] = []
+    full = frozenset[FaultKind]()
+    for _ in range(count):
+        faults.append(catalog.draw(rng, without=full))
+        if faults[-1].kind is FaultKind.DISK_FULL:
+            full = frozenset({FaultKind.DISK_FULL})
+    return faults
+
+
+async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Outcome | None:
+    """Drive for ``cruise`` seconds, have the fault, end it, recover. None: the truck could not be driven before it."""
+    clock, observer, context = truck.clock, truck.observer, truck.rig.context
+    if not await _drive(truck):
+        return None
+    await clock.sleep(cruise)
+    truck.reports()
+    observer.begin(stops=fault.must_stop)
+    await apply(fault.start, context)
+    await clock.sleep(fault.hold)
+    stop_bytes, metres = observer.stop_bytes_after(), observer.metres()
+    observer.end_fault()
+    observer.disarm()
+    await truck.order(Order.DISARM)
+    await clock.sleep(STOPS_WITHIN / 2)
+    standstill = observer.standstill_after()
+    reason = next((reason for report in truck.reports() for reason in _reasons(report)), None)
+    ended = clock.now()
+    await apply(fault.end, context)
+    await truck.until(lambda: not truck.blockers(), PATIENCE)
+    recovered = (clock.now() - ended) / SECOND
+    blockers = truck.blockers()
+    if not blockers and not await _drive(truck):
+        blockers = tuple(truck.gate.reasons) if truck.gate is not None else ("gate",)
+    blocked = Reason.OBSTACLE_STOP in blockers and observer.before_something()
+    if blocked:
+        blockers = ()
+    drove_on = standstill is not None and standstill > fault.hold  # it stood only because it was disarmed
+    return Outcome(
+        fault.name,
+        fault.kind,
+        fault.must_stop,
+        reason=reason,
+        stop_bytes_s=None if drove_on else stop_bytes,
+        standstill_s=None if drove_on else standstill,
+        metres=metres,
+        recovered_s=None if blockers else recovered,
+        stuck=blockers,
+        blocked=blocked,
+        violations=observer.violations(),
+    )
+
+
+async def _drive(truck: DrillTruck) -> bool:
+    """Arm and come to speed."""
+    truck.observer.arm()
+    return await truck.until(truck.drives, PATIENCE, Order.ARM)
+
+
+def _reasons(report: Event | GateState | HealthTable) -> Iterator[Reason]:
+    """Reasons that explain a stop."""
+    match report:
+        case Event():
+            named: Iterable[Reason] = (report.reason,) if report.severity is not Severity.INFO else ()
+        case GateState():
+            named = report.reasons
+        case HealthTable():
+            named = (service.reason for service in report.services if service.name not in OPTIONAL)
+    yield from (reason for reason in named if reason not in QUIET)

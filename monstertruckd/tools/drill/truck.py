@@ -1,0 +1,105 @@
+"""The simulated truck of a drill: rig, operator and observer, and what the daemon reports."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from typing import Final, Self
+
+from monstertruck_runtime.clock import SECOND, VirtualClock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.health import HealthTable, ServiceState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.tools.drill.observer import Observer
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+CRUISE: Final = 0.1
+"""True speed of a truck that drives, m/s."""
+OPTIONAL: Final = frozenset({"recorder"})
+"""Services that a fault may end for the rest of a run: driving goes on without."""
+
+Report = Event | GateState | HealthTable
+
+
+class DrillTruck:
+    """One rig with its operator and observer.
+
+    Args:
+        rig: not running yet.
+    """
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.rig = rig
+        self.clock = rig.clock
+        self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
+        self.operator = LocalOperator(rig.bus, rig.clock)
+        queues = (rig.bus.subscribe(topic, fifo(1 << 16)) for topic in (topics.EVENT, topics.GATE, topics.HEALTH))
+        self._reports = tuple(queues)
+        self._gate = rig.bus.subscribe(topics.GATE, latest())
+        self._health = rig.bus.subscribe(topics.HEALTH, latest())
+
+    @classmethod
+    @asynccontextmanager
+    async def running(cls, config: SimulatedTruckConfig, clock: VirtualClock) -> AsyncIterator[Self]:
+        """World, daemon and observer run while the context lasts.
+
+        Raises:
+            BaseException: what ended the daemon early.
+        """
+        rig = VirtualRig(config, clock)
+        truck = cls(rig)
+        async with rig.running():
+            observing = asyncio.create_task(truck.observer.run(), name="observer")
+            try:
+                yield truck
+            finally:
+                observing.cancel()
+                await asyncio.wait([observing])
+
+    @property
+    def gate(self) -> GateState | None:
+        """Newest state of the gate."""
+        return self._gate.latest
+
+    def blockers(self) -> tuple[str, ...]:
+        """Services that are not ready, and reasons that keep the truck from being armed; empty = it can be driven."""
+        table, state = self._health.latest, self._gate.latest
+        if table is None or state is None:
+            return ("daemon",)
+        down = [r.name for r in table.services if r.state is not ServiceState.READY and r.name not in OPTIONAL]
+        driving = state.mode is GateMode.DRIVING
+        reasons = () if driving else tuple(reason for reason in state.reasons if reason is not Reason.DISARMED)
+        return (*down, *reasons)
+
+    async def until(self, condition: Callable[[], bool], seconds: float, order: Order | None = None) -> bool:
+        """Whether the condition becomes true in time; until then the order is repeated while the truck is disarmed."""
+        end = self.clock.now() + round(seconds * SECOND)
+        while self.clock.now() < end and not self.rig.daemon_ended:
+            if condition():
+                return True
+            if order is not None and self.gate is not None and not self.gate.mode.active:
+                await self.order(order)
+            await self.clock.sleep(0.02)
+        return condition()
+
+    async def order(self, order: Order) -> None:
+        """Send an order, if the daemon runs."""
+        if not self.rig.daemon_ended:
+            await self.operator.order(order)
+
+    def drives(self) -> bool:
+        """Whether it moves at a speed worth stopping."""
+        return abs(self.observer.speed) > CRUISE
+
+    def reports(self) -> list[Report]:
+        """Events, gate states and health tables since the last call, by time."""
+        return sorted(self._drained(), key=lambda report: report.stamp)
+
+    def _drained(self) -> Iterator[Report]:
+        for queue in self._reports:
+            yield from queue.drain()
