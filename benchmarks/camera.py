@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.webcam.jpeg import complete
+from monstertruck_drivers.webcam.driver import complete
+from monstertruck_drivers.webcam.emulator import Renderer
 from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser
-from monstertruck_drivers.webcam.render import Renderer
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall

@@ -29,7 +29,8 @@ from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.hokuyo_urg import protocol as scip
 from monstertruck_drivers.maestro import protocol as maestro
 from monstertruck_drivers.os4000 import protocol as os4000
-from monstertruck_drivers.webcam import jpeg, packets
+from monstertruck_drivers.webcam import driver as webcam_driver
+from monstertruck_drivers.webcam import packets
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceTimeoutError, InputError, ProtocolError
@@ -98,7 +99,7 @@ def parsers() -> dict[str, Stream | Whole]:
         "ax12": Stream(ax12.Parser, [(packet.encode(), packet) for packet in status]),
         "camera": Stream(packets.PacketParser, [(packet.encode(), packet) for packet in pictures], held=HELD_LIMIT),
         "epos": Whole(_epos, (epos.FrameError,), [_epos_frame(entry) for entry in (od.STATUSWORD, od.TARGET_VELOCITY)]),
-        "jpeg": Whole(jpeg.complete, (ValueError,), [_jpeg(rng)]),
+        "jpeg": Whole(webcam_driver.complete, (ValueError,), [_jpeg(rng)]),
         "wire-json": Whole(lambda data: wire.decode(topics.REQ_DRIVE, data), (InputError,), [_request()]),
         "wire-drive": Whole(lambda data: wire.decode(topics.DRIVE, data), (InputError,), [_drive()]),
         "wire-scan": Whole(lambda data: wire.decode(topics.SCAN, data), (InputError,), [_scan(rng)]),

@@ -1,15 +1,174 @@
-"""The computer the daemon runs on, real or emulated: its USB tree, kernel files and disk."""
+"""The computer the daemon runs on, real or emulated: its USB tree, kernel files, programs and disk."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Final, Protocol, Self
 
 from monstertruck_drivers.host_health.readings import Disk, disk_of
-from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.sysfs import Sysfs
-from monstertruck_drivers.usb.watch import NoWatcher, Watcher, open_watcher
+from monstertruck_drivers.link import Port, SerialPort
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.threads import Offload, in_thread
+
+
+class Sysfs:
+    """Attributes below ``root``; what cannot be read is absent.
+
+    Some attributes wait for the device (strings, ``authorized``), so nothing of this belongs on the event loop.
+    """
+
+    def __init__(self, root: Path = Path("/sys")) -> None:
+        self.root = root
+
+    def text(self, path: str) -> str | None:
+        """Content of an attribute without surrounding blanks; None if it is not there or cannot be read."""
+        try:
+            return (self.root / path).read_text(errors="replace").strip()
+        except OSError:
+            return None
+
+    def number(self, path: str, base: int = 10) -> int | None:
+        """Content as an integer; None if it is none."""
+        try:
+            return int(self.text(path) or "", base)
+        except ValueError:
+            return None
+
+    def names(self, path: str) -> list[str]:
+        """Entries of a folder, sorted; none if it is not there."""
+        try:
+            return sorted(entry.name for entry in (self.root / path).iterdir())
+        except OSError:
+            return []
+
+    def write(self, path: str, text: str) -> None:
+        """Set an attribute.
+
+        Raises:
+            OSError: it is not there, not permitted, or refused.
+        """
+        with (self.root / path).open("r+") as attribute:  # an attribute is never created
+            attribute.write(text)
+
+
+log = logging.getLogger(__name__)
+
+SUBSYSTEMS: Final = ("usb", "tty", "video4linux")
+
+
+class Watcher(Protocol):
+    """Source of hints; may miss some, so its user looks by itself now and then."""
+
+    def start(self, hint: Callable[[], None]) -> None:
+        """Call ``hint`` on the running loop whenever something may have changed, until ``stop``."""
+        ...
+
+    def stop(self) -> None:
+        """No more hints; may be called again."""
+        ...
+
+
+class NoWatcher:
+    """For machines that announce nothing: the tree is only looked at now and then."""
+
+    def start(self, hint: Callable[[], None]) -> None:
+        """Nothing will come."""
+
+    def stop(self) -> None:
+        """Nothing came."""
+
+
+class UdevWatcher:
+    """Listens to udev, that is after its rules ran: links and permissions are in place.
+
+    Args:
+        monitor: a ``pyudev.Monitor``, or what looks like one.
+    """
+
+    def __init__(self, monitor: Any) -> None:
+        self._monitor = monitor
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._hint: Callable[[], None] = _ignore
+
+    def start(self, hint: Callable[[], None]) -> None:
+        """Listen on the running loop."""
+        self._hint = hint
+        self._monitor.start()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._monitor.fileno(), self._drain)
+
+    def stop(self) -> None:
+        """Listen no more."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._monitor.fileno())
+            self._loop = None
+
+    def _drain(self) -> None:
+        try:
+            while self._monitor.poll(timeout=0) is not None:
+                pass
+        except OSError as error:  # the kernel's queue overflowed: announcements are lost
+            log.debug("udev: %s", error)
+            if self._loop is not None:  # uvloop calls the reader of a file with an error once, and then no more
+                self._loop.remove_reader(self._monitor.fileno())
+                self._loop.add_reader(self._monitor.fileno(), self._drain)
+        self._hint()
+
+
+def open_watcher() -> Watcher:
+    """Udev's announcements where the machine has them, none otherwise."""
+    try:
+        # LGPL, for robots only, and it loads a system library.
+        import pyudev  # noqa: PLC0415
+
+        monitor = pyudev.Monitor.from_netlink(pyudev.Context(), "udev")
+        for subsystem in SUBSYSTEMS:
+            monitor.filter_by(subsystem)
+    except (ImportError, OSError) as error:
+        log.warning("no udev announcements (%s): the USB tree is looked at every few seconds only", error)
+        return NoWatcher()
+    return UdevWatcher(monitor)
+
+
+def _ignore() -> None:
+    return None
+
+
+async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
+    """Run a program without a shell.
+
+    Returns:
+        Its exit code and what it printed.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *arguments, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+    )
+    try:
+        output, _ = await process.communicate()
+    except asyncio.CancelledError:
+        process.kill()
+        await process.wait()
+        raise
+    return process.returncode or 0, output.decode(errors="replace").strip()
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Files, nodes and programs; an emulated machine stands in for it in tests."""
+
+    clock: Clock
+    sysfs: Sysfs = field(default_factory=Sysfs)
+    dev: Path = Path("/dev")
+    beside: Offload = in_thread
+    run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
+    serial: Callable[[Path, int], Port] = SerialPort
+    """A serial node and a baud rate to a port."""
+
 
 ROOT = Path("/")
 

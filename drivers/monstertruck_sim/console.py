@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, TextIO
 
-from monstertruck_drivers.base import Emulator, FileEmulator
 from monstertruck_drivers.cable import EmulatedPort, LineFaults
+from monstertruck_drivers.emulation import Emulator, FileEmulator
 from monstertruck_runtime.errors import InputError
 
 HELP = (

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from monstertruck_drivers.base import Emulator, EmulatorSetup, FileEmulator
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.catalog import DeviceKind
 from monstertruck_drivers.config import Devices, Monitors, kind_of
+from monstertruck_drivers.emulation import Emulator, EmulatorSetup, FileEmulator
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, RecordedRanges
 from monstertruck_drivers.maestro.emulator import MaestroEmulator

@@ -2,17 +2,13 @@
 
 from collections.abc import Mapping
 
-from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.link import BAUD, Port, SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.hub import HubCoordinator
-from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.port import HubNode, HubPort
-from monstertruck_drivers.usb.power import PortPower
-from monstertruck_drivers.usb.service import UsbService
-from monstertruck_drivers.webcam.path_source import PathSource
-from monstertruck_drivers.webcam.rendered_source import RenderedSource
+from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
+from monstertruck_drivers.usb.port import HubNode, HubPort, PortPower
+from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSource
 from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
 from monstertruck_schemas import topics
 from monstertruck_schemas.topics import Writer

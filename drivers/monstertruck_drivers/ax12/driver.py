@@ -1,18 +1,255 @@
 """Stabiliser driver: joint goals out; angles, loads, heat and alarms of both servos in."""
 
+import contextlib
 from typing import Final
 
 from monstertruck_drivers.ax12 import protocol as p
-from monstertruck_drivers.ax12.config import Ax12Config
-from monstertruck_drivers.ax12.joint import Joint
-from monstertruck_drivers.ax12.session import Session
+from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
+from monstertruck_drivers.ax12.protocol import Alarm, Present, alarm_names, word
+from monstertruck_drivers.ax12.session import RETRIES, Session
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
 from monstertruck_runtime.schedule import QUESTIONS, Schedule
+from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import StabiliserCommand
-from monstertruck_schemas.sensor import StabiliserFeedback, TorqueState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import StabiliserFeedback, StabiliserJoint, TorqueState
+
+STORED: Final = 19
+"""Bytes of settings from the start of the control table."""
+SETTINGS: Final = 12
+"""Bytes from the torque switch to the torque limit."""
+ANSWERS_ALL: Final = b"\x02"
+"""Status level at which writes are answered too."""
+
+
+class Joint:
+    """Keeps one unit holding; time passes only in ``join`` and ``poll``.
+
+    **Alarms.** An overload or overheated unit sets its own torque limit to 0 and goes limp; it answers as before, and
+    its error bits may clear although it stays limp. So the torque settings are looked at when the bits change and
+    once in a while. After a rest, once cool, the unit gets torque again: its goal becomes its present position
+    first, or it would jump.
+
+    Args:
+        name: ``pitch`` or ``roll``.
+        joint: calibration.
+        config: times and limits.
+        clock: time.
+        events: alarms, losses and returns.
+        source: service name.
+    """
+
+    def __init__(
+        self, name: str, joint: JointConfig, config: Ax12Config, clock: Clock, events: EventSink, source: str
+    ) -> None:
+        self.id = joint.id
+        self.torque = TorqueState.ABSENT
+        self._name = name
+        self._joint = joint
+        self._config = config
+        self._clock = clock
+        self._events = events
+        self._source = source
+        self._rest = config.alarm.rest
+        self._held_at: int | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """A session starts: nothing is known of the unit, whose rest after alarms goes on all the same."""
+        self.torque = TorqueState.ABSENT
+        self._present: Present | None = None
+        self._error = Alarm(0)
+        self._told = Alarm(0)
+        self._clean_since = self._clock.now()
+        self._misses = 0
+        self._ask_at = 0
+        self._check_at = 0
+        self._hold_at = 0
+        self._max_torque = p.MAX_TORQUE.default
+        self._outage = False
+
+    # What is known
+
+    @property
+    def angle(self) -> float | None:
+        """Joint angle, rad; None while the unit does not answer."""
+        return None if self._present is None else self._joint.angle(self._present.position)
+
+    def goal(self, angle: float) -> bytes:
+        """Bytes of the goal register for a joint angle, rad, held within the limits."""
+        return p.GOAL_POSITION.encode(self._joint.position(angle))
+
+    def feedback(self) -> StabiliserJoint:
+        """For the message; signs of the joint angle."""
+        present = self._present
+        if present is None:
+            return StabiliserJoint(torque=self.torque)
+        sign = self._joint.direction
+        return StabiliserJoint(
+            torque=self.torque,
+            error=int(self._error),
+            velocity=sign * present.speed * p.SPEED_UNIT,
+            load=sign * present.load * p.LOAD_UNIT,
+            voltage=present.voltage * p.VOLT_UNIT,
+            temperature=float(present.temperature),
+        )
+
+    # Exchanges
+
+    async def join(self, session: Session, retries: int = RETRIES) -> None:
+        """Make sure that the unit is there and what is configured; the next ``poll`` makes it hold.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: it does not answer.
+            ProtocolError: it refuses.
+            WrongDeviceError: no AX-12A.
+            DeviceMismatchError: it turns endlessly, or its limits forbid configured goals.
+        """
+        self._ask_at = self._clock.now() + round(self._config.absent_interval * SECOND)
+        await session.ping(self.id, retries)
+        try:
+            stored = (await session.read(self.id, p.MODEL_NUMBER, STORED, retries)).data
+        except DeviceTimeoutError:
+            await self._answer_all(session)
+            stored = (await session.read(self.id, p.MODEL_NUMBER, STORED, retries)).data
+        self._check(stored)
+        if stored[p.STATUS_LEVEL.address] != ANSWERS_ALL[0]:
+            await self._answer_all(session)
+        self._max_torque = word(stored, p.MAX_TORQUE.address)
+        self._misses = 0
+        self.torque = TorqueState.LIMP
+        self._hold_at = 0
+
+    async def poll(self, session: Session) -> None:
+        """Read the unit, and do what it needs.
+
+        Raises:
+            DeviceLostError: unplugged.
+            WrongDeviceError: the unit came back as another one.
+            DeviceMismatchError: the same, in its settings.
+        """
+        try:
+            if self.torque is TorqueState.ABSENT:
+                if self._clock.now() < self._ask_at:
+                    return
+                await self.join(session, retries=0)
+            answer = await session.read(self.id, p.PRESENT_POSITION, p.PRESENT_SIZE, retries=0)
+            self._misses = 0
+            self._present = Present.decode(answer.data)
+            await self._look_after(session, self._present, answer.error)
+        except (DeviceTimeoutError, ProtocolError) as error:
+            self._miss(str(error))
+
+    async def _look_after(self, session: Session, present: Present, error: Alarm) -> None:
+        now = self._clock.now()
+        changed, self._error = error != self._error, error
+        self._tell_alarms(error, now)
+        if self.torque is TorqueState.HOLDING and (changed or now >= self._check_at):
+            await self._check_torque(session, present)
+        cool = present.temperature <= self._config.alarm.cool_below
+        if self.torque is TorqueState.LIMP and now >= self._hold_at and cool:
+            await self._hold(session, present)
+
+    async def _check_torque(self, session: Session, present: Present) -> None:
+        enabled, speed, limit = await self._settings(session)
+        if not limit:
+            self._go_limp()
+        elif not enabled or speed != self._config.speed_word:
+            self._tell(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as by a brown-out: sent again")
+            await self._hold(session, present)
+
+    async def _hold(self, session: Session, present: Present) -> None:
+        """Give torque without a jump: the goal is where the joint is, or the limit next to it."""
+        config, joint = self._config, self._joint
+        goal = min(max(present.position, joint.min_position), joint.max_position)
+        words = (p.GOAL_POSITION, goal), (p.MOVING_SPEED, config.speed_word), (p.TORQUE_LIMIT, self._max_torque)
+        await session.write(self.id, p.CW_MARGIN, bytes((config.margin, config.margin, config.slope, config.slope)))
+        await session.write(self.id, p.GOAL_POSITION, b"".join(register.encode(value) for register, value in words))
+        await session.write(self.id, p.TORQUE_ENABLE, b"\x01")
+        enabled, _, limit = await self._settings(session)
+        if not (enabled and limit):
+            self._go_limp()
+            return
+        self.torque = TorqueState.HOLDING
+        self._held_at = self._clock.now()
+        if self._outage:
+            self._outage = False
+            self._tell(Reason.DEVICE_READY, Severity.INFO, "holds again")
+
+    def _go_limp(self) -> None:
+        """Rest, the longer the sooner it tripped again."""
+        alarm, now = self._config.alarm, self._clock.now()
+        if self._held_at is not None and now - self._held_at >= alarm.settled_after * SECOND:
+            self._rest = alarm.rest
+        self.torque = TorqueState.LIMP
+        self._hold_at = now + round(self._rest * SECOND)
+        if not self._outage:
+            text = f"limp after {alarm_names(self._error)}: rests {self._rest:g} s"
+            self._tell(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
+        self._outage = True
+        self._rest = min(2 * self._rest, alarm.rest_max)
+
+    def _miss(self, why: str) -> None:
+        self._misses += 1
+        if self.torque is TorqueState.ABSENT or self._misses <= RETRIES:
+            return
+        self.torque = TorqueState.ABSENT
+        self._present = None
+        self._error = Alarm(0)
+        self._ask_at = self._clock.now() + round(self._config.absent_interval * SECOND)
+        self.tell_absent(why)
+
+    def tell_absent(self, why: str) -> None:
+        """Report that the unit does not answer."""
+        self._outage = True
+        self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
+
+    async def _settings(self, session: Session) -> tuple[int, int, int]:
+        """Torque switch, moving speed, torque limit."""
+        answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries=0)
+        self._error, data = answer.error, answer.data
+        self._check_at = self._clock.now() + round(self._config.check_interval * SECOND)
+        return data[0], word(data, 8), word(data, 10)
+
+    async def _answer_all(self, session: Session) -> None:
+        """Store the status level that answers everything; whether this write is answered depends on the old one."""
+        with contextlib.suppress(DeviceTimeoutError):
+            await session.write(self.id, p.STATUS_LEVEL, ANSWERS_ALL, retries=0)
+        self._tell(Reason.DEVICE_MISMATCH, Severity.INFO, "did not answer everything: status level set to 2")
+
+    def _check(self, stored: bytes) -> None:
+        model = word(stored, p.MODEL_NUMBER.address)
+        if model != p.MODEL:
+            raise WrongDeviceError(f"unit {self.id} ({self._name}): model {model}, expected an AX-12A ({p.MODEL})")
+        low, high = word(stored, p.CW_LIMIT.address), word(stored, p.CCW_LIMIT.address)
+        wanted = (self._joint.min_position, self._joint.max_position)
+        if low > wanted[0] or high < wanted[1]:
+            raise DeviceMismatchError(
+                f"unit {self.id} ({self._name}): its angle limits are {low}..{high} (0..0 turns endlessly), "
+                f"expected to allow {wanted[0]}..{wanted[1]}"
+            )
+
+    # Reports
+
+    def _tell_alarms(self, error: Alarm, now: int) -> None:
+        """Each bit once, until all were clear for a while."""
+        if not error:
+            if self._told and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
+                self._told = Alarm(0)
+            return
+        self._clean_since = now
+        new = error & ~self._told
+        self._told |= error
+        if new:
+            self._tell(Reason.DEVICE_FAULT, Severity.WARNING, f"reports {alarm_names(new)}", error=int(error))
+
+    def _tell(self, reason: Reason, severity: Severity, text: str, **values: Value) -> None:
+        self._events(reason, severity, self._source, f"{self._name} joint (unit {self.id}) {text}", **values)
+
 
 STRANGE: Final = 3
 """Bytes out of form that show another device; fewer may be disturbances."""

@@ -11,8 +11,8 @@ from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
-from monstertruck_drivers.base import EmulatorSetup, Trail
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, Trail
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 

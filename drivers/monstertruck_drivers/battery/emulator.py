@@ -6,10 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_drivers.base import EmulatorSetup
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.iio import CONVERTERS
-from monstertruck_drivers.file_tree import FileTree
+from monstertruck_drivers.emulation import EmulatorSetup, FileTree
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 

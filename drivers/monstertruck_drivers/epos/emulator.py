@@ -10,8 +10,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from monstertruck_drivers.base import EmulatorSetup, MotorPlant
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
 from monstertruck_drivers.epos.protocol import (

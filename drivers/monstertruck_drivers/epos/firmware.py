@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from monstertruck_drivers.base import MotorPlant, MotorReading
+from monstertruck_drivers.emulation import MotorPlant, MotorReading
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.objects import OBJECTS, Entry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State

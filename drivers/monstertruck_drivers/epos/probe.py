@@ -4,8 +4,7 @@ from typing import Any
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger
-from monstertruck_drivers.epos.identity import read_identity
+from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, read_identity
 from monstertruck_drivers.epos.protocol import state_of
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock

@@ -1,8 +1,6 @@
 """The scanner as a service: one session streams scans until it is cancelled or lost."""
 
-from monstertruck_drivers.hokuyo_urg.clock_map import ClockMap
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.hokuyo_urg.identity import Parameters
 from monstertruck_drivers.hokuyo_urg.protocol import (
     Outcome,
     Reply,
@@ -13,7 +11,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     scip1_scan_command,
     split_ranges,
 )
-from monstertruck_drivers.hokuyo_urg.session import Dialect, ScipSession, Sensor
+from monstertruck_drivers.hokuyo_urg.session import ClockMap, Dialect, Parameters, ScipSession, Sensor
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError

@@ -5,7 +5,6 @@ from dataclasses import asdict
 import numpy as np
 
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.hokuyo_urg.identity import Parameters
 from monstertruck_drivers.hokuyo_urg.protocol import (
     ScanBlock,
     decode_scan,
@@ -13,7 +12,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     scip1_scan_command,
     split_ranges,
 )
-from monstertruck_drivers.hokuyo_urg.session import Dialect, ScipSession, Sensor
+from monstertruck_drivers.hokuyo_urg.session import Dialect, Parameters, ScipSession, Sensor
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
 

@@ -1,23 +1,26 @@
 """One conversation with a scanner: waking it from any state, asking, comparing clocks, silencing it."""
 
 import contextlib
+import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
-from monstertruck_drivers.hokuyo_urg.clock_map import Anchor
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.hokuyo_urg.identity import (
-    SCIP1_PARAMETERS,
-    Identity,
-    InternalState,
-    Parameters,
-    parse_fields,
-    parse_identity,
-    parse_parameters,
-    parse_state,
+from monstertruck_drivers.hokuyo_urg.protocol import (
+    COUNTER_BITS,
+    COUNTER_MASK,
+    Outcome,
+    Reply,
+    ScipParser,
+    classify,
+    decode_counter,
+    line_sum,
+    request,
+    sum_matches,
 )
-from monstertruck_drivers.hokuyo_urg.protocol import Outcome, Reply, ScipParser, classify, decode_counter, request
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import (
@@ -27,6 +30,229 @@ from monstertruck_runtime.errors import (
     ProtocolError,
     WrongDeviceError,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Answer to VV (or V)."""
+
+    vendor: str
+    product: str
+    firmware: str
+    protocol: str
+    serial: str
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Answer to PP: everything the geometry of a scan follows from."""
+
+    model: str
+    least_mm: int
+    """Values below are error codes."""
+    greatest_mm: int
+    steps_per_turn: int
+    first_step: int
+    """First step that measures."""
+    last_step: int
+    front_step: int
+    """Step that looks straight ahead."""
+    rpm: int
+
+    @property
+    def period(self) -> float:
+        """Seconds of one revolution."""
+        return 60.0 / self.rpm
+
+    @property
+    def step_time(self) -> float:
+        """Seconds between neighbouring steps."""
+        return self.period / self.steps_per_turn
+
+    def angle(self, step: float) -> float:
+        """Direction of a step, rad, counter-clockwise from straight ahead."""
+        return (step - self.front_step) * 2.0 * math.pi / self.steps_per_turn
+
+
+@dataclass(frozen=True, slots=True)
+class InternalState:
+    """Answer to II."""
+
+    laser_on: bool
+    speed: str
+    mode: str
+    counter: int
+    """Milliseconds, 24 bits."""
+    status: str
+
+
+SCIP1_PARAMETERS: Final = Parameters("URG-04LX", 20, 4095, 1024, 44, 725, 384, 600)
+"""URG-04LX of firmware below 3, which has no PP to ask; 4095 mm is the most its encoding holds."""
+
+
+def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
+    """``KEY:value;`` lines as a mapping.
+
+    A wrong sum on SERI is accepted (some units send it so), and one that leaves out what follows ``<-`` (some models'
+    II).
+
+    Raises:
+        ProtocolError: another line with a wrong sum, or not of this form.
+    """
+    fields: dict[str, str] = {}
+    for line in lines:
+        key, colon, value = line.partition(b":")
+        if not colon or len(key) != 4:
+            raise ProtocolError(f"SCIP: expected 'KEY:value', got {line!r}")
+        if sums:
+            note = line.partition(b"<-")[0]
+            if not (sum_matches(line) or sum_matches(note + line[-1:]) or key == b"SERI"):
+                raise ProtocolError(f"SCIP: bad checksum in {line!r}")
+            value = value[:-1]
+        fields[key.decode("latin-1")] = value.removesuffix(b";").decode("latin-1").strip()
+    return fields
+
+
+def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
+    """Lines ``KEY:value;`` as firmware 3.1 sends them: the ``;`` is left out of the sum."""
+    lines = []
+    for key, value in fields.items():
+        text = f"{key}:{value}".encode("latin-1")
+        lines.append(text + b";" + bytes((line_sum(text),)))
+    return lines
+
+
+def parse_identity(fields: dict[str, str]) -> Identity:
+    """Fields of VV; a missing one is empty, as old units leave some out."""
+    return Identity(*(fields.get(key, "") for key in ("VEND", "PROD", "FIRM", "PROT", "SERI")))
+
+
+def parse_parameters(fields: dict[str, str]) -> Parameters:
+    """Fields of PP.
+
+    Raises:
+        ProtocolError: a field is missing, no number, or the geometry is impossible.
+    """
+    try:
+        numbers = [int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")]
+    except (KeyError, ValueError) as error:
+        raise ProtocolError(f"SCIP: PP has no number for {error}") from error
+    found = Parameters(fields.get("MODL", ""), *numbers)
+    sound = (
+        0 <= found.least_mm < found.greatest_mm
+        and 0 <= found.first_step < found.last_step < found.steps_per_turn
+        and found.rpm > 0
+    )
+    if not sound:
+        raise ProtocolError(f"SCIP: PP tells an impossible geometry: {found}")
+    return found
+
+
+def parse_state(fields: dict[str, str]) -> InternalState:
+    """Fields of II.
+
+    Raises:
+        ProtocolError: no hexadecimal TIME.
+    """
+    try:
+        counter = int(fields["TIME"], 16)
+    except (KeyError, ValueError) as error:
+        raise ProtocolError(f"SCIP: II has no hexadecimal TIME: {error}") from error
+    return InternalState(
+        laser_on=fields.get("LASR", "") == "ON",
+        speed=fields.get("SCSP", ""),
+        mode=fields.get("MESM", ""),
+        counter=counter,
+        status=fields.get("STAT", ""),
+    )
+
+
+MILLISECOND: Final = 1_000_000
+MAX_DRIFT_PPM: Final = 200
+RESTART: Final = 1000 * MILLISECOND
+"""Disagreement of both clocks over one scan that only a restarted counter can explain, ns."""
+SETTLE: Final = 5000 * MILLISECOND
+"""How long the start-up comparison is used while the latency is being found, ns (200 ppm = 1 ms)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """One comparison of both clocks."""
+
+    counter: int
+    """Sensor's milliseconds, 24 bits."""
+    host: int
+    """The daemon's time when the counter said so, ns."""
+    round_trip: int = 0
+    """How long the exchange took, ns; half of it bounds the error."""
+
+
+class ClockMap:
+    """Stamps of counter values, never going backwards.
+
+    Args:
+        nominal_latency: ns from a counter value to the arrival of its scan; used only where it cannot be measured
+            (no ``anchor``, or the counter restarted before the first scan).
+        anchor: comparison made at start.
+    """
+
+    def __init__(self, nominal_latency: int, anchor: Anchor | None = None) -> None:
+        self.restarts = 0
+        """How often the counter restarted."""
+        self._latency: int = nominal_latency
+        self._reference: int | None = None if anchor is None else anchor.host
+        self._counter: int | None = None if anchor is None else anchor.counter
+        self._host = 0 if anchor is None else anchor.host
+        self._elapsed = 0  # sensor's ns since the first comparison
+        self._envelope: int | None = None
+        self._stamp: int | None = None
+
+    def stamp(self, counter: int, arrival: int) -> int:
+        """The daemon's time, ns, at which the sensor's counter said ``counter``.
+
+        Args:
+            counter: milliseconds, 24 bits, later than that of the previous call.
+            arrival: when the last byte came, ns.
+        """
+        offset = self._follow(counter, arrival)
+        stamp = self._elapsed + offset
+        if self._stamp is not None:
+            stamp = max(stamp, self._stamp + 1)
+        self._stamp = stamp
+        return stamp
+
+    def _follow(self, counter: int, arrival: int) -> int:
+        """Take one sample; returns (daemon's time - sensor's time) without latency."""
+        waited = arrival - self._host
+        previous, self._counter, self._host = self._counter, counter, arrival
+        if previous is None:
+            self._envelope = arrival
+            return arrival - self._latency
+        step = ((counter - previous) & COUNTER_MASK) * MILLISECOND
+        if abs(_signed(step - waited)) > RESTART:
+            self.restarts += 1
+            self._reference = None
+            self._elapsed += waited
+            self._envelope = arrival - self._elapsed
+            return self._envelope - self._latency
+        self._elapsed += step
+        sample = arrival - self._elapsed
+        rise = step * MAX_DRIFT_PPM // 1_000_000
+        self._envelope = sample if self._envelope is None else min(sample, self._envelope + rise)
+        if self._reference is None:
+            return self._envelope - self._latency
+        reference = self._reference
+        self._latency = self._envelope - reference
+        if self._elapsed > SETTLE:
+            self._reference = None
+        return reference
+
+
+def _signed(difference: int) -> int:
+    """A difference of counters, ns, as the least one of all that a wrap makes equal."""
+    turn = MILLISECOND << COUNTER_BITS
+    return (difference + turn // 2) % turn - turn // 2
+
 
 LISTEN = 0.05
 """Seconds whose bytes are thrown away after opening."""

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.base import EmulatorSetup
-from monstertruck_drivers.file_tree import FileTree
+from monstertruck_drivers.emulation import EmulatorSetup, FileTree
 from monstertruck_drivers.host_health.readings import FIRMWARE_THROTTLED
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError

@@ -8,8 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import EmulatorSetup, ServoPlant, Trail
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
+from monstertruck_drivers.emulation import EmulatorSetup, ServoPlant, Trail
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
     CHANNELS,

@@ -7,8 +7,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_drivers.base import AttitudeSource, CompassReading, EmulatorSetup, Trail
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import AttitudeSource, CompassReading, EmulatorSetup, Trail
 from monstertruck_drivers.os4000.protocol import (
     BAUD,
     BAUDS,

@@ -12,11 +12,9 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.cable import EmulatedPort, MemoryPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort, PtyPort
+from monstertruck_drivers.computer import Machine, Sysfs
 from monstertruck_drivers.link import Port, SerialPort
-from monstertruck_drivers.pty_port import PtyPort
-from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, sort_key
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from monstertruck_drivers.usb.sysfs import Sysfs
+from monstertruck_drivers.computer import Sysfs
 
 DEVICES = "bus/usb/devices"
 HUB_CLASS = 0x09

@@ -1,11 +1,13 @@
-"""Pictures of the emulated camera, over the port it is plugged into."""
+"""Pictures of the emulated camera over its port, and the camera at a path, whichever is there."""
 
+from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port
+from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port, SerialPort
 from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser, decode_mode
-from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, Mode, device_error
+from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, FrameSource, FrameStream, Mode, device_error
+from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError
 
@@ -81,3 +83,29 @@ class RenderedStream:
         if not self._link.is_lost:
             self._link.write(b"CLOSE\n")
         self._link.close()
+
+
+PTYS: Final = Path("/dev/pts")
+
+
+class PathSource:
+    """Looks at every opening whether the path leads to a pty, behind which only an emulator can be.
+
+    Args:
+        path: node, symlink or glob pattern, see ``V4l2Source``.
+        clock: time.
+    """
+
+    def __init__(self, path: str, clock: Clock) -> None:
+        self.name = path
+        self._clock = clock
+
+    async def open(self, mode: Mode, buffers: int) -> FrameStream:
+        """Start the camera, see ``FrameSource``."""
+        return await self._present().open(mode, buffers)
+
+    def _present(self) -> FrameSource:
+        path = Path(self.name)
+        if path.resolve().parent == PTYS:
+            return RenderedSource(SerialPort(path), self._clock)
+        return V4l2Source(self.name)

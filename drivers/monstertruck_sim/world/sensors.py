@@ -6,7 +6,7 @@ from math import atan2, cos, degrees, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import CompassReading, JointSource, MotorReading, PulseSource
+from monstertruck_drivers.emulation import CompassReading, JointSource, MotorReading, PulseSource
 from monstertruck_sim.world.config import BatteryConfig, CameraConfig, CompassConfig, LidarConfig, MotorConfig
 from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
 from monstertruck_sim.world.truck_plant import TruckPlant

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import PulseSource
+from monstertruck_drivers.emulation import PulseSource
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.dynamics import SingleTrack
 from monstertruck_kinematics.motion import integrate

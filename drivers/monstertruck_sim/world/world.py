@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
+from monstertruck_drivers.emulation import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn

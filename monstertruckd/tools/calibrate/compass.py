@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
-from monstertruck_drivers.os4000.iron import level_field
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import COMPASS, Estimate, Result

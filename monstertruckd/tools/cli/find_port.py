@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.catalog import DEVICES
+from monstertruck_drivers.computer import Machine
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.machine import Machine
 from monstertruck_drivers.usb.tree import Snapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
 from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file

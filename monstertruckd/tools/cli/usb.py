@@ -45,8 +45,8 @@ def find_port(
     json_output: JsonOption = False,
 ) -> None:
     """Unplug the cable: this names its hub and port and prints the line for the configuration."""
+    from monstertruck_drivers.computer import Machine
     from monstertruck_drivers.config import Devices
-    from monstertruck_drivers.usb.machine import Machine
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.cli.find_port import config_line, find_cable, require_place, write_port
 

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from rich.text import Text
 from rich.tree import Tree
 
+from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_drivers.usb.hub import HubCoordinator
-from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_drivers.usb.tree import parent_of, port_of, read_tree, sort_key
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock

@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from monstertruck_drivers.base import EmulatorSetup
+from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.catalog import DEVICES
-from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.console import Emulated

@@ -12,10 +12,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.cable import EmulatedPort
+from monstertruck_drivers.cable import EmulatedPort, PtyPort
 from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
-from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import settle

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort
-from monstertruck_drivers.computer import Computer
-from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.sysfs import Sysfs
+from monstertruck_drivers.computer import Computer, Machine, Sysfs
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Message

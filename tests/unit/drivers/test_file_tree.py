@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from monstertruck_drivers.file_tree import FileTree
+from monstertruck_drivers.emulation import FileTree
 
 
 def test_files_appear_change_and_go(tmp_path: Path):

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers import pty_port
-from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers import cable
+from monstertruck_drivers.cable import MemoryPort, PtyPort
 from monstertruck_drivers.link import BUFFER_LIMIT, SerialPort
-from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
 
@@ -291,7 +290,7 @@ async def test_a_vanished_pty_does_not_spin_the_loop(tmp_path: Path):
 
 
 async def test_what_a_device_says_within_a_usb_frame_arrives_together(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(pty_port, "FRAME", 0.05)
+    monkeypatch.setattr(cable, "FRAME", 0.05)
     pty = PtyPort(tmp_path / "dev")
     pty.plug()
     async with await SerialPort(tmp_path / "dev").open() as link:

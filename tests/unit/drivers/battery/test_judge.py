@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.battery.config import PackConfig
-from monstertruck_drivers.battery.judge import CELL_VOLTS, BatteryJudge, charge_of
+from monstertruck_drivers.battery.monitor import CELL_VOLTS, BatteryJudge, charge_of
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import BatteryLevel
 from monstertruck_sim.world.battery import Battery

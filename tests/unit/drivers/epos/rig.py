@@ -10,11 +10,10 @@ import numpy as np
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import RESTART_POLICY, EposDriver
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, EposDriver
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.firmware import FreeMotor
-from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
 from monstertruck_drivers.epos.protocol import (
     Control,
     Frame,
@@ -25,7 +24,7 @@ from monstertruck_drivers.epos.protocol import (
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
-from monstertruck_runtime.service import supervise
+from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.health import ServiceHealth
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
@@ -77,7 +76,7 @@ class Rig(DriverRig):
     async def supervised(self) -> AsyncIterator[asyncio.Task[Any]]:
         """Session after session in the background."""
         rng = np.random.default_rng(1)
-        service = supervise(self.driver, RESTART_POLICY, self.clock, self.health.append, rng)
+        service = supervise(self.driver, RestartPolicy(max_delay=0.5), self.clock, self.health.append, rng)
         async with background(service) as task:
             yield task
 

@@ -10,8 +10,7 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import SAFE_DEADLINE
-from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, SAFE_DEADLINE
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.cable import DeviceEnd, PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.probe import probe
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
 from monstertruck_drivers.link import SerialPort
-from monstertruck_drivers.pty_port import PtyPort
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceFaultError,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from monstertruck_drivers.epos.policy import RAD_S_PER_RPM
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM
 from monstertruck_drivers.epos.protocol import Control, State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (

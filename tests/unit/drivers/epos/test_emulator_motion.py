@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from monstertruck_drivers.base import MotorReading
+from monstertruck_drivers.emulation import MotorReading
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger

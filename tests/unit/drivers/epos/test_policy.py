@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.identity import Identity
-from monstertruck_drivers.epos.policy import Odometer, Wanted, drive_mode, settled, wanted
+from monstertruck_drivers.epos.driver import Odometer, Wanted, drive_mode, settled, wanted
+from monstertruck_drivers.epos.exchange import Identity
 from monstertruck_drivers.epos.protocol import State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceMismatchError

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from monstertruck_drivers.hokuyo_urg.identity import (
+from monstertruck_drivers.hokuyo_urg.protocol import line_sum
+from monstertruck_drivers.hokuyo_urg.session import (
     SCIP1_PARAMETERS,
     build_fields,
     parse_fields,
@@ -12,7 +13,6 @@ from monstertruck_drivers.hokuyo_urg.identity import (
     parse_parameters,
     parse_state,
 )
-from monstertruck_drivers.hokuyo_urg.protocol import line_sum
 from monstertruck_runtime.errors import ProtocolError
 
 VV = [

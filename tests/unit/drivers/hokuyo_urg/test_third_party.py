@@ -25,8 +25,8 @@ import pytest
 from hokuyolx.exceptions import HokuyoStatusException
 from numpy.typing import NDArray
 
-from monstertruck_drivers.base import RangeSource
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import RangeSource
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_runtime.clock import WallClock
 from monstertruck_sim.world.config import WorldConfig

@@ -3,8 +3,8 @@
 import pytest
 
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
+from monstertruck_drivers.link_quality.driver import LinkJudge
 from monstertruck_drivers.link_quality.interfaces import Sample, Signal
-from monstertruck_drivers.link_quality.judge import LinkJudge
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LinkLevel, LinkMedium
 

@@ -5,8 +5,8 @@ from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
 
-from monstertruck_drivers.base import CompassReading
 from monstertruck_drivers.cable import EmulatedPort
+from monstertruck_drivers.emulation import CompassReading
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.driver import Os4000Driver
 from monstertruck_drivers.os4000.emulator import Os4000Emulator

@@ -9,10 +9,8 @@ from typing import Any
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
-from monstertruck_drivers.usb.hub import HubCoordinator
-from monstertruck_drivers.usb.port import HubPort
-from monstertruck_drivers.usb.power import PortPower
-from monstertruck_drivers.usb.service import UsbService
+from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
+from monstertruck_drivers.usb.port import HubPort, PortPower
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceError
 from monstertruck_schemas.event import Severity

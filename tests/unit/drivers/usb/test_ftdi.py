@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from monstertruck_drivers.usb.emulated import EmulatedUsb
-from monstertruck_drivers.usb.ftdi import LOW_LATENCY, set_latency
+from monstertruck_drivers.usb.port import LOW_LATENCY, set_latency
 from monstertruck_drivers.usb.tree import Node, read_device
 
 

@@ -31,7 +31,7 @@ def test_at_rest_nobody_waits_and_nothing_is_told(tmp_path: Path):
             await bench.clock.sleep(20)
             assert all(len(times) == 1 for times in starts.values())
             assert max(times[0] for times in starts.values()) < 1.2, "all at once: no hub came back"
-            assert bench.service.waiting == frozenset()
+            assert bench.hubs.waiting == frozenset()
 
     bench = play(tmp_path, scene)
     assert bench.events.kept == []
@@ -46,7 +46,7 @@ def test_a_hub_with_four_devices_vanishes_and_returns(tmp_path: Path, deaf: bool
             await bench.clock.sleep(3)
             bench.usb.lose_hub("1-1")
             await bench.clock.sleep(2)
-            assert bench.service.waiting == set(FIRST)
+            assert bench.hubs.waiting == set(FIRST)
             assert bench.states()["1-1.1"] is UsbState.WAITING
             assert bench.node("1-1.1").tty is None
             assert bench.hubs.waits_for("drive") == "waits for hub 1-1"
@@ -61,7 +61,7 @@ def test_a_hub_with_four_devices_vanishes_and_returns(tmp_path: Path, deaf: bool
             assert all(later - earlier >= 0.3 - 1e-6 for earlier, later in pairwise(times))
             assert times[-1] < 4, "everything is back within 4 s"
             assert len(starts["compass"]) == 1, "the other hub's device never noticed"
-            assert bench.service.waiting == frozenset()
+            assert bench.hubs.waiting == frozenset()
 
     bench = play(tmp_path, scene)
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
@@ -140,7 +140,7 @@ def test_one_cable_pulled_is_no_hub_event(tmp_path: Path):
             bench.usb.unplug("1-1.1")
             await bench.clock.sleep(1)
             assert bench.states()["1-1.1"] is UsbState.ABSENT
-            assert bench.service.waiting == frozenset()
+            assert bench.hubs.waiting == frozenset()
             bench.usb.plug("1-1.1")
             await bench.clock.sleep(1)
             assert [len(starts[role]) for role in FIRST] == [2, 1, 1, 1]
@@ -155,7 +155,7 @@ def test_a_quick_replug_of_one_device_counts(tmp_path: Path):
         bench.usb.unplug("1-1.3")
         bench.usb.plug("1-1.3")
         await bench.clock.sleep(1)
-        assert bench.service.waiting == frozenset()
+        assert bench.hubs.waiting == frozenset()
 
     bench = play(tmp_path, scene)
     assert bench.node("1-1.3").replugs == 1
@@ -168,7 +168,7 @@ def test_a_hub_that_stays_but_loses_all_devices_is_one_event(tmp_path: Path):
             bench.usb.unplug(name)
             await bench.clock.sleep(0.06)
         await bench.clock.sleep(1)
-        assert bench.service.waiting == set(FIRST)
+        assert bench.hubs.waiting == set(FIRST)
         for name in ("1-1.1", "1-1.3", "1-1.4", "1-1.2"):
             bench.usb.plug(name)
         await bench.clock.sleep(3)
@@ -184,7 +184,7 @@ def test_the_only_device_of_a_hub_is_not_the_hub(tmp_path: Path):
         await bench.clock.sleep(1)
         bench.usb.unplug("1-2.1")
         await bench.clock.sleep(1)
-        assert bench.service.waiting == frozenset()
+        assert bench.hubs.waiting == frozenset()
 
     assert play(tmp_path, scene).events.kept == []
 
@@ -195,7 +195,7 @@ def test_a_hub_with_one_device_is_a_hub(tmp_path: Path):
         await bench.clock.sleep(1)
         bench.usb.lose_hub("1-2")
         await bench.clock.sleep(1)
-        assert bench.service.waiting == {"compass"}
+        assert bench.hubs.waiting == {"compass"}
 
     assert play(tmp_path, scene).events.of(Reason.HUB_LOST)[0][3] == {"hub": "1-2", "devices": 1, "roles": "compass"}
 
@@ -214,10 +214,10 @@ def test_both_hubs_at_once_are_one_event_of_what_they_hang_on(tmp_path: Path):
         bench.usb.lose_hub("1-1")
         bench.usb.lose_hub("1-2")
         await bench.clock.sleep(1)
-        assert bench.service.waiting == set(PORTS)
+        assert bench.hubs.waiting == set(PORTS)
         await bench.usb.return_hub("usb1", bench.clock)
         await bench.clock.sleep(3)
-        assert bench.service.waiting == frozenset()
+        assert bench.hubs.waiting == frozenset()
 
     bench = play(tmp_path, scene)
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
@@ -274,7 +274,7 @@ def test_a_hub_lost_again_during_the_staggered_start(tmp_path: Path):
             assert [len(starts[role]) for role in ("drive", "steering", "lidar", "stabiliser")] == [2, 2, 1, 1]
             bench.usb.lose_hub("1-1")
             await bench.clock.sleep(5)
-            assert bench.service.waiting == set(FIRST)
+            assert bench.hubs.waiting == set(FIRST)
             await bench.usb.return_hub("1-1", bench.clock)
             await bench.clock.sleep(3)
             assert [len(starts[role]) for role in ("drive", "steering", "lidar", "stabiliser")] == [3, 3, 2, 2]
@@ -289,7 +289,7 @@ def test_who_does_not_come_back_is_named_and_waits_no_longer(tmp_path: Path):
         await bench.clock.sleep(1)
         await bench.usb.return_hub("1-1", bench.clock)
         await bench.clock.sleep(3)
-        assert bench.service.waiting == frozenset()
+        assert bench.hubs.waiting == frozenset()
         assert bench.states()["1-1.4"] is UsbState.ABSENT
         bench.usb.plug("1-1.4")
         await bench.clock.sleep(0.2)
@@ -310,9 +310,9 @@ def test_a_hub_that_comes_back_empty_frees_its_devices_after_a_while(tmp_path: P
         await bench.clock.sleep(1)
         await bench.usb.return_hub("1-1", bench.clock)
         await bench.clock.sleep(2)
-        assert bench.service.waiting == set(FIRST), "devices may need longer than their hub"
+        assert bench.hubs.waiting == set(FIRST), "devices may need longer than their hub"
         await bench.clock.sleep(2)
-        assert bench.service.waiting == frozenset()
+        assert bench.hubs.waiting == frozenset()
 
     assert play(tmp_path, scene).events.of(Reason.HUB_RETURNED)[0][3]["missing"] == 4
 
@@ -322,7 +322,7 @@ def test_a_hub_that_is_new_starts_its_devices_one_by_one_too(tmp_path: Path):
         bench.usb.unplug("1-1")
         async with bench.watching(), bench.drivers(*FIRST) as starts:
             await bench.clock.sleep(5)
-            assert bench.service.waiting == frozenset(), "a hub that never was is an unplugged device, not an outage"
+            assert bench.hubs.waiting == frozenset(), "a hub that never was is an unplugged device, not an outage"
             assert {node.state for node in bench.out.kept[-1].nodes if node.role in FIRST} == {UsbState.ABSENT}
             await bench.usb.return_hub("1-1", bench.clock)
             await bench.clock.sleep(4)
@@ -338,13 +338,13 @@ def test_without_the_service_nobody_waits(tmp_path: Path):
         async with bench.watching():
             bench.usb.lose_hub("1-1")
             await bench.clock.sleep(1)
-            waiting = asyncio.create_task(bench.service.gate_start("lidar"))
+            waiting = asyncio.create_task(bench.hubs.wait_to_start("lidar"))
             await bench.clock.sleep(1)
             assert not waiting.done()
         await waiting
         assert bench.hubs.waiting == frozenset()
         assert bench.usb.watcher._hint is None
-        await bench.service.gate_start("no such role")
+        await bench.hubs.wait_to_start("no such role")
 
     play(tmp_path, scene, watched=False)
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers.cable import MemoryPort
-from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.cable import MemoryPort, PtyPort
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.port import OPEN_PATIENCE, HubNode, HubPort

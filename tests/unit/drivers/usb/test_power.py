@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from monstertruck_drivers.computer import run_command
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig
-from monstertruck_drivers.usb.machine import run_command
 from monstertruck_drivers.usb.tree import port_directory
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import BusyError, DeviceError

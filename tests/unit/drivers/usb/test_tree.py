@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monstertruck_drivers.usb.sysfs import Sysfs
+from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.usb.tree import (
     DEVICES,
     ancestors,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from monstertruck_drivers.usb.watch import SUBSYSTEMS, NoWatcher, UdevWatcher, open_watcher
+from monstertruck_drivers.computer import SUBSYSTEMS, NoWatcher, UdevWatcher, open_watcher
 
 
 class Monitor:

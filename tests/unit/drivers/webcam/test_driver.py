@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_drivers.cable import EmulatedPort, MemoryPort
-from monstertruck_drivers.pty_port import PtyPort
+from monstertruck_drivers.cable import EmulatedPort, MemoryPort, PtyPort
 from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.driver import WebcamDriver
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_drivers.webcam.packets import Kind, Packet, encode_mode
-from monstertruck_drivers.webcam.path_source import PathSource
-from monstertruck_drivers.webcam.rendered_source import RenderedSource
+from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSource
 from monstertruck_drivers.webcam.source import FrameSource, Mode
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_drivers.webcam.jpeg import TABLES_SEGMENT, complete
+from monstertruck_drivers.webcam.driver import TABLES_SEGMENT, complete
 from tests.unit.drivers.webcam.pictures import bare, picture, pixels
 
 

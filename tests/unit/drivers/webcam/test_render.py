@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from monstertruck_drivers.webcam.jpeg import complete
-from monstertruck_drivers.webcam.render import FONT_SIZE, Renderer
+from monstertruck_drivers.webcam.driver import complete
+from monstertruck_drivers.webcam.emulator import FONT_SIZE, Renderer
 from monstertruck_drivers.webcam.source import Mode
 from tests.unit.drivers.webcam.pictures import pixels
 

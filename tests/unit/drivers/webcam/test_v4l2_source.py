@@ -7,8 +7,8 @@ import threading
 import pytest
 
 from monstertruck_drivers.webcam import v4l2
-from monstertruck_drivers.webcam.path_source import PathSource
 from monstertruck_drivers.webcam.probe import probe
+from monstertruck_drivers.webcam.rendered_source import PathSource
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source, find_node
 from monstertruck_runtime.clock import WallClock

@@ -9,9 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from monstertruck_drivers.computer import Machine, Sysfs
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.machine import Machine
-from monstertruck_drivers.usb.sysfs import Sysfs
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree

@@ -2,7 +2,7 @@
 
 import sys
 
-from monstertruck_drivers.base import Trail
+from monstertruck_drivers.emulation import Trail
 
 
 def test_a_trail_keeps_the_newest_bytes_and_is_small():
