@@ -12,14 +12,15 @@ from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.fusion.config import AnyOdometry
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_kinematics.chassis import Chassis, build_chassis
+from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
 from monstertruck_planners.track.config import STEERING_MODES
+from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.body import BodyConfig, TruckBody
+from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.gate.config import GateConfig
@@ -88,7 +89,7 @@ class TruckConfig(Schema):
     version: Literal[1]
     robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = "truck"
     """Name of this robot in every key"""
-    body: BodyConfig = TruckBody()
+    body: AnyBody = TruckBody()
     """Kind of robot, with what only this kind has"""
     geometry: Geometry = Geometry()
     devices: Devices
@@ -127,12 +128,9 @@ class TruckConfig(Schema):
             KinematicsError: dimensions no robot can have.
         """
         geometry = self.geometry
-        return build_chassis(
-            wheelbase=geometry.wheelbase,
-            track=geometry.track,
-            drivetrain=DriveTrain(geometry.drive_ratio, geometry.wheel_radius),
-            **self.body.model_dump(),
-        )
+        drivetrain = DriveTrain(geometry.drive_ratio, geometry.wheel_radius)
+        chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, geometry.wheelbase, geometry.track))
+        return chassis
 
     @property
     def calibration_folder(self) -> Path:

@@ -230,75 +230,139 @@ class IndependentChassis(Chassis):
         return self.family.forward((*self.bicycle.wheel_angles(front, rear), *pace))
 
 
-def build_chassis(
-    kind: str,
-    *,
-    wheelbase: float = 0.32,
-    track: float = 0.26,
-    drivetrain: DriveTrain,
-    polynomials: PolynomialSet = "corrected",
-    driven: Literal["front", "rear"] = "rear",
+# Builders: a body of the configuration names one of these
+
+
+@dataclass(frozen=True, slots=True)
+class Dimensions:
+    """What every robot has, whatever its body."""
+
+    drivetrain: DriveTrain
+    """Motor to wheel, the same for every shaft."""
+    wheelbase: float = 0.32
+    """Between the axles, m; of a body without them, the length of its equivalent bicycle."""
+    track: float = 0.26
+    """Between left and right wheels, m."""
+    polynomials: PolynomialSet = "corrected"
+    """Linkage of the truck's axles."""
+
+    @property
+    def centred(self) -> FourWheelSteering:
+        """The bicycle whose base point lies in the middle between its axles."""
+        return FourWheelSteering(self.wheelbase, self.track)
+
+    @property
+    def linkage(self) -> SteeringPolynomials:
+        """Servo to axle."""
+        return SteeringPolynomials.named(self.polynomials)
+
+
+def truck_chassis(size: Dimensions) -> Chassis:
+    """Two steered axles, one motor for all four wheels."""
+    return TruckChassis(size.centred, size.drivetrain, ("drive",), "both", size.linkage)
+
+
+def independent_chassis(size: Dimensions) -> Chassis:
+    """Two steered axles, a motor in every wheel."""
+    wheels = IndependentSteer(size.centred.wheel_positions, size.drivetrain.wheel_radius)
+    return IndependentChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", size.linkage, wheels)
+
+
+def synchro_chassis(size: Dimensions) -> Chassis:
+    """Wheels that roll and turn together."""
+    family = Synchro(size.drivetrain.wheel_radius)
+    return SynchroChassis(size.centred, size.drivetrain, ("roll",), "parallel", DIRECT, family)
+
+
+def ackermann_chassis(size: Dimensions) -> Chassis:
+    """A car."""
+    return _steered_front(size, size.linkage, Ackermann(size.wheelbase, size.track, size.drivetrain.wheel_radius))
+
+
+def bicycle_chassis(size: Dimensions, driven: Literal["front", "rear"] = "rear") -> Chassis:
+    """One steered front wheel, one fixed rear wheel.
+
+    Args:
+        size: the robot's.
+        driven: wheel that the motor drives.
+    """
+    return _steered_front(size, DIRECT, Bicycle(size.wheelbase, driven, size.drivetrain.wheel_radius))
+
+
+def tricycle_chassis(size: Dimensions, driven: Literal["front", "rear"] = "front") -> Chassis:
+    """One steered front wheel, two fixed rear wheels.
+
+    Args:
+        size: the robot's.
+        driven: axle that the motor drives.
+    """
+    return _steered_front(
+        size, DIRECT, Tricycle(size.wheelbase, driven, size.drivetrain.wheel_radius, track=size.track)
+    )
+
+
+def _steered_front(size: Dimensions, steering: SteeringPolynomials, family: Drive) -> Chassis:
+    return FamilyChassis(size.centred, size.drivetrain, ("drive",), "front", steering, family, origin=-size.centred.l_r)
+
+
+def differential_chassis(size: Dimensions) -> Chassis:
+    """Two driven wheels beside the base point."""
+    return _driven_sides(size, Differential(size.drivetrain.wheel_radius, size.track))
+
+
+def skid_steer_chassis(
+    size: Dimensions,
     icr_left: float | None = None,
     icr_right: float | None = None,
     icr_x: float = 0.0,
     gain_left: float = 1.0,
     gain_right: float = 1.0,
-    circle: float = 0.2,
-    count: int = 3,
 ) -> Chassis:
-    """A chassis by the name of its family.
+    """Left and right wheels that turn the body by skidding.
 
     Args:
-        kind: truck, ackermann, bicycle, tricycle, independent, differential, skid_steer, synchro, omni or mecanum.
-        wheelbase: between the axles, m; of a body without them, the length of its equivalent bicycle.
-        track: m.
-        drivetrain: motor to wheel.
-        polynomials: linkage of truck, ackermann and independent; the other steered bodies turn their wheel by the
-            servo itself.
-        driven: wheel of a bicycle or tricycle.
-        icr_left: of a skid-steer drive, m; None = half the track.
-        icr_right: likewise; None = minus half the track.
-        icr_x: of a skid-steer drive, m, 0 to -wheelbase.
-        gain_left: of a skid-steer drive.
-        gain_right: of a skid-steer drive.
-        circle: of an omni drive, m.
-        count: of an omni drive's wheels.
+        size: the robot's.
+        icr_left: lateral position of the left side's turning centre, m; None = half the track.
+        icr_right: of the right side's, m; None = minus half the track.
+        icr_x: longitudinal position of both, m, 0 to -wheelbase.
+        gain_left: effective over nominal radius of the left wheels.
+        gain_right: of the right wheels.
 
     Raises:
-        KinematicsError: no such family, or dimensions no robot can have.
+        KinematicsError: no robot can have these.
     """
-    radius = drivetrain.wheel_radius
-    centred = FourWheelSteering(wheelbase, track)
-    linkage = SteeringPolynomials.named(polynomials)
-    if kind == "truck":
-        return TruckChassis(centred, drivetrain, ("drive",), "both", linkage)
-    if kind == "independent":
-        wheels = IndependentSteer(centred.wheel_positions, radius)
-        return IndependentChassis(centred, drivetrain, WHEEL_NAMES, "both", linkage, wheels)
-    if kind == "synchro":
-        return SynchroChassis(centred, drivetrain, ("roll",), "parallel", DIRECT, Synchro(radius))
-    if kind in ("ackermann", "bicycle", "tricycle"):
-        family: Drive = Ackermann(wheelbase, track, radius)
-        if kind == "bicycle":
-            family = Bicycle(wheelbase, driven, radius)
-        elif kind == "tricycle":
-            family = Tricycle(wheelbase, driven, radius, track=track)
-        steering = linkage if kind == "ackermann" else DIRECT
-        return FamilyChassis(centred, drivetrain, ("drive",), "front", steering, family, origin=-centred.l_r)
-    if kind in ("differential", "skid_steer"):
-        family = Differential(radius, track)
-        if kind == "skid_steer":
-            left = track / 2 if icr_left is None else icr_left
-            right = -track / 2 if icr_right is None else icr_right
-            family = SkidSteer(radius, left, right, icr_x, gain_left, gain_right)
-            if not -wheelbase <= icr_x <= 0.0:
-                raise KinematicsError(f"icr_x is {icr_x}: expected {-wheelbase:g} to 0, measured from the base")
-        bicycle = FourWheelSteering(wheelbase, track, 1.0 + icr_x / wheelbase)
-        return FamilyChassis(bicycle, drivetrain, ("left", "right"), "front", None, family, 1.0 / radius)
-    if kind in ("omni", "mecanum"):
-        family = omni(circle, radius, count) if kind == "omni" else mecanum(wheelbase, track, radius)
-        return FamilyChassis(centred, drivetrain, family.inputs, "both", None, family, 1.0 / radius)
-    raise KinematicsError(
-        f"body {kind!r}: expected truck, ackermann, bicycle, tricycle, independent, differential, skid_steer, "
-        "synchro, omni or mecanum"
+    left = size.track / 2 if icr_left is None else icr_left
+    right = -size.track / 2 if icr_right is None else icr_right
+    family = SkidSteer(size.drivetrain.wheel_radius, left, right, icr_x, gain_left, gain_right)
+    if not -size.wheelbase <= icr_x <= 0.0:
+        raise KinematicsError(f"icr_x is {icr_x}: expected {-size.wheelbase:g} to 0, measured from the base")
+    return _driven_sides(size, family, icr_x)
+
+
+def _driven_sides(size: Dimensions, family: Drive, icr_x: float = 0.0) -> Chassis:
+    bicycle = FourWheelSteering(size.wheelbase, size.track, 1.0 + icr_x / size.wheelbase)
+    return FamilyChassis(
+        bicycle, size.drivetrain, ("left", "right"), "front", None, family, 1.0 / size.drivetrain.wheel_radius
+    )
+
+
+def omni_chassis(size: Dimensions, circle: float = 0.2, count: int = 3) -> Chassis:
+    """Driven Swedish wheels on a circle.
+
+    Args:
+        size: the robot's.
+        circle: its radius, m.
+        count: of the wheels.
+    """
+    return _driven_wheels(size, omni(circle, size.drivetrain.wheel_radius, count))
+
+
+def mecanum_chassis(size: Dimensions) -> Chassis:
+    """Four driven mecanum wheels."""
+    return _driven_wheels(size, mecanum(size.wheelbase, size.track, size.drivetrain.wheel_radius))
+
+
+def _driven_wheels(size: Dimensions, family: Drive) -> Chassis:
+    return FamilyChassis(
+        size.centred, size.drivetrain, family.inputs, "both", None, family, 1.0 / size.drivetrain.wheel_radius
     )

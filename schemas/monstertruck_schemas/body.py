@@ -38,19 +38,25 @@ class Mount(Schema):
         return self.x, self.y, self.yaw
 
 
-class TruckBody(Schema):
+class BodyConfig(Schema):
+    """What only one kind of body has; each kind is a subclass."""
+
+    kind: str
+
+
+class TruckBody(BodyConfig):
     """Two steered axles, one motor for all four wheels."""
 
     kind: Literal["truck"] = "truck"
 
 
-class AckermannBody(Schema):
+class AckermannBody(BodyConfig):
     """A car: steered front axle, fixed rear axle with the motor; the front servo steers."""
 
     kind: Literal["ackermann"]
 
 
-class BicycleBody(Schema):
+class BicycleBody(BodyConfig):
     """One steered front wheel, one fixed rear wheel; the front servo steers."""
 
     kind: Literal["bicycle"]
@@ -58,7 +64,7 @@ class BicycleBody(Schema):
     """Wheel that the motor drives"""
 
 
-class TricycleBody(Schema):
+class TricycleBody(BodyConfig):
     """One steered front wheel, two fixed rear wheels; the front servo steers."""
 
     kind: Literal["tricycle"]
@@ -66,19 +72,19 @@ class TricycleBody(Schema):
     """Axle that the motor drives"""
 
 
-class IndependentBody(Schema):
+class IndependentBody(BodyConfig):
     """Two steered axles with ideal linkages, a motor in every wheel: front left, front right, rear left, rear right."""
 
     kind: Literal["independent"]
 
 
-class DifferentialBody(Schema):
+class DifferentialBody(BodyConfig):
     """Two driven wheels (left, right) beside the base point, and casters; nothing is steered."""
 
     kind: Literal["differential"]
 
 
-class SkidSteerBody(Schema):
+class SkidSteerBody(BodyConfig):
     """Left and right wheels driven side by side (left, right), turning by skidding; parameters as identified."""
 
     kind: Literal["skid_steer"]
@@ -94,13 +100,13 @@ class SkidSteerBody(Schema):
     """Effective over nominal radius of the right wheels"""
 
 
-class SynchroBody(Schema):
+class SynchroBody(BodyConfig):
     """Wheels that roll (one motor) and turn (the front servo) together; the body keeps its heading."""
 
     kind: Literal["synchro"]
 
 
-class OmniBody(Schema):
+class OmniBody(BodyConfig):
     """Driven 90-degree Swedish wheels on a circle, counter-clockwise from the one straight ahead."""
 
     kind: Literal["omni"]
@@ -110,22 +116,7 @@ class OmniBody(Schema):
     """Wheels"""
 
 
-class MecanumBody(Schema):
+class MecanumBody(BodyConfig):
     """Four driven mecanum wheels: front left, front right, rear left, rear right."""
 
     kind: Literal["mecanum"]
-
-
-BodyConfig = Annotated[
-    TruckBody
-    | AckermannBody
-    | BicycleBody
-    | TricycleBody
-    | IndependentBody
-    | DifferentialBody
-    | SkidSteerBody
-    | SynchroBody
-    | OmniBody
-    | MecanumBody,
-    Field(discriminator="kind"),
-]

@@ -8,10 +8,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_kinematics.chassis import Chassis, build_chassis
+from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_schemas.base import Pose2D, Schema
-from monstertruck_schemas.body import BodyConfig, TruckBody
+from monstertruck_schemas.body import TruckBody
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -75,7 +76,7 @@ class TruckConfig(Schema):
     Both carry a slow random part. A wheel that is not steered rolls along its own axis.
     """
 
-    body: BodyConfig = TruckBody()
+    body: AnyBody = TruckBody()
     """Kind of robot, as the daemon's own ``body``"""
     dynamics: Literal["kinematic", "single_track"] = "kinematic"
     """How tyres hold a body with steered axles: by their slip angles, or with the inertia of the single-track model
@@ -123,13 +124,9 @@ class TruckConfig(Schema):
         Raises:
             KinematicsError: dimensions no robot can have.
         """
-        return build_chassis(
-            wheelbase=self.wheelbase,
-            track=self.track,
-            drivetrain=DriveTrain(self.motor.ratio, self.wheel_radius),
-            polynomials=self.steering,
-            **self.body.model_dump(),
-        )
+        drivetrain = DriveTrain(self.motor.ratio, self.wheel_radius)
+        chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, self.wheelbase, self.track, self.steering))
+        return chassis
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Self:

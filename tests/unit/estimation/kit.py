@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
@@ -13,7 +13,7 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, Stee
 STEERING = FourWheelSteering()
 DRIVETRAIN = DriveTrain()
 LINKAGE = SteeringPolynomials()
-CHASSIS = build_chassis("truck", drivetrain=DRIVETRAIN)
+CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
 
 
 def drive_feedback(now, position, velocity=0.0):

@@ -5,9 +5,10 @@ import math
 import pytest
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions
 from monstertruck_kinematics.motion import integrate
 from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.bodies import BODIES
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.kit import drive_feedback, servo_feedback
 
@@ -24,7 +25,7 @@ class Robot:
     """Shafts that turn as asked; the i-th is read i times 12 ms late in each round of 50 ms."""
 
     def __init__(self, kind, **parameters):
-        self.chassis = build_chassis(kind, drivetrain=DRIVETRAIN, **parameters)
+        self.chassis = BODIES[kind].implementation_class()(Dimensions(DRIVETRAIN), **parameters)
         self.reckoning = DeadReckoning(OdometryConfig(compass=None), self.chassis)
         self.now, self.pose = SECOND, (0.0, 0.0, 0.0)
         self.turns = [1000.0 * i for i in range(len(self.chassis.shafts))]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_estimation.odometry import OdometryService, PlanarCovariance
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_runtime.clock import SECOND, run_virtual
 from tests.unit.estimation.kit import DRIVETRAIN, Truck, drive_feedback, heading, servo_feedback, spread
 
@@ -157,9 +157,7 @@ def test_without_a_compass_the_heading_drifts_with_it_it_stays_bounded():
     drifting = Truck(compass=None)
     held = Truck(compass_error=noisy(math.radians(0.5)))
     for truck in (drifting, held):
-        truck.reckoning._wheels._chassis = build_chassis(
-            "truck", wheelbase=0.34, drivetrain=DRIVETRAIN
-        )  # a wrong wheelbase
+        truck.reckoning._wheels._chassis = truck_chassis(Dimensions(DRIVETRAIN, wheelbase=0.34))  # a wrong wheelbase
         lap(truck, laps=5)
     assert drifting.error()[1] > 0.3
     assert held.error()[1] < math.radians(5)

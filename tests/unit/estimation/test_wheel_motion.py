@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.wheel_motion import WheelMotion, way_covariance
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions, truck_chassis
+from monstertruck_runtime.bodies import BODIES
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.kit import DRIVETRAIN, drive_feedback, servo_feedback
 
@@ -36,7 +37,7 @@ def total(chassis, made):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_family_has_a_covariance_that_grows_with_the_way_not_with_the_readings(kind):
-    chassis = build_chassis(kind, drivetrain=DRIVETRAIN)
+    chassis = BODIES[kind].implementation_class()(Dimensions(DRIVETRAIN))
     speeds = 0.2 + 0.02 * np.arange(len(chassis.shafts))
     short, long = rolls(chassis, speeds, 0.1, 10), rolls(chassis, speeds, 0.1, 20)
     one = total(chassis, short)
@@ -48,7 +49,7 @@ def test_every_family_has_a_covariance_that_grows_with_the_way_not_with_the_read
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_noise_of_the_shafts_gives_the_covariance_that_is_told(kind):
     """Monte Carlo: 300 drives of 1 s with noisy shafts, against the sum of the ways' covariances."""
-    chassis = build_chassis(kind, drivetrain=DRIVETRAIN)
+    chassis = BODIES[kind].implementation_class()(Dimensions(DRIVETRAIN))
     rng, speeds = np.random.default_rng(1), np.full(len(chassis.shafts), 0.2)
     made = rolls(chassis, speeds, 0.05, 20)
     told = sum(way_covariance(chassis, roll, SHAFT, 0.0, (0.0, 0.0, 0.0)) for roll in made)
@@ -66,12 +67,12 @@ def test_the_noise_of_the_shafts_gives_the_covariance_that_is_told(kind):
 
 
 def test_the_covariance_of_a_truck_that_stands_is_none():
-    chassis = build_chassis("truck", drivetrain=DRIVETRAIN)
+    chassis = truck_chassis(Dimensions(DRIVETRAIN))
     assert not total(chassis, rolls(chassis, (0.0,), 0.2, 5)).any()
 
 
 def test_an_uncertain_axle_turns_the_truck():
-    chassis = build_chassis("truck", drivetrain=DRIVETRAIN)
+    chassis = truck_chassis(Dimensions(DRIVETRAIN))
     sure, unsure = (
         sum(way_covariance(chassis, roll, SHAFT, angle, (0.0, 0.0, 0.0)) for roll in rolls(chassis, (0.2,), 0.0, 20))
         for angle in (0.0, 0.05)
@@ -82,7 +83,7 @@ def test_an_uncertain_axle_turns_the_truck():
 
 
 def test_positions_that_are_no_numbers_or_not_later_are_left_out():
-    wheels = WheelMotion(build_chassis("truck", drivetrain=DRIVETRAIN), 0.6)
+    wheels = WheelMotion(truck_chassis(Dimensions(DRIVETRAIN)), 0.6)
     assert wheels.observe_drive(drive_feedback(SECOND, 0.0)) is None
     bad = drive_feedback(2 * SECOND, 0.0).model_copy(update={"position": math.nan})
     assert wheels.observe_drive(bad) is None

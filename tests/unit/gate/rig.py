@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
@@ -30,7 +30,7 @@ SENSORS = ("scan", "attitude", "drive", "steering", "battery")
 DRIVETRAIN = DriveTrain()
 LINKAGE = SteeringPolynomials()
 STEERING = FourWheelSteering()
-CHASSIS = build_chassis("truck", drivetrain=DRIVETRAIN)
+CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
 
 
 def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, **config):

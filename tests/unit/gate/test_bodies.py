@@ -2,7 +2,7 @@
 
 import pytest
 
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import Dimensions, differential_chassis
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
@@ -11,7 +11,7 @@ from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
 from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, health, make_gate, scan
 
-DIFFERENTIAL = build_chassis("differential", drivetrain=DRIVETRAIN)
+DIFFERENTIAL = differential_chassis(Dimensions(DRIVETRAIN))
 
 
 class TwoWheels(Rig):

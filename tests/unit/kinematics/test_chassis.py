@@ -7,25 +7,37 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.chassis import build_chassis
+from monstertruck_kinematics.chassis import (
+    Dimensions,
+    ackermann_chassis,
+    bicycle_chassis,
+    differential_chassis,
+    independent_chassis,
+    mecanum_chassis,
+    omni_chassis,
+    skid_steer_chassis,
+    synchro_chassis,
+    tricycle_chassis,
+    truck_chassis,
+)
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import STEEPEST, DriveTrain
 
 DRIVETRAIN = DriveTrain()
 SKID = {"icr_left": 0.2, "icr_right": -0.21, "icr_x": -0.03, "gain_left": 0.98, "gain_right": 0.9}
 BODIES = {
-    "truck": build_chassis("truck", drivetrain=DRIVETRAIN),
-    "independent": build_chassis("independent", drivetrain=DRIVETRAIN),
-    "ackermann": build_chassis("ackermann", drivetrain=DRIVETRAIN),
-    "bicycle": build_chassis("bicycle", drivetrain=DRIVETRAIN),
-    "front-driven bicycle": build_chassis("bicycle", drivetrain=DRIVETRAIN, driven="front"),
-    "tricycle": build_chassis("tricycle", drivetrain=DRIVETRAIN, driven="front"),
-    "differential": build_chassis("differential", drivetrain=DRIVETRAIN),
-    "skid-steer": build_chassis("skid_steer", drivetrain=DRIVETRAIN, **SKID),
-    "synchro": build_chassis("synchro", drivetrain=DRIVETRAIN),
-    "omni": build_chassis("omni", drivetrain=DRIVETRAIN),
-    "omni of four": build_chassis("omni", drivetrain=DRIVETRAIN, count=4, circle=0.15),
-    "mecanum": build_chassis("mecanum", drivetrain=DRIVETRAIN),
+    "truck": truck_chassis(Dimensions(DRIVETRAIN)),
+    "independent": independent_chassis(Dimensions(DRIVETRAIN)),
+    "ackermann": ackermann_chassis(Dimensions(DRIVETRAIN)),
+    "bicycle": bicycle_chassis(Dimensions(DRIVETRAIN)),
+    "front-driven bicycle": bicycle_chassis(Dimensions(DRIVETRAIN), driven="front"),
+    "tricycle": tricycle_chassis(Dimensions(DRIVETRAIN), driven="front"),
+    "differential": differential_chassis(Dimensions(DRIVETRAIN)),
+    "skid-steer": skid_steer_chassis(Dimensions(DRIVETRAIN), **SKID),
+    "synchro": synchro_chassis(Dimensions(DRIVETRAIN)),
+    "omni": omni_chassis(Dimensions(DRIVETRAIN)),
+    "omni of four": omni_chassis(Dimensions(DRIVETRAIN), count=4, circle=0.15),
+    "mecanum": mecanum_chassis(Dimensions(DRIVETRAIN)),
 }
 every_body = pytest.mark.parametrize("chassis", BODIES.values(), ids=BODIES)
 
@@ -116,14 +128,13 @@ def test_only_steered_axles_limit_the_reach():
 
 
 @pytest.mark.parametrize(
-    ("kind", "parameters", "complaint"),
+    ("build", "parameters", "complaint"),
     [
-        ("hovercraft", {}, "body 'hovercraft': expected truck, ackermann"),
-        ("skid_steer", {"icr_x": 0.1}, r"icr_x is 0\.1: expected -0\.32 to 0"),
-        ("skid_steer", {"icr_left": -0.3}, "icr_left is -0.3"),
-        ("differential", {"track": -1.0}, "track"),
+        (skid_steer_chassis, {"icr_x": 0.1}, r"icr_x is 0\.1: expected -0\.32 to 0"),
+        (skid_steer_chassis, {"icr_left": -0.3}, "icr_left is -0.3"),
+        (differential_chassis, {"size": Dimensions(DRIVETRAIN, track=-1.0)}, "track"),
     ],
 )
-def test_bodies_nobody_can_build(kind, parameters, complaint):
+def test_bodies_nobody_can_build(build, parameters, complaint):
     with pytest.raises(KinematicsError, match=complaint):
-        build_chassis(kind, drivetrain=DRIVETRAIN, **parameters)
+        build(**{"size": Dimensions(DRIVETRAIN)} | parameters)

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.chassis import TruckChassis, build_chassis
+from monstertruck_kinematics.chassis import Dimensions, TruckChassis, truck_chassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.calibrate.steering import Reach, _directions, _rough
 from monstertruckd.tools.calibrate.steering_model import Leg, Maps, SteeringModel, half_widths
 
-CHASSIS = build_chassis("truck", drivetrain=DriveTrain())
+CHASSIS = truck_chassis(Dimensions(DriveTrain()))
 assert isinstance(CHASSIS, TruckChassis)
 MODEL = SteeringModel(CHASSIS)
 BELIEVED = Maps((1439.2, 1439.2), (-10.48, -10.48))
