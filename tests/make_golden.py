@@ -14,8 +14,8 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruckd import __version__
 from monstertruckd.config.load import load_tree
 from monstertruckd.tools.demo.fast import run_fast_demo
-from monstertruckd.tools.logs.info import info
 from monstertruckd.tools.logs.report.collect import collect
+from monstertruckd.tools.logs.summary import info
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = ROOT / "tests" / "data" / "golden"

@@ -21,7 +21,7 @@ from monstertruck_schemas.req import GoalRequest, Order, Role
 from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.wall import write_overlay
-from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig

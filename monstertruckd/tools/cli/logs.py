@@ -15,7 +15,7 @@ from monstertruckd.tools.cli.options import complete_topic
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.logs.selection import Progress, Selection
+    from monstertruckd.tools.logs.messages import Progress, Selection
 
 app = command_group("Look inside, repair and export logs (MCAP).")
 
@@ -44,7 +44,7 @@ def list_command(
     json_output: JsonOption = False,
 ) -> None:
     """The logs of a folder: when, how long, how much, finished or not."""
-    from monstertruckd.tools.logs.listing import LogState, list_logs
+    from monstertruckd.tools.logs.summary import LogState, list_logs
 
     logs = list_logs(folder)
     if json_output:
@@ -76,7 +76,7 @@ def list_command(
 def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     """What a log holds: topics, counts, rates, attachments, damage."""
     from monstertruckd.recorder.repair import in_use
-    from monstertruckd.tools.logs.info import info
+    from monstertruckd.tools.logs.summary import info
 
     summary = info(log)
     if json_output:
@@ -148,7 +148,7 @@ def export_command(
     json_output: JsonOption = False,
 ) -> None:
     """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
-    from monstertruckd.tools.logs.selection import Selection
+    from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
     with needs_extra("logs"):
@@ -173,12 +173,11 @@ def view_command(
     end: EndOption = None,
 ) -> None:
     """Show a log in the rerun viewer, laid out, without any network (extra `view`)."""
-    from monstertruckd.tools.logs.selection import Selection
+    from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
     with needs_extra("view"):
-        from monstertruckd.tools.logs.rerun_log import convert
-        from monstertruckd.tools.logs.view import show
+        from monstertruckd.tools.logs.rerun_view import convert, show
     with TemporaryDirectory(prefix="monstertruckd-") as scratch:
         recording = save or Path(scratch) / f"{log.stem}.rrd"
         with _reading("convert", log) as done:
@@ -205,7 +204,7 @@ def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress]
         case ExportFormat.ROS2:
             from monstertruckd.tools.logs.ros2 import export_ros2 as export
         case ExportFormat.MCAP:
-            from monstertruckd.tools.logs.wall_mcap import export_mcap as export
+            from monstertruckd.tools.logs.export import export_mcap as export
     return export
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
 
 GOAL_CLOSING = 0.3

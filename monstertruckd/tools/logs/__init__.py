@@ -1,1 +1,1 @@
-"""What is made of logs: lists, summaries, exports, reports, pictures, replays."""
+"""Tools on logs: lists, summaries, exports, reports, viewers, replay."""

@@ -1,22 +1,48 @@
-"""Export of logs for spreadsheets (CSV) and numpy (NPZ): one file per topic, one column per field."""
+"""Export of logs: CSV for spreadsheets, NPZ for numpy, MCAP in UNIX time for viewers that show dates.
+
+The recorder cannot write UNIX time: a robot without a real-time clock learns the date after its first messages, and a
+viewer looks up transforms by the stamps inside them, so log times and stamps must be of one clock.
+"""
 
 import csv
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
+from mcap.records import Attachment, Header, Metadata
+from mcap.writer import Writer
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.state import ClockOffset
+from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.recorder.log_file import Channels
 from monstertruckd.recorder.reader import LogReader
-from monstertruckd.tools.logs.selection import ALL, Progress, Selection
-from monstertruckd.tools.logs.unfinished import removed_on_failure
-from monstertruckd.tools.logs.wall_time import real_offset
+from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
+
+
+@contextmanager
+def removed_on_failure() -> Iterator[list[Path]]:
+    """Yields a list; the files and folders added to it are removed if the body fails."""
+    made: list[Path] = []
+    try:
+        yield made
+    except BaseException:
+        for path in made:
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        raise
+
 
 _LOG_TIME, _REAL_TIME = "log_time", "real_time"
 
@@ -26,9 +52,9 @@ def export_csv(
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.csv`` for every topic that has messages.
 
-    Nested records get dotted columns; arrays and lists stand in one cell as JSON; absent values are empty. Pictures
-    become files of a folder beside the table, which names them. ``log_time`` is daemon time, ns; ``real_time`` the
-    calendar's (UTC).
+    Nested records get dotted columns; arrays and lists are JSON in one cell; absent values are empty. Pictures
+    are saved as files in a folder next to the table, which names them. ``log_time`` is daemon time, ns; ``real_time``
+    UTC.
 
     Returns:
         The files by topic.
@@ -55,10 +81,10 @@ def export_npz(
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
 
-    Absent numbers are NaN. Arrays of equal length are stacked to shape (messages, length); others are laid end
-    to end, with their lengths in ``<column>.lengths``. Text, lists and mappings are strings (lists as JSON).
-    Pictures become files of a folder beside the table, which names them. ``log_time`` is daemon time, ``real_time``
-    UNIX time, both in ns.
+    Absent numbers are NaN. Arrays of equal length are stacked to shape (messages, length); others are
+    concatenated, with their lengths in ``<column>.lengths``. Text, lists and mappings are strings (lists as JSON).
+    Pictures are saved as files in a folder next to the table, which names them. ``log_time`` is daemon time,
+    ``real_time`` UNIX time, both in ns.
 
     Returns:
         The files by topic.
@@ -86,7 +112,7 @@ def export_npz(
 
 @contextmanager
 def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
-    """Says where to write a topic's table; all get their names, noted in ``files``, once all are whole."""
+    """Yields a function from topic to file to write; all get their final names, in ``files``, once all are complete."""
     with removed_on_failure() as parts:
 
         def place(topic: str) -> Path:
@@ -135,7 +161,7 @@ def _save(data: bytes, directory: Path, name: str) -> str:
 
 
 def _flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
-    """Columns of a record; the same for every message of a model, present or not."""
+    """Columns of a record; the same for all messages of a model."""
     row: dict[str, Any] = {}
     for name, field in model.model_fields.items():
         value = None if record is None else getattr(record, name)
@@ -180,3 +206,81 @@ def _column(name: str, values: list[Any]) -> dict[str, NDArray[Any]]:
             return {name: np.array([np.nan if value is None else value for value in values], np.float64)}
         return {name: np.array(values)}
     return {name: np.array(["" if value is None else str(_cell(value)) for value in values])}
+
+
+S = TypeVar("S", bound=Schema)
+
+_TIME_FIELDS: Final = {"stamp", "received", "since", "gate_stamp"}
+"""Fields with daemon time, in messages and nested records."""
+
+
+def export_mcap(
+    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> dict[str, Path]:
+    """Write the selected messages to a new file with log times, stamps and headers in UNIX time.
+
+    Returns:
+        The file by topic.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, a message in it is invalid, or the file exists or cannot be written.
+    """
+    reader = LogReader(Path(path))
+    offset = real_offset(reader)
+    topics: dict[str, Path] = {}
+    file = Path(output)
+    try:
+        with removed_on_failure() as made, file.open("xb") as stream:
+            made.append(file)
+            writer = Writer(stream)
+            _copy_preamble(writer, reader, offset)
+            channels = Channels(writer)
+            for entry, message in selection.of(reader, progress):
+                topic = BY_NAME[entry.topic]
+                topics[entry.topic] = file
+                payload = wire.encode(topic, in_unix_time(message, offset))
+                at, stamp = entry.log_time + offset, max(0, message.stamp + offset)
+                writer.add_message(channels.of(topic), at, payload, stamp, entry.sequence)
+            writer.finish()  # type: ignore[no-untyped-call]
+    except FileExistsError:
+        msg = f"{file}: is there already"
+        raise InputError(msg) from None
+    except OSError as error:
+        msg = f"{file}: cannot be written: {error.strerror}"
+        raise InputError(msg) from error
+    return topics
+
+
+def in_unix_time(record: S, offset: int) -> S:
+    """The record with all its times shifted by ``offset`` ns; a clock offset becomes the remaining difference."""
+    changes: dict[str, Any] = {}
+    for name in type(record).model_fields:
+        value = getattr(record, name)
+        if name in _TIME_FIELDS and value is not None:
+            changes[name] = value + offset
+        elif isinstance(value, Schema):
+            changes[name] = in_unix_time(value, offset)
+        elif isinstance(value, tuple) and value and isinstance(value[0], Schema):
+            changes[name] = tuple(in_unix_time(item, offset) for item in value)
+    if isinstance(record, ClockOffset):
+        changes["offset"] = record.offset - offset
+    return record.model_copy(update=changes)
+
+
+def _copy_preamble(writer: Writer, reader: LogReader, offset: int) -> None:
+    """Copy header, attachments and metadata."""
+    library = ""
+    records: list[Attachment | Metadata] = []
+    for record in reader.preamble():
+        if isinstance(record, Header):
+            library = record.library
+        elif isinstance(record, Attachment | Metadata):
+            records.append(record)
+    writer.start(library=library)
+    for record in records:
+        if isinstance(record, Metadata):
+            writer.add_metadata(record.name, dict(record.metadata) | {"real_offset_ns": "0", "moved_ns": str(offset)})
+        else:
+            at = record.log_time + offset
+            writer.add_attachment(at, at, record.name, record.media_type, record.data)

@@ -13,7 +13,7 @@ from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.tools.logs.wall_time import first_offset
+from monstertruckd.tools.logs.messages import first_offset
 
 
 def replay_log(
@@ -26,7 +26,7 @@ def replay_log(
 ) -> int:
     """Publish the messages of ``log`` at their own times; returns how many.
 
-    Requests are left out: they came from outside and would reach nobody.
+    Requests are left out: they were sent to the daemon, not by it.
 
     Args:
         log: file to read.
@@ -34,7 +34,7 @@ def replay_log(
         endpoint: where to listen.
         speed: multiple of real time.
         topics: only these; none = all.
-        progress: told the bytes of the log read so far.
+        progress: called with the bytes of the log read so far.
 
     Raises:
         NotFoundError: no such log, or an unknown topic.

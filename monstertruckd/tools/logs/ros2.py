@@ -26,9 +26,8 @@ from monstertruck_schemas.sensor import Battery, CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.recorder.reader import LogReader
-from monstertruckd.tools.logs.selection import ALL, Progress, Selection
-from monstertruckd.tools.logs.unfinished import removed_on_failure
-from monstertruckd.tools.logs.wall_time import real_offset
+from monstertruckd.tools.logs.export import removed_on_failure
+from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
 _VERSION: Final = 8

@@ -1,4 +1,4 @@
-"""Scans with odometry from logs of many makes: our own MCAP, CARMEN text, arrays in npz, URG text."""
+"""Scans with odometry from logs of several formats: our MCAP, CARMEN text, arrays in npz, URG text."""
 
 import gzip
 import io
@@ -22,7 +22,7 @@ from monstertruck_schemas.state import Odometry
 from monstertruckd.recorder.reader import MAGIC, open_log
 
 BEGIN: Final = SECOND
-"""Stamp of the first scan of a log that counts from elsewhere, ns."""
+"""Stamp of the first scan of a log with times of another origin, ns."""
 LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
 URG_STEP: Final = math.tau / 1024
@@ -46,7 +46,7 @@ def read_scans(path: Path) -> ScanLog:
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is none of the known makes, damaged, or has no scans.
+        InputError: it is of no known format, damaged, or has no scans.
     """
     try:
         with path.open("rb") as file:

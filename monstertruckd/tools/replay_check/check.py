@@ -21,7 +21,7 @@ from monstertruckd.bus.local import TapCallback
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.recorder.reader import LogMessage
-from monstertruckd.tools.logs.wall_time import first_offset
+from monstertruckd.tools.logs.messages import first_offset
 from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.tools.replay_check.comparison import TopicComparison
 from monstertruckd.tools.replay_check.pace import PacedClock

@@ -1,5 +1,5 @@
-"""``log report``: a run on one HTML page that needs nothing but itself."""
+"""``log report``: a run on one self-contained HTML page."""
 
-from monstertruckd.tools.logs.report.page import Report, report
+from monstertruckd.tools.logs.report.page import RunReport, report
 
-__all__ = ["Report", "report"]
+__all__ = ["RunReport", "report"]

@@ -21,17 +21,86 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset, Odometry
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.recorder.reader import LogMessage, LogReader
-from monstertruckd.tools.logs.report.curves import FIGURES, Curve
+from monstertruckd.tools.logs.messages import Progress, first_offset
 from monstertruckd.tools.logs.report.scan_map import ScanMap
+from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Trace
 from monstertruckd.tools.logs.report.states import States
-from monstertruckd.tools.logs.report.traffic import Traffic
-from monstertruckd.tools.logs.report.way import Way
-from monstertruckd.tools.logs.selection import Progress
-from monstertruckd.tools.logs.trace import Trace
-from monstertruckd.tools.logs.wall_time import first_offset
+
+_SILENT_PERIODS: Final = 5
+"""Nominal periods without a message that count as a silence, if the topic names no staleness limit."""
+_SEQUENCES: Final = 1 << 32
+
+
+@dataclass(slots=True)
+class Traffic:
+    """One topic of the log."""
+
+    name: str
+    messages: int = 0
+    bytes: int = 0
+    first: int = 0
+    last: int = 0
+    lost: int = 0
+    """Messages the recorder counted but the log does not hold."""
+    undecodable: int = 0
+    silences: int = 0
+    longest_silence: float = 0.0
+    """Seconds between two messages, greatest; 0 for topics without a nominal rate."""
+    rate: Trace = field(default_factory=Trace)
+    """Messages of each whole second, in per cent of the nominal rate."""
+    _sequence: int | None = None
+    _second: int = 0
+    _in_second: int = 0
+
+    @property
+    def nominal(self) -> float | None:
+        """Rate of the topic table, Hz."""
+        topic = BY_NAME.get(self.name)
+        return None if topic is None else topic.rate
+
+    @property
+    def mean_rate(self) -> float | None:
+        """Measured rate between first and last message, Hz."""
+        return (self.messages - 1) * SECOND / (self.last - self.first) if self.last > self.first else None
+
+    def take(self, message: LogMessage) -> None:
+        """Count a message."""
+        now = message.log_time
+        if self.messages == 0:
+            self.first = self.last = now
+            self._second = now // SECOND
+        self._count_lost(message.sequence)
+        if self.nominal is not None:
+            self._watch(now, self.nominal)
+        self.messages += 1
+        self.bytes += len(message.payload)
+        self.last = max(self.last, now)
+
+    def _count_lost(self, sequence: int) -> None:
+        if self._sequence is not None:
+            skipped = (sequence - self._sequence - 1) % _SEQUENCES
+            self.lost += skipped if skipped < _SEQUENCES // 2 else 0  # else the sequence restarted
+        self._sequence = sequence
+
+    def _watch(self, now: int, nominal: float) -> None:
+        silence = (now - self.last) / SECOND
+        self.longest_silence = max(self.longest_silence, silence)
+        limit = BY_NAME[self.name].stale_after or _SILENT_PERIODS / nominal
+        self.silences += silence > limit
+        self.count_to(now)
+        self._in_second += 1
+
+    def count_to(self, now: int) -> None:
+        """Count every second that has ended at ``now``."""
+        while self.nominal is not None and self._second < now // SECOND:
+            if self._second > self.first // SECOND:  # the first one is incomplete
+                self.rate.add(self._second * SECOND + SECOND // 2, 100.0 * self._in_second / self.nominal)
+            self._second += 1
+            self._in_second = 0
+
 
 _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.TRANSFORMS.name: SECOND}
-"""Topics that are decoded no more often than this, ns: they come thick and cost most of the time."""
+"""Topics of high rate that are decoded no more often than this, ns."""
 _EVENTS: Final = 400
 """Events kept of each severity."""
 _JOURNAL: Final = 400
@@ -39,8 +108,8 @@ _JOURNAL: Final = 400
 
 
 @dataclass(slots=True)
-class Run:
-    """A log, digested."""
+class RunSummary:
+    """Everything the report shows of a log."""
 
     path: Path
     size: int
@@ -52,9 +121,9 @@ class Run:
     library: str = ""
     attachments: dict[str, Any] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
-    """What the log says of its run."""
+    """Metadata of the run in the log."""
     offset: int | None = None
-    """Real minus daemon time, ns, as the log last knew it."""
+    """Real minus daemon time, ns, by the newest message."""
     traces: dict[Curve, Trace] = field(default_factory=dict)
     traffic: dict[str, Traffic] = field(default_factory=dict)
     states: States = field(default_factory=States)
@@ -65,12 +134,12 @@ class Run:
     journal_count: int = 0
     """All of them."""
     stops: dict[int, Stop] = field(default_factory=dict)
-    """By number, each as it was told last."""
+    """By number, each as last published."""
     drops: int = 0
-    """Messages lost in the daemon's bounded queues, as it last counted them."""
-    way: Way = field(default_factory=Way)
+    """Messages lost in the daemon's bounded queues, by its last count."""
+    way: DrivenPath = field(default_factory=DrivenPath)
     """In the map frame if the log has poses there, else in odom."""
-    odometry: Way = field(default_factory=Way)
+    odometry: DrivenPath = field(default_factory=DrivenPath)
     path_plan: TruckPath | None = None
     tracker: TrackerState | None = None
     top_speed: float = 0.0
@@ -95,7 +164,7 @@ class Run:
 
     @property
     def is_black_box(self) -> bool:
-        """Pictures are thinned out on purpose, and the file counts its losses itself."""
+        """Pictures in it are sampled, and its metadata counts lost messages."""
         return "stopped_at_ns" in self.metadata
 
     @property
@@ -107,17 +176,17 @@ class Run:
 
 
 class Collector:
-    """Takes messages in the order of the log."""
+    """Adds messages in the order of the log."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RunSummary) -> None:
         self._run = run
         self._due: dict[str, int] = {}
-        self._takers: dict[str, list[Callable[[int, Any], None]]] = {}
+        self._handlers: dict[str, list[Callable[[int, Any], None]]] = {}
         for figure in FIGURES:
             for curve in figure.curves:
                 trace = run.traces[curve] = Trace()
                 self._on(curve.topic.name, _plotter(curve, trace))
-        takers: tuple[tuple[Topic[Any], Callable[[int, Any], None]], ...] = (
+        handlers: tuple[tuple[Topic[Any], Callable[[int, Any], None]], ...] = (
             (t.EVENT, self._event),
             (t.LOG, self._record),
             (t.STOP, self._stop),
@@ -130,24 +199,24 @@ class Collector:
             (t.MAP, lambda _, m: run.map.grid(m)),
             (t.SCAN, lambda _, m: run.map.scan(m)),
             (t.LOOP, self._loop),
-            *run.states.takers(),
+            *run.states.handlers(),
         )
-        for topic, taker in takers:
-            self._on(topic.name, taker)
+        for topic, handler in handlers:
+            self._on(topic.name, handler)
 
-    def _on(self, topic: str, taker: Callable[[int, Any], None]) -> None:
-        self._takers.setdefault(topic, []).append(taker)
+    def _on(self, topic: str, handler: Callable[[int, Any], None]) -> None:
+        self._handlers.setdefault(topic, []).append(handler)
 
     def take(self, entry: LogMessage) -> None:
-        """Digest one message; what cannot be decoded is counted."""
+        """Add one message; those that cannot be decoded are counted."""
         run, now = self._run, entry.log_time
         run.start = now if run.messages == 0 else min(run.start, now)
         run.end = max(run.end, now)
         run.messages += 1
         traffic = run.traffic.setdefault(entry.topic, Traffic(entry.topic))
         traffic.take(entry)
-        takers = self._takers.get(entry.topic)
-        if takers is None or now < self._due.get(entry.topic, now):
+        handlers = self._handlers.get(entry.topic)
+        if handlers is None or now < self._due.get(entry.topic, now):
             return
         if (period := _PERIODS.get(entry.topic)) is not None:
             self._due[entry.topic] = now + period
@@ -155,8 +224,8 @@ class Collector:
         if message is None:
             traffic.undecodable += 1
             return
-        for taker in takers:
-            taker(now, message)
+        for handler in handlers:
+            handler(now, message)
 
     def _event(self, _: int, event: Event) -> None:
         counts = self._run.event_counts
@@ -201,19 +270,19 @@ class Collector:
             self._run.cross_track_count += 1
 
 
-def collect(path: str | Path, progress: Progress | None = None) -> Run:
-    """Digest a log, finished or not, up to its end or its first damage.
+def collect(path: str | Path, progress: Progress | None = None) -> RunSummary:
+    """Read a log, finished or not, up to its end or its first damage.
 
     Args:
         path: the log.
-        progress: called with the bytes read so far, now and then.
+        progress: called with the bytes read so far.
 
     Raises:
         NotFoundError: no such log.
         InputError: not a log, or it holds no message.
     """
     reader = LogReader(Path(path))
-    run = Run(Path(path), reader.size)
+    run = RunSummary(Path(path), reader.size)
     collector = Collector(run)
     for number, entry in enumerate(reader):
         collector.take(entry)
@@ -232,8 +301,8 @@ def collect(path: str | Path, progress: Progress | None = None) -> Run:
     return run
 
 
-def _describe(run: Run, reader: LogReader) -> None:
-    """What stands before the first message: attachments, library, and the offset the run began with."""
+def _describe(run: RunSummary, reader: LogReader) -> None:
+    """Attachments, library and clock offset from the records before the first message."""
     for record in reader.preamble():
         match record:
             case Header():

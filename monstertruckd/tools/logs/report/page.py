@@ -13,26 +13,24 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Cause, Event, LogLevel, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruckd.recorder.reader import spare_log
-from monstertruckd.tools.logs.report.collect import Run, collect
-from monstertruckd.tools.logs.report.drawing import SEVERITY_TONE, Lines, plots, plotted, scene, timeline
-from monstertruckd.tools.logs.report.spans import Tone
-from monstertruckd.tools.logs.report.svg import clock_text
-from monstertruckd.tools.logs.selection import Progress
-from monstertruckd.tools.logs.wall_time import is_plausible, utc
+from monstertruckd.tools.logs.messages import Progress, is_plausible, utc
+from monstertruckd.tools.logs.report.collect import RunSummary, collect
+from monstertruckd.tools.logs.report.drawing import SEVERITY_TONE, Lines, clock_text, plots, plotted, scene, timeline
+from monstertruckd.tools.logs.report.states import Tone
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
-"""What the page may load: nothing. Browsers hold it to that."""
+"""Content security policy: the page may load nothing."""
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class RunReport:
     """A written report."""
 
     file: Path
-    run: Run
+    run: RunSummary
 
     def figures(self) -> dict[str, Any]:
-        """The figures at its top, as plain data."""
+        """The figures at the top of the page, as plain data."""
         run = self.run
         return {
             "file": str(self.file),
@@ -50,12 +48,12 @@ class Report:
         }
 
 
-def report(log: str | Path, output: str | Path | None = None, progress: Progress | None = None) -> Report:
+def report(log: str | Path, output: str | Path | None = None, progress: Progress | None = None) -> RunReport:
     """Write the report of a log.
 
     Args:
         log: MCAP file, finished or not.
-        output: HTML file; default: beside the log.
+        output: HTML file; default: next to the log.
         progress: called with the bytes read so far.
 
     Raises:
@@ -71,21 +69,21 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
     except OSError as error:
         msg = f"{file}: cannot be written: {error.strerror}"
         raise InputError(msg) from None
-    return Report(file, run)
+    return RunReport(file, run)
 
 
-def robot(run: Run) -> str:
+def robot(run: RunSummary) -> str:
     """Name of the robot by its configuration."""
     return str(run.attachments.get("config", {}).get("robot") or run.metadata.get("robot", "unknown robot"))
 
 
-def began(run: Run) -> str | None:
+def began(run: RunSummary) -> str | None:
     """Date of the first message, UTC; None if the log knows none."""
     real = run.start + (run.offset or 0)
     return utc(real) if is_plausible(real) else None
 
 
-def page(run: Run) -> str:
+def page(run: RunSummary) -> str:
     """The whole page."""
     here = files(__package__)
     chosen = plotted(run)
@@ -118,7 +116,7 @@ def page(run: Run) -> str:
     )
 
 
-def _head(run: Run) -> str:
+def _head(run: RunSummary) -> str:
     date = began(run)
     when = f"{date} UTC" if date else "date unknown (virtual clock, or a clock that was never set)"
     badges = [
@@ -140,7 +138,7 @@ def _badge(count: int, name: str, tone: Tone) -> tuple[str, Tone]:
     return (f"{count} {name}{'' if count == 1 else 's'}", tone) if count else (f"no {name}", Tone.GOOD)
 
 
-def _tiles(run: Run) -> str:
+def _tiles(run: RunSummary) -> str:
     rms = run.cross_track_rms
     lateness = next((trace for curve, trace in run.traces.items() if curve.label == "worst" and trace.count), None)
     rows = [
@@ -159,14 +157,14 @@ def _tiles(run: Run) -> str:
     return f'<div class="tiles">{tiles}</div>'
 
 
-def _events(run: Run) -> str:
+def _events(run: RunSummary) -> str:
     rows = "".join(_event(run, event) for event in run.events)
     left_out = sum(run.event_counts.values()) - len(run.events)
     note = f'<p class="note">&emsp;{left_out} more events are in the log.</p>' if left_out else ""
     return f"<ol>{rows}</ol>{note}" if rows else '<p class="note">&emsp;None.</p>'
 
 
-def _event(run: Run, event: Event) -> str:
+def _event(run: RunSummary, event: Event) -> str:
     seconds = max(event.stamp - run.start, 0) / SECOND
     values = (f"{key}={_short(value)}" for key, value in event.values.items())
     return (
@@ -181,13 +179,13 @@ def _short(value: float | str | bool | None) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _stops(run: Run) -> str:
-    """Every stop with the chain of what was behind it."""
+def _stops(run: RunSummary) -> str:
+    """Every stop with its chain of causes."""
     rows = "".join(_stop(run, stop) for stop in run.stops.values())
     return f'<h2>Stops</h2><div class="card stops">{rows}</div>' if rows else ""
 
 
-def _stop(run: Run, stop: Stop) -> str:
+def _stop(run: RunSummary, stop: Stop) -> str:
     tone = Tone.CALM if stop.ordered else Tone.BAD
     seconds = max(stop.stamp - run.start, 0) / SECOND
     speed = "" if stop.speed is None else f" at {stop.speed:.2f} m/s"
@@ -202,7 +200,7 @@ def _stop(run: Run, stop: Stop) -> str:
     )
 
 
-def _cause(run: Run, cause: Cause) -> str:
+def _cause(run: RunSummary, cause: Cause) -> str:
     since = clock_text(max(cause.since - run.start, 0) / SECOND, 2)
     measured = ", ".join(
         f"{m.name} {'unknown' if m.value is None else f'{m.value:.4g}'}"
@@ -217,8 +215,8 @@ def _cause(run: Run, cause: Cause) -> str:
     )
 
 
-def _journal(run: Run) -> str:
-    """What the daemon warned of."""
+def _journal(run: RunSummary) -> str:
+    """Warnings and errors of the journal."""
     rows = "".join(
         f'<li data-at="{1e3 * (seconds := max(record.stamp - run.start, 0) / SECOND):.0f}">'
         f"<time>{clock_text(seconds, 2)}</time><div>"
@@ -231,7 +229,7 @@ def _journal(run: Run) -> str:
     return f'<h2>Journal</h2><div class="card events"><ol>{rows}</ol>{note}</div>' if rows else ""
 
 
-def _services(run: Run) -> str:
+def _services(run: RunSummary) -> str:
     rows = []
     for name, track in run.states.services.items():
         row, ready = run.states.health[name], track.seconds("ready")
@@ -249,7 +247,7 @@ def _services(run: Run) -> str:
     return f'<h2>Health</h2><div class="card scroll">{table}</div>' if rows else ""
 
 
-def _traffic(run: Run) -> str:
+def _traffic(run: RunSummary) -> str:
     rows = []
     for name, row in sorted(run.traffic.items()):
         nominal, rate = row.nominal, row.mean_rate
@@ -285,7 +283,7 @@ def _table(
     wide: int | None = None,
     alarm: set[int] = frozenset(),  # type: ignore[assignment]
 ) -> str:
-    """Rows of markup; columns in ``alarm`` stand out where they are not 0."""
+    """A table of markup; columns in ``alarm`` are highlighted where not 0."""
     top = "".join(f"<th{' class=n' if n in right else ''}>{escape(head)}</th>" for n, head in enumerate(heads))
 
     def cell(n: int, text: str) -> str:
@@ -296,7 +294,7 @@ def _table(
     return f"<table><tr>{top}</tr>{body}</table>"
 
 
-def _details(run: Run) -> str:
+def _details(run: RunSummary) -> str:
     """Attachments of the log, folded."""
     versions = run.attachments.get("versions", {})
     text = ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
@@ -312,8 +310,8 @@ def _details(run: Run) -> str:
     )
 
 
-def _data(run: Run, chosen: list[tuple[str, str, float, bool, Lines]]) -> str:
-    """What the cursor reads out: times in ms since the start."""
+def _data(run: RunSummary, chosen: list[tuple[str, str, float, bool, Lines]]) -> str:
+    """Values for the cursor; times in ms since the start."""
 
     def milliseconds(times: Iterable[int]) -> list[int]:
         return [int(time - run.start) // 1_000_000 for time in times]

@@ -1,4 +1,4 @@
-"""The picture under the path: what the lidar saw, or the newest occupancy grid of the log."""
+"""The map under the driven path: an occupancy grid of the log's scans, or the newest grid in the log."""
 
 import io
 import math

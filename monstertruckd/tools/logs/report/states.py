@@ -1,15 +1,89 @@
-"""From messages to the rows of the timeline."""
+"""States over time: the rows and bars of the report's timeline."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from typing import Any, Final
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 from monstertruck_schemas.usb import UsbState, UsbTree
-from monstertruckd.tools.logs.report.spans import Tone, Track
+
+
+class Tone(IntEnum):
+    """How a state is coloured; greater is worse."""
+
+    NONE = 0
+    """Not merged_spans."""
+    CALM = 1
+    GOOD = 2
+    BUSY = 3
+    WARNING = 4
+    BAD = 5
+
+
+@dataclass(frozen=True, slots=True)
+class StateSpan:
+    """A state that held from ``start`` to ``end``, ns."""
+
+    start: int
+    end: int
+    text: str
+    tone: Tone
+    detail: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """How long it held."""
+        return (self.end - self.start) / SECOND
+
+
+@dataclass(slots=True)
+class StateTrack:
+    """One row of the timeline."""
+
+    name: str
+    spans: list[StateSpan] = field(default_factory=list)
+
+    def set(self, time: int, text: str, tone: Tone, detail: str = "") -> None:
+        """Begin a state at ``time``."""
+        if self.spans:
+            last = self.spans[-1]
+            if (last.text, last.tone, last.detail) == (text, tone, detail):
+                return
+            self.spans[-1] = replace(last, end=time)
+        self.spans.append(StateSpan(time, time, text, tone, detail))
+
+    def close(self, end: int) -> None:
+        """End the newest state at ``end``."""
+        if self.spans:
+            self.spans[-1] = replace(self.spans[-1], end=max(end, self.spans[-1].start))
+
+    @property
+    def worst(self) -> Tone:
+        """Worst state."""
+        return max((span.tone for span in self.spans), default=Tone.NONE)
+
+    def seconds(self, text: str) -> float:
+        """How long ``text`` held in all."""
+        return sum(span.seconds for span in self.spans if span.text == text)
+
+
+def merged_spans(spans: list[StateSpan], shortest: int) -> list[StateSpan]:
+    """Spans to draw: neighbours both shorter than ``shortest`` ns are merged into one, of the worse state."""
+    merged: list[StateSpan] = []
+    for span in spans:
+        if merged and span.end - span.start < shortest and merged[-1].end - merged[-1].start < shortest:
+            worse = max(merged[-1], span, key=lambda s: s.tone)
+            merged[-1] = replace(worse, start=merged[-1].start, end=span.end)
+        else:
+            merged.append(span)
+    return [span for span in merged if span.tone is not Tone.NONE]
+
 
 _GATE: Final = {
     GateMode.DISARMED: Tone.CALM,
@@ -47,25 +121,25 @@ _USB: Final = {
     UsbState.HELD: Tone.WARNING,
 }
 _NORMAL: Final = {"disarmed"}
-"""Limits of a truck that is meant to stand: the gate's row says so already."""
+"""Limits that the gate's row shows already."""
 
 
 class States:
     """Every row of the timeline, filled message by message."""
 
     def __init__(self) -> None:
-        self.gate = Track("gate")
-        self.driver = Track("driven by")
-        self.limit = Track("limited by")
-        self.motor = Track("motor")
-        self.battery = Track("battery")
-        self.services: dict[str, Track] = {}
+        self.gate = StateTrack("gate")
+        self.driver = StateTrack("driven by")
+        self.limit = StateTrack("limited by")
+        self.motor = StateTrack("motor")
+        self.battery = StateTrack("battery")
+        self.services: dict[str, StateTrack] = {}
         self.health: dict[str, ServiceHealth] = {}
-        """Newest row of each service that was not its ordinary stop."""
-        self.usb: dict[str, Track] = {}
+        """Newest health of each service, except its ordinary stop."""
+        self.usb: dict[str, StateTrack] = {}
 
-    def takers(self) -> Iterator[tuple[Topic[Any], Callable[[int, Any], None]]]:
-        """Which message goes where."""
+    def handlers(self) -> Iterator[tuple[Topic[Any], Callable[[int, Any], None]]]:
+        """Topics and the functions that add their messages."""
         yield t.GATE, self._gate
         yield t.DRIVE, self._motor
         yield t.BATTERY, self._battery
@@ -73,12 +147,12 @@ class States:
         yield t.USB, self._usb
 
     def close(self, end: int) -> None:
-        """The log ends."""
+        """End all states at the end of the log."""
         for track in (*self.main, *self.services.values(), *self.usb.values()):
             track.close(end)
 
     @property
-    def main(self) -> tuple[Track, ...]:
+    def main(self) -> tuple[StateTrack, ...]:
         """Rows that are always worth showing."""
         return self.gate, self.driver, self.limit, self.motor, self.battery
 
@@ -97,7 +171,7 @@ class States:
 
     def _services(self, now: int, table: HealthTable) -> None:
         for row in table.services:
-            track = self.services.setdefault(row.name, Track(row.name))
+            track = self.services.setdefault(row.name, StateTrack(row.name))
             track.set(now, row.state.value, _SERVICE[row.state], row.detail)
             if row.state is not ServiceState.STOPPED or row.name not in self.health:
                 self.health[row.name] = row
@@ -105,5 +179,5 @@ class States:
     def _usb(self, now: int, tree: UsbTree) -> None:
         for node in tree.nodes:
             if node.role is not None:
-                track = self.usb.setdefault(node.role, Track(f"usb {node.role}"))
+                track = self.usb.setdefault(node.role, StateTrack(f"usb {node.role}"))
                 track.set(now, node.state.value, _USB[node.state], node.name)

@@ -29,7 +29,7 @@ from monstertruckd.tools.cli.output import (
     progress,
     until_stopped,
 )
-from monstertruckd.tools.logs.listing import LogState, list_logs
+from monstertruckd.tools.logs.summary import LogState, list_logs
 
 ROOT = Path(__file__).resolve().parents[4]
 

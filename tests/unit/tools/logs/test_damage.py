@@ -12,7 +12,7 @@ from monstertruck_schemas import topics as t
 from monstertruckd.recorder.log_file import Entry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
-from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.summary import info
 from tests.unit.tools.logs.run_kit import compass, write
 from tests.unit.tools.replay_check.log_surgery import chunks
 

@@ -20,11 +20,9 @@ from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Battery, BatteryLevel, CompressedImage
 from monstertruck_schemas.state import Grid, Transform, Transforms
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.tools.logs.export import export_csv, export_npz
+from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
+from monstertruckd.tools.logs.messages import Selection, real_offset, utc
 from monstertruckd.tools.logs.ros2 import export_ros2
-from monstertruckd.tools.logs.selection import Selection
-from monstertruckd.tools.logs.wall_mcap import export_mcap
-from monstertruckd.tools.logs.wall_time import real_offset, utc
 from tests.unit.recorder.conftest import scan
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 

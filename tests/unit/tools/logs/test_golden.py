@@ -15,12 +15,11 @@ from monstertruckd.config.load import load_truck
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.demo.wall import free_endpoint
-from monstertruckd.tools.logs.export import export_csv, export_npz
-from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
 from monstertruckd.tools.logs.replay import replay_log
 from monstertruckd.tools.logs.report import report
 from monstertruckd.tools.logs.ros2 import export_ros2
-from monstertruckd.tools.logs.wall_mcap import export_mcap
+from monstertruckd.tools.logs.summary import info
 
 RELEASES = sorted((Path(__file__).parents[3] / "data" / "golden").iterdir())
 pytestmark = pytest.mark.parametrize("release", RELEASES, ids=lambda folder: folder.name)

@@ -12,8 +12,8 @@ from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.topics import CLOCK, GATE
 from monstertruckd.recorder.reader import LogReader
 from monstertruckd.tools.cli.main import main
-from monstertruckd.tools.logs.listing import Listed, LogState, list_logs
-from monstertruckd.tools.logs.wall_time import real_offset
+from monstertruckd.tools.logs.messages import real_offset
+from monstertruckd.tools.logs.summary import LogState, LogSummary, list_logs
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate
 
 
@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 def test_every_log_says_when_how_long_and_how_much(folder: Path):
     undated, dated, broken, foreign = list_logs(folder)
     size = (folder / "run-1.mcap").stat().st_size
-    assert dated == Listed(folder / "run-1.mcap", size, LogState.FINISHED, "2026-05-01 01:46:41", 3.0, 5)
+    assert dated == LogSummary(folder / "run-1.mcap", size, LogState.FINISHED, "2026-05-01 01:46:41", 3.0, 5)
     assert (undated.path.name, undated.started, undated.messages) == ("run-2.mcap", None, 4)
     assert (broken.state, broken.messages, broken.duration) == (LogState.UNFINISHED, None, None)
     assert foreign.state is LogState.UNREADABLE

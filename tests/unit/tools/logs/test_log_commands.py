@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruckd.tools.cli.main import app
-from monstertruckd.tools.logs.selection import Selection
+from monstertruckd.tools.logs.messages import Selection
 
 GOLDEN = max((Path(__file__).parents[3] / "data" / "golden").glob("*/run.mcap"))
 

@@ -18,7 +18,7 @@ from monstertruckd.recorder.log_file import Entry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover, recover_directory
 from monstertruckd.tools.logs.export import export_csv, export_npz
-from monstertruckd.tools.logs.info import info
+from monstertruckd.tools.logs.summary import info
 from tests.unit.tools.logs.run_kit import MAKERS, write
 
 

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.logs.report.spans import Span, Tone, Track, drawn
-from monstertruckd.tools.logs.report.svg import clock_text, line, time_ticks, value_axis
-from monstertruckd.tools.logs.trace import Trace
+from monstertruckd.tools.logs.report.drawing import clock_text, line, time_ticks, value_axis
+from monstertruckd.tools.logs.report.signals import Trace
+from monstertruckd.tools.logs.report.states import StateSpan, StateTrack, Tone, merged_spans
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(4, 50))
@@ -72,7 +72,7 @@ def test_instants_are_round():
 
 
 def test_track_merges_equal_states_and_short_ones_keep_the_worst():
-    track = Track("gate")
+    track = StateTrack("gate")
     for time, text, tone in ((0, "a", Tone.GOOD), (5, "a", Tone.GOOD), (100, "b", Tone.BAD), (101, "a", Tone.GOOD)):
         track.set(time, text, tone)
     track.set(102, "c", Tone.WARNING)
@@ -85,8 +85,8 @@ def test_track_merges_equal_states_and_short_ones_keep_the_worst():
     ]
     assert track.seconds("a") == pytest.approx(101 / SECOND)
     assert track.worst is Tone.BAD
-    assert [span.text for span in drawn(track.spans, 10)] == ["a", "b", "c"]
-    assert drawn([Span(0, 9, "", Tone.NONE)], 1) == []
+    assert [span.text for span in merged_spans(track.spans, 10)] == ["a", "b", "c"]
+    assert merged_spans([StateSpan(0, 9, "", Tone.NONE)], 1) == []
 
 
 def test_middle_of_intervals():

@@ -16,9 +16,8 @@ from monstertruck_runtime.errors import CommandFailedError, InputError, NotFound
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruckd.tools.cli.logs import app, needs_extra
-from monstertruckd.tools.logs.rerun_log import TIMELINE, convert
-from monstertruckd.tools.logs.selection import Selection
-from monstertruckd.tools.logs.view import environment, show
+from monstertruckd.tools.logs.messages import Selection
+from monstertruckd.tools.logs.rerun_view import TIMELINE, convert, environment, show
 from tests.unit.recorder.conftest import scan
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 from tests.unit.tools.logs.test_export import grid, image, path, transforms

@@ -1,6 +1,10 @@
 """A log as a rerun recording: scans, map, path, frames, pictures, states, events and plots, with their layout."""
 
 import math
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from monstertruck_planners.collision import scan_points
-from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.errors import CommandFailedError, ConfigError, InputError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
@@ -20,13 +24,11 @@ from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import GateState, Grid, Odometry, Transforms
 from monstertruckd.recorder.reader import LogReader, spare_log
-from monstertruckd.tools.logs.report.curves import FIGURES, Curve, Figure
-from monstertruckd.tools.logs.report.way import Way
-from monstertruckd.tools.logs.selection import ALL, Progress, Selection
-from monstertruckd.tools.logs.wall_time import is_plausible, real_offset
+from monstertruckd.tools.logs.messages import ALL, Progress, Selection, is_plausible, real_offset
+from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
 TIMELINE: Final = "time"
-"""Real time where the log knows it, else the daemon's."""
+"""Real time if the log has it, else the daemon's."""
 APPLICATION: Final = "monstertruckd"
 
 _CAMERA: Final = "camera"
@@ -34,7 +36,7 @@ _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", 
 """Figures that are in view when the recording opens."""
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
 _HEIGHT: Final = 0.15
-"""Of the truck's box, m: no configuration tells it."""
+"""Of the truck's box, m; not configured."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _JOURNAL: Final = {
     LogLevel.DEBUG: "DEBUG",
@@ -79,7 +81,7 @@ def convert(log: str | Path, output: str | Path, selection: Selection = ALL, pro
 
 
 class Scene:
-    """Logs one message after the other; curves are gathered and sent as columns at the end.
+    """Logs message by message; curves are collected and sent as columns at the end.
 
     Args:
         stream: recording, open.
@@ -95,12 +97,12 @@ class Scene:
             for curve in figure.curves:
                 self._curves.setdefault(curve.topic.name, []).append((figure, curve))
         self._samples: dict[str, tuple[list[int], list[float]]] = {}
-        self._way = Way()
+        self._way = DrivenPath()
         self._way_frame = "odom"
         self._states: dict[str, str] = {}
         self.entities: set[str] = set()
         """Signals and pictures that the recording has."""
-        self._takers: Mapping[str, Callable[[Any], None]] = {
+        self._handlers: Mapping[str, Callable[[Any], None]] = {
             t.SCAN.name: self._scan,
             t.TRANSFORMS.name: self._transforms,
             t.MAP.name: self._grid,
@@ -135,14 +137,14 @@ class Scene:
                 times, values = self._samples.setdefault(entity(figure, curve), ([], []))
                 times.append(log_time)
                 values.append(value)
-        if (taker := self._takers.get(topic)) is not None:
+        if (handler := self._handlers.get(topic)) is not None:
             if self._dated is None:
                 self._dated = is_plausible(log_time + self._offset)
             self._set_time(log_time)
-            taker(message)
+            handler(message)
 
     def finish(self) -> None:
-        """Send what was gathered."""
+        """Send the collected curves and the driven path."""
         names = {entity(figure, curve): curve.label for figure in FIGURES for curve in figure.curves}
         self.entities |= self._samples.keys()
         for path, (times, values) in self._samples.items():
@@ -243,7 +245,7 @@ def blueprint(entities: Collection[str]) -> rrb.Blueprint:
     """The layout: place and pictures at the left, plots at the right, states and events below.
 
     Args:
-        entities: what the recording has of signals and pictures; the rest gets no room.
+        entities: signals and pictures of the recording; views of others are left out.
     """
     eye = rrb.EyeControls3D(position=(0.0, -0.4, 6.5), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 1.0, 0.0))
     place = rrb.Spatial3DView(
@@ -283,3 +285,39 @@ def _plot(figure: Figure) -> rrb.TimeSeriesView:
         axis_x=rrb.TimeAxis(view_range=whole),
         plot_legend=rrb.Corner2D.RightTop,
     )
+
+
+_NOWHERE: Final = "http://127.0.0.1:9"
+"""The discard port, on which nothing listens."""
+
+
+def show(recording: Path) -> None:
+    """Show a rerun file until the viewer is closed.
+
+    Raises:
+        CommandFailedError: there is no display, or the viewer failed.
+    """
+    if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))):
+        raise CommandFailedError("the rerun viewer needs a display, and there is none; --save writes a file instead")
+    with tempfile.TemporaryDirectory(prefix="monstertruckd-view-") as folder:
+        confined = environment(Path(folder))
+        _run_viewer(["analytics", "disable"], confined, quiet=True)
+        _run_viewer(["--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen", str(recording)], confined)
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Environment of a viewer that keeps its files in ``folder`` and reaches no other host."""
+    names = ("ALL_PROXY", "HTTP_PROXY", "HTTPS_PROXY")
+    proxies = {name: _NOWHERE for upper in names for name in (upper, upper.lower())}
+    home = {name: str(folder) for name in ("XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")}
+    local = dict.fromkeys(("NO_PROXY", "no_proxy"), "127.0.0.1,localhost")
+    return dict(os.environ) | proxies | home | local
+
+
+def _run_viewer(arguments: list[str], confined: dict[str, str], *, quiet: bool = False) -> None:
+    command = [sys.executable, "-m", "rerun_cli", *arguments]
+    output = subprocess.DEVNULL if quiet else None
+    done = subprocess.run(command, env=confined, stdout=output, stderr=output, check=False)  # noqa: S603  # our own
+    if done.returncode:
+        msg = f"the rerun viewer ended with {done.returncode}; --save writes a file instead"
+        raise CommandFailedError(msg)

@@ -1,0 +1,136 @@
+"""Messages of a log for the tools: which ones, decoded, and their real time.
+
+Logs keep the daemon's monotonic time, because a robot without a real-time clock learns the date late and its clock then
+jumps by hours. The newest offset in a log dates all of its messages.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from mcap.reader import make_reader
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import BY_NAME, CLOCK
+from monstertruckd.recorder.reader import DAMAGE, LogMessage, LogReader, index_is_sound
+
+_EVERY = 1000
+"""Messages between two calls of a progress function."""
+
+Progress = Callable[[float], None]
+"""Called with the bytes of the log read so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """A choice of a log's messages; by default all of the topics in the table.
+
+    Args:
+        topics: names; empty = all.
+        start: seconds after the log's first message.
+        end: as ``start``, not included.
+
+    Raises:
+        NotFoundError: a topic is not in the table.
+        InputError: the end is not after the start.
+    """
+
+    topics: tuple[str, ...] = ()
+    start: float = 0.0
+    end: float = math.inf
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.topics) - BY_NAME.keys():
+            msg = f"no topic {', '.join(sorted(unknown))}; known: {', '.join(BY_NAME)}"
+            raise NotFoundError(msg)
+        if not self.start < self.end:
+            msg = f"from {self.start:g} s to {self.end:g} s: expected an end after the start"
+            raise InputError(msg)
+
+    def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
+        """The selected messages with their decoded forms; those of other schemas are skipped.
+
+        Raises:
+            InputError: a selected message is invalid; names file, message and field.
+        """
+        first: int | None = None
+        for number, entry in enumerate(reader, start=1):
+            if progress is not None and number % _EVERY == 0:
+                progress(reader.position)
+            first = entry.log_time if first is None else first
+            topic = BY_NAME.get(entry.topic)
+            if topic is None or (self.topics and entry.topic not in self.topics):
+                continue
+            if not self.start <= (entry.log_time - first) / SECOND < self.end:
+                continue
+            try:
+                yield entry, entry.decode()
+            except NotFoundError:
+                continue
+            except TruckError as error:
+                msg = f"{reader.path}: message {number}: {error}"
+                raise InputError(msg) from None
+
+
+ALL = Selection()
+
+
+_PLAUSIBLE: Final = 946_684_800 * SECOND
+"""2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set."""
+
+
+def real_offset(reader: LogReader) -> int:
+    """Real (UNIX) minus daemon time, ns, by the newest message about it in the log; 0 without one.
+
+    Raises:
+        InputError: the log's metadata of it is no number.
+    """
+    newest = _newest_clock(reader)
+    if newest is not None:
+        return wire.decode(CLOCK, newest).offset
+    return first_offset(reader.path, reader.metadata().get("run", {}))
+
+
+def first_offset(log: Path, metadata: Mapping[str, str]) -> int:
+    """Real minus daemon time, ns, at the start of a run, by its metadata; 0 without.
+
+    Raises:
+        InputError: the metadata is no number.
+    """
+    text = metadata.get("real_offset_ns", "0")
+    try:
+        return int(text)
+    except ValueError:
+        raise InputError(f"{log}: metadata run: real_offset_ns is {text!r}, expected a whole number") from None
+
+
+def _newest_clock(reader: LogReader) -> bytes | None:
+    """Payload of the last clock message: by the index, or, without a valid one, by reading the whole log."""
+    with reader.path.open("rb") as file, suppress(*DAMAGE):
+        sound = index_is_sound(file)
+        file.seek(0)
+        log = make_reader(file, validate_crcs=True)
+        if sound and (summary := log.get_summary()) is not None and summary.chunk_indexes:
+            last = next(log.iter_messages(topics=CLOCK.name, reverse=True), None)
+            return None if last is None else last[2].data
+    newest: bytes | None = None
+    for message in reader:
+        newest = message.payload if message.topic == CLOCK.name else newest
+    return newest
+
+
+def is_plausible(real: int) -> bool:
+    """Whether a real time, ns, can be the date of a run."""
+    return real >= _PLAUSIBLE
+
+
+def utc(real: int) -> str:
+    """A real time, ns, as ``YYYY-MM-DD hh:mm:ss`` UTC."""
+    return str(np.datetime64(real // SECOND, "s")).replace("T", " ")

@@ -1,0 +1,148 @@
+"""Summaries: of one log by reading it, of a folder's logs by their indices."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound, is_finished
+from monstertruckd.recorder.repair import in_use
+from monstertruckd.tools.logs.messages import is_plausible, real_offset, utc
+
+
+def info(path: str | Path) -> dict[str, Any]:
+    """Contents of a log as plain JSON-able values.
+
+    Returns:
+        ``path``, ``size`` (bytes), ``damage`` (text or None), ``messages``, ``start``/``end`` (ns or None),
+        ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``,
+        ``start``, ``end``), ``attachments`` (name to bytes), ``metadata`` (name to text values).
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: not a log.
+    """
+    reader = LogReader(Path(path))
+    schemas: dict[int, str] = {}
+    channels: dict[int, dict[str, Any]] = {}
+    topics: dict[str, dict[str, Any]] = {}
+    attachments: dict[str, int] = {}
+    metadata: dict[str, dict[str, str]] = {}
+    for record in reader.records():
+        if isinstance(record, Message):
+            row = channels[record.channel_id]
+            row["messages"] += 1
+            row["bytes"] += len(record.data)
+            row["start"] = record.log_time if row["start"] is None else min(row["start"], record.log_time)
+            row["end"] = record.log_time if row["end"] is None else max(row["end"], record.log_time)
+        elif isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = topics.setdefault(
+                record.topic,
+                {"messages": 0, "rate": None, "bytes": 0, "schema": schemas.get(record.schema_id, "")}
+                | {"start": None, "end": None},
+            )
+        elif isinstance(record, Attachment):
+            attachments[record.name] = len(record.data)
+        elif isinstance(record, Metadata):
+            metadata[record.name] = dict(record.metadata)
+    for row in topics.values():
+        if row["messages"] > 1 and row["end"] > row["start"]:
+            row["rate"] = (row["messages"] - 1) * SECOND / (row["end"] - row["start"])
+    used = [row for row in topics.values() if row["messages"]]
+    start = min((row["start"] for row in used), default=None)
+    end = max((row["end"] for row in used), default=None)
+    return {
+        "path": str(path),
+        "size": Path(path).stat().st_size,
+        "damage": reader.fault,
+        "messages": sum(row["messages"] for row in used),
+        "start": start,
+        "end": end,
+        "duration": 0.0 if start is None or end is None else (end - start) / SECOND,
+        "topics": dict(sorted(topics.items())),
+        "attachments": attachments,
+        "metadata": metadata,
+    }
+
+
+class LogState(StrEnum):
+    """State of a log."""
+
+    FINISHED = "finished"
+    WRITING = "being written"
+    UNFINISHED = "unfinished"
+    """Not finished and not being written: for ``recover``."""
+    DAMAGED = "damaged"
+    """Its index is damaged: for ``recover``."""
+    UNREADABLE = "unreadable"
+    """Not a log, or not readable."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """One log of a folder."""
+
+    path: Path
+    size: int
+    """Bytes."""
+    state: LogState
+    started: str | None = None
+    """UTC; None if the date is unknown, or the log is not finished."""
+    duration: float | None = None
+    """Seconds; None if the log is not finished."""
+    messages: int | None = None
+
+
+def list_logs(folder: Path) -> list[LogSummary]:
+    """All logs in ``folder`` and below, by name.
+
+    Raises:
+        NotFoundError: no such folder.
+    """
+    if not folder.is_dir():
+        raise NotFoundError(f"{folder}: no such folder")
+    return [_summary_of(path) for path in sorted(folder.rglob("*.mcap")) if path.is_file()]
+
+
+def _summary_of(path: Path) -> LogSummary:
+    size = path.stat().st_size
+    try:
+        reader = LogReader(path)
+    except InputError:
+        return LogSummary(path, size, LogState.UNREADABLE)
+    if not is_finished(path):
+        return LogSummary(path, size, LogState.WRITING if in_use(path) else LogState.UNFINISHED)
+    try:
+        with path.open("rb") as file:
+            if not index_is_sound(file):
+                return LogSummary(path, size, LogState.DAMAGED)
+            file.seek(0)
+            summary = make_reader(file).get_summary()
+        statistics = None if summary is None else summary.statistics
+        if statistics is None:
+            return LogSummary(path, size, LogState.FINISHED)
+        real = statistics.message_start_time + _offset(reader)
+    except DAMAGE:
+        return LogSummary(path, size, LogState.DAMAGED)
+    return LogSummary(
+        path,
+        size,
+        LogState.FINISHED,
+        started=utc(real) if is_plausible(real) else None,
+        duration=(statistics.message_end_time - statistics.message_start_time) / SECOND,
+        messages=statistics.message_count,
+    )
+
+
+def _offset(reader: LogReader) -> int:
+    try:
+        return real_offset(reader)
+    except InputError:
+        return 0
