@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import BaseModel
 
 import monstertruck_estimation.slam.service as slam_service
-from monstertruck_runtime.actors.placement import LoopActor
+from monstertruck_runtime.actors.actor import LoopActor
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics

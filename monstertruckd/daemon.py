@@ -19,9 +19,9 @@ from monstertruck_drivers.link import Port
 from monstertruck_planners.goals import rpc as goal_rpc
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.steps import CODEC
-from monstertruck_runtime.actors.placement import Places
+from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
-from monstertruck_runtime.actors.remote import RemoteDesk
+from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import latest
@@ -107,8 +107,8 @@ class Daemon:
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
-        self._desk = RemoteDesk(CODEC)
-        self._places = Places(clock, self._desk)
+        self._remote_steps = RemoteWorkQueue(CODEC)
+        self._actors = ActorFactory(clock, self._remote_steps)
         self.rpc = self._build_rpc()
         self._attachments = self._describe()
         self.recorder = self._build_recorder()
@@ -141,7 +141,7 @@ class Daemon:
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
-            for service in build_planners(self.config, self.bus, self.clock, self._body, self._places):
+            for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors):
                 self._start(planners, service)
                 if isinstance(service, GoalService):
                     goal_rpc.register(self.rpc, service, self.clock)
@@ -250,7 +250,7 @@ class Daemon:
 
         rpc.register("config", config)
         rpc.register("versions", versions)
-        rpc.register(REMOTE_STEP, self._desk.serve)
+        rpc.register(REMOTE_STEP, self._remote_steps.serve)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
             rpc, self.config, loaded, self.clock, self._events, self._offload, lambda: self.gate.mode

@@ -18,7 +18,7 @@ from monstertruck_planners.steps import STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
-from monstertruck_runtime.actors.placement import Places
+from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import Publisher, Subscription
@@ -124,7 +124,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
     )
 
 
-def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, places: Places) -> Iterator[Service]:
+def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
         paths, requests = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
@@ -141,9 +141,9 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, plac
             bus.event_sink(),
             config.gate.max_request_age,
         )
-        yield _build_tracker(config, config.tracker, bus, clock, body, requests, places)
+        yield _build_tracker(config, config.tracker, bus, clock, body, requests, actors)
         if config.planner is not None:
-            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, places)
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield StabiliserService(
             config.levelling,
@@ -166,7 +166,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, plac
 
 def _build_tracker(
     config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, requests: Publisher[DriveRequest],
-    places: Places,
+    actors: ActorFactory,
 ) -> Service:  # fmt: skip
     lidar, placement = config.devices.lidar, config.placement.tracker
     inputs: dict[str, Subscription[Any]] = {
@@ -180,7 +180,7 @@ def _build_tracker(
         inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
     actor = None
     if placement != "loop":
-        actor = places.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
+        actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
     return TrackerService(
         TrackSetup(tracker, body.chassis.bicycle, body.footprint, body.points.mount),
         clock,

@@ -10,7 +10,7 @@ from monstertruck_planners.goals.exchange import Setup
 from monstertruck_planners.goals.parts import Inputs, Outputs
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS
-from monstertruck_runtime.actors.placement import Places
+from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import Publisher
@@ -21,7 +21,7 @@ from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 
-PATIENCE: Final = 180.0
+START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: the first time it compiles."""
 
 
@@ -34,7 +34,7 @@ def build_goals(
     footprint: Footprint,
     path: Publisher[Path],
     planner_request: Publisher[DriveRequest],
-    places: Places,
+    actors: ActorFactory,
 ) -> GoalService:
     """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
     lidar, mapped = config.devices.lidar, config.slam is not None
@@ -45,13 +45,13 @@ def build_goals(
     return GoalService(
         setup,
         clock,
-        places.actor(
+        actors.actor(
             config.placement.planner,
             PLANNING,
             STEPS[PLANNING],
             latency=planner.latency,
             deadline=planner.deadline,
-            patience=PATIENCE,
+            start_timeout=START_TIMEOUT,
         ),
         deceleration=config.tracker.deceleration,
         max_age=config.gate.max_request_age,
@@ -66,24 +66,24 @@ def build_goals(
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         ),
         outputs=Outputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
-        deformation=_deformation(config, setup, bus, clock, places),
+        deformation=_deformation(config, setup, bus, clock, actors),
     )
 
 
-def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, places: Places) -> Deformation | None:
+def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, actors: ActorFactory) -> Deformation | None:
     mapped, local = config.slam is not None, setup.config.local
     if setup.config.deform is None or config.devices.lidar is None:
         return None
     return Deformation(
         setup,
         clock,
-        places.actor(
+        actors.actor(
             config.placement.deformer,
             DEFORMING,
             STEPS[DEFORMING],
             latency=local.latency,
             deadline=local.deadline,
-            patience=PATIENCE,
+            start_timeout=START_TIMEOUT,
         ),
         scan=bus.subscribe(topics.SCAN, latest()),
         pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),

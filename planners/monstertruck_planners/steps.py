@@ -4,7 +4,7 @@ from typing import Final
 
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
 from monstertruck_planners.track.service import TrackInput, TrackOutput
-from monstertruck_runtime.actors.codec import StepCodec
+from monstertruck_runtime.actors.remote import StepCodec
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import GateState, Odometry

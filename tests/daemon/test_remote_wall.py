@@ -9,8 +9,8 @@ import pytest
 
 from monstertruck_planners.goals.exchange import DeformAnswer, PlanAnswer
 from monstertruck_planners.steps import CODEC, DEFORMING, PLANNING, STEPS, TRACKING
-from monstertruck_runtime.actors.placement import Placement, Places
-from monstertruck_runtime.actors.remote import RPC, RemoteDesk
+from monstertruck_runtime.actors.actor import ActorFactory, Placement
+from monstertruck_runtime.actors.remote import RPC, RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, run_wall
 from tests.bus_kit import running_robot
 from tests.unit.runtime.actors.step_kit import deform_tasks, numbers, plan_task, track_inputs
@@ -20,31 +20,31 @@ pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 INPUTS = {PLANNING: [plan_task()], DEFORMING: deform_tasks(), TRACKING: track_inputs()}
 
 
-async def outputs(places: Places, placement: Placement, name: str) -> list[Any]:
+async def outputs(actors: ActorFactory, placement: Placement, name: str) -> list[Any]:
     target, inputs = STEPS[name], INPUTS[name]
-    async with places.actor(placement, name, target, latency=0.0, deadline=60.0, patience=120.0) as actor:
+    async with actors.actor(placement, name, target, latency=0.0, deadline=60.0, start_timeout=120.0) as actor:
         await actor.start()
         return [await actor.step(one) for one in inputs]
 
 
 def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
     async def main(clock: Clock) -> tuple[int, dict[str, list[list[Any]]]]:
-        desk = RemoteDesk(CODEC)
-        places = Places(clock, desk)
+        queue = RemoteWorkQueue(CODEC)
+        actors = ActorFactory(clock, queue)
         remote = {}
         async with running_robot(deadline=5.0) as robot:
-            robot.rpc.register(RPC, desk.serve)
+            robot.rpc.register(RPC, queue.serve)
             server = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "monstertruckd", "plan-server", "--endpoint", robot.endpoint
             )
             try:
                 for name in STEPS:
-                    remote[name] = await outputs(places, "remote", name)
+                    remote[name] = await outputs(actors, "remote", name)
             finally:
                 server.terminate()
                 ended = await server.wait()
         here: tuple[Placement, ...] = ("worker", "loop")
-        return ended, {name: [remote[name], *[await outputs(places, place, name) for place in here]] for name in STEPS}
+        return ended, {name: [remote[name], *[await outputs(actors, place, name) for place in here]] for name in STEPS}
 
     ended, found = run_wall(main)
     assert ended == 0

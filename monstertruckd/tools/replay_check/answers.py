@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
 from monstertruck_planners.steps import CODEC
-from monstertruck_runtime.actors.placement import Actor, LoopActor, Placement, Places
-from monstertruck_runtime.actors.remote import RemoteDesk
+from monstertruck_runtime.actors.actor import Actor, ActorFactory, LoopActor, Placement
+from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_schemas.plan import Path, Steering
 from monstertruck_schemas.reasons import Reason
@@ -112,11 +112,11 @@ class ReplayedDeformer(_Replayed):
         return replace(answer, finding="new", path=path)
 
 
-class ReplayedPlaces(Places):
+class ReplayedActors(ActorFactory):
     """Actors of the goal service."""
 
     def __init__(self, clock: PacedClock, record: GoalRecord, book: Book) -> None:
-        super().__init__(clock, RemoteDesk(CODEC))
+        super().__init__(clock, RemoteWorkQueue(CODEC))
         self._paced, self._record, self._book = clock, record, book
 
     def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:

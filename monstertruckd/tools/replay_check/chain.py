@@ -13,7 +13,7 @@ from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.track.paths import PathService
 from monstertruck_runtime import wire
-from monstertruck_runtime.actors.agenda import use_agenda
+from monstertruck_runtime.actors.actor import use_delivery
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Publisher
@@ -30,7 +30,7 @@ from monstertruckd.assembly.devices import scan_publisher
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
 from monstertruckd.recorder.reader import LogMessage
-from monstertruckd.tools.replay_check.answers import Book, ReplayedPlaces
+from monstertruckd.tools.replay_check.answers import Book, ReplayedActors
 from monstertruckd.tools.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill, is_deformed
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
 from monstertruckd.tools.replay_check.recorded import Survey
@@ -163,7 +163,7 @@ class Chain:
         """Newest number of a request for goals, by source."""
         self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None
         if self._turns is not None:
-            use_agenda(clock, self._turns)
+            use_delivery(clock, self._turns)
         self._answering = False
         self._answers = 0
         self.bus = Bus(clock)
@@ -316,7 +316,7 @@ class Chain:
     def _build(self, config: TruckConfig) -> Iterator[Service]:
         body = Body.of(config)
         yield from build_estimation(config, self.bus, self._clock, body)
-        places = ReplayedPlaces(self._clock, self._goal_record, self._book)
+        places = ReplayedActors(self._clock, self._goal_record, self._book)
         planners = build_planners(config, self.bus, self._clock, body, places)
         wanted = TICKS.keys() if config.planner is None else {*TICKS, PathService.name}
         yield from (service for service in planners if service.name in wanted)

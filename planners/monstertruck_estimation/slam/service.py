@@ -38,7 +38,7 @@ from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
-PATIENCE: Final = 180.0
+START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: numba compiles at the first start."""
 HISTORY: Final = 128
 """Poses of odometry kept: 2.5 s at 50 Hz."""
@@ -119,7 +119,12 @@ class SlamService:
         """
         config = self._config
         worker = WorkerActor(
-            self.name, TARGET, self._clock, latency=config.latency, deadline=config.deadline, patience=PATIENCE
+            self.name,
+            TARGET,
+            self._clock,
+            latency=config.latency,
+            deadline=config.deadline,
+            start_timeout=START_TIMEOUT,
         )
         async with worker:
             await worker.start()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup, Way
 from monstertruck_planners.goals.parts import level, pose_of
-from monstertruck_runtime.actors.placement import Actor
+from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox

@@ -52,7 +52,7 @@ class PlanTask:
     afresh: bool = False
     """Forget the route so far."""
     via: tuple[Place, ...] = ()
-    """Places of the base to be passed before the goal."""
+    """ActorFactory of the base to be passed before the goal."""
 
 
 @dataclass(frozen=True, slots=True)

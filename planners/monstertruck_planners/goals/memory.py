@@ -17,7 +17,7 @@ THROUGH: Final = 0.10
 
 
 class ObstacleMemory:
-    """Places of obstacles in the map's frame, at most one for each square.
+    """ActorFactory of obstacles in the map's frame, at most one for each square.
 
     Args:
         square: m.

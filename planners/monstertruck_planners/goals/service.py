@@ -16,7 +16,7 @@ from monstertruck_planners.goals.lead import AT_REST, Lead
 from monstertruck_planners.goals.lookout import blocked, way_ahead
 from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
 from monstertruck_planners.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
-from monstertruck_runtime.actors.placement import Actor
+from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.ports import Ready

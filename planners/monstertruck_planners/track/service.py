@@ -15,7 +15,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
 from monstertruck_planners.track.segments import Progress, SegmentedPath
-from monstertruck_runtime.actors.placement import Actor
+from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value

@@ -1,17 +1,143 @@
-"""Stateful workers: a process each, driven step by step, with deadline, kill and restart."""
+"""Where a pure step runs: in the loop, in a worker process, or on another machine; one word changes it.
+
+Actors keep their state from step to step. A worker is a process of its own, with deadline, kill and restart.
+"""
 
 import asyncio
+import heapq
+import importlib
+import itertools
+import weakref
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Protocol, Self, TypeVar
 
-from monstertruck_runtime.actors.agenda import agenda_of
 from monstertruck_runtime.actors.process import WorkerProcess
+from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
 from monstertruck_runtime.errors import WorkerTimeoutError
 from monstertruck_runtime.threads import in_thread
 
 T = TypeVar("T")
+
+Placement = Literal["loop", "worker", "remote"]
+
+
+class Actor(Protocol):
+    """Something that takes steps, one at a time, and keeps its state between them until one fails."""
+
+    async def __aenter__(self) -> Self:
+        """Begin."""
+        ...
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End."""
+        ...
+
+    async def start(self) -> None:
+        """Make ready for the first step."""
+        ...
+
+    async def step(self, inputs: Any) -> Any:
+        """Take one step."""
+        ...
+
+
+class ResultDelivery(Protocol):
+    """When a worker's result counts on a virtual clock."""
+
+    async def wait(self, clock: VirtualClock, due: int) -> None:
+        """Return when a result that is due at ``due``, ns, may be delivered."""
+        ...
+
+
+class VirtualDelivery:
+    """Delivers results at their instants; those due together in the order in which they were submitted."""
+
+    def __init__(self) -> None:
+        self._sequence = itertools.count()
+        self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
+
+    async def wait(self, clock: VirtualClock, due: int) -> None:
+        """Wait until ``due``, ns."""
+        delivered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._waiting, (due, next(self._sequence), delivered))
+        self._set_timer(clock, due)
+        await delivered
+
+    def _set_timer(self, clock: VirtualClock, due: int) -> None:
+        left = max(0, due - clock.now()) / SECOND
+        asyncio.get_running_loop().call_later(left, self._deliver, clock, due)
+
+    def _deliver(self, clock: VirtualClock, due: int) -> None:
+        now = clock.now()
+        if now < due:  # timers count in float seconds
+            self._set_timer(clock, due)
+            return
+        while self._waiting and self._waiting[0][0] <= now:
+            delivered = heapq.heappop(self._waiting)[2]
+            if not delivered.done():
+                delivered.set_result(None)
+
+
+_deliveries: "weakref.WeakKeyDictionary[VirtualClock, ResultDelivery]" = weakref.WeakKeyDictionary()
+
+
+def delivery_of(clock: VirtualClock) -> ResultDelivery:
+    """The one delivery that all workers of a clock share."""
+    return _deliveries.setdefault(clock, VirtualDelivery())
+
+
+def use_delivery(clock: VirtualClock, delivery: ResultDelivery) -> None:
+    """Let ``delivery`` decide when the results of all workers of ``clock`` count."""
+    _deliveries[clock] = delivery
+
+
+class LoopActor:
+    """The step in the caller's own loop, which stands still meanwhile.
+
+    On the virtual clock the result is delivered when a worker's would be.
+
+    Args:
+        target: ``module:factory``, as for ``WorkerActor``.
+        clock: time.
+        latency: declared seconds of a step; virtual clock only.
+    """
+
+    def __init__(self, target: str, clock: Clock, latency: float) -> None:
+        self._target = target
+        self._clock = clock
+        self._latency = latency
+        self._step: Any = None
+
+    async def start(self) -> None:
+        """Build what takes the steps."""
+        if self._step is None:
+            module, _, factory = self._target.partition(":")
+            self._step = getattr(importlib.import_module(module), factory)()
+
+    async def step(self, inputs: Any) -> Any:
+        """Take one step; if it raises, the next one finds a fresh state."""
+        await self.start()
+        submitted = self._clock.now()
+        try:
+            outputs = self._step.step(inputs)
+        except BaseException:
+            self._step = None
+            raise
+        if isinstance(self._clock, VirtualClock):
+            await delivery_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
+        return outputs
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._step = None
 
 
 class WorkerActor:
@@ -31,7 +157,7 @@ class WorkerActor:
         latency: declared seconds of a step on the reference computer.
         deadline: seconds after which a step is given up.
         cpu_factor: how much slower than the reference the studied computer is; virtual clock only.
-        patience: real seconds a start may take and, on the virtual clock, a result may be late.
+        start_timeout: real seconds a start may take and, on the virtual clock, a result after its virtual instant.
     """
 
     def __init__(
@@ -43,19 +169,19 @@ class WorkerActor:
         latency: float,
         deadline: float,
         cpu_factor: float = 1.0,
-        patience: float = 30.0,
+        start_timeout: float = 30.0,
     ) -> None:
         self._name = name
         self._target = target
         self._clock = clock
         self._latency = latency * cpu_factor
         self._deadline = deadline
-        self._patience = patience
+        self._start_timeout = start_timeout
         self._virtual = isinstance(clock, VirtualClock)
         self._process: WorkerProcess | None = None
         self._built = False
-        """The process has told that it can take steps."""
-        self._turn = asyncio.Lock()
+        """The process has reported that it can take steps."""
+        self._lock = asyncio.Lock()
 
     @property
     def pid(self) -> int | None:
@@ -65,13 +191,13 @@ class WorkerActor:
     async def start(self) -> None:
         """Start the process if it does not run; a step does so itself, this only saves it the wait.
 
-        On the virtual clock nobody waits: the process starts beside the run, and the first step raises what went wrong.
+        On the virtual clock it returns at once: the first step waits for the process and raises what went wrong.
 
         Raises:
             WorkerError: the factory failed (wall clock).
-            WorkerTimeoutError: it took longer than ``patience`` (wall clock).
+            WorkerTimeoutError: it took longer than ``start_timeout`` (wall clock).
         """
-        async with self._turn:
+        async with self._lock:
             if not self._virtual:
                 await self._started()
             elif self._process is None:
@@ -84,7 +210,7 @@ class WorkerActor:
             WorkerTimeoutError: the deadline passed; the worker was killed.
             WorkerError: the worker raised or died.
         """
-        async with self._turn:
+        async with self._lock:
             process = await self._started()
             try:
                 return await (self._step_virtually if self._virtual else self._step_really)(process, inputs)
@@ -112,12 +238,12 @@ class WorkerActor:
     async def _build(self, process: WorkerProcess) -> None:
         try:
             if self._virtual:
-                process.receive(self._patience)
+                process.receive(self._start_timeout)
             else:
-                async with self._clock.deadline(self._patience):
+                async with self._clock.deadline(self._start_timeout):
                     await asyncio.to_thread(process.receive)
         except TimeoutError:
-            msg = f"worker {self._name} did not start within {self._patience} s"
+            msg = f"worker {self._name} did not start within {self._start_timeout} s"
             raise WorkerTimeoutError(msg) from None
         self._built = True
 
@@ -131,11 +257,11 @@ class WorkerActor:
     async def _step_virtually(self, process: WorkerProcess, inputs: Any) -> Any:
         submitted = self._clock.now()
         try:
-            process.send(inputs, self._patience)
+            process.send(inputs)
             if self._latency <= self._deadline:
                 assert isinstance(self._clock, VirtualClock)
-                await agenda_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
-                return process.receive(self._patience)
+                await delivery_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
+                return process.receive(self._start_timeout)
         except TimeoutError:
             pass
         await self._clock.sleep_until(submitted + round(self._deadline * SECOND))
@@ -145,7 +271,7 @@ class WorkerActor:
         return WorkerTimeoutError(f"worker {self._name} missed its deadline of {self._deadline} s and was killed")
 
     def _spawn(self) -> WorkerProcess:
-        self._process, self._built = WorkerProcess(self._name, self._target), False
+        self._process, self._built = WorkerProcess(self._name, self._target, self._start_timeout), False
         return self._process
 
     async def _discard(self) -> None:
@@ -164,3 +290,37 @@ class WorkerActor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         await self.close()
+
+
+class ActorFactory:
+    """Makes the actors of one daemon.
+
+    Args:
+        clock: time.
+        remote: where other machines call for work.
+    """
+
+    def __init__(self, clock: Clock, remote: RemoteWorkQueue) -> None:
+        self._clock = clock
+        self._remote = remote
+
+    def actor(
+        self,
+        placement: Placement,
+        name: str,
+        target: str,
+        *,
+        latency: float,
+        deadline: float,
+        start_timeout: float = 30.0,
+    ) -> Actor:
+        """An actor; arguments as of ``WorkerActor``, those of no use to a placement are left out."""
+        match placement:
+            case "loop":
+                return LoopActor(target, self._clock, latency)
+            case "worker":
+                return WorkerActor(
+                    name, target, self._clock, latency=latency, deadline=deadline, start_timeout=start_timeout
+                )
+            case "remote":
+                return self._remote.actor(name, self._clock, deadline=deadline, start_timeout=start_timeout)

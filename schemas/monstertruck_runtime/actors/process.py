@@ -1,14 +1,28 @@
-"""The parent's blocking hold on one worker process."""
+"""A worker process: the parent's blocking hold on it, and its main program.
 
+``python -m monstertruck_runtime.actors.process FD MODULE:FACTORY`` builds the worker and answers steps until the parent
+is gone, however busy it is then. Signals meant for the daemon's whole group are ignored: the parent decides when its
+workers end. Imports stay few, for every worker pays for them.
+"""
+
+import importlib
 import os
+import queue
+import signal
 import socket
+import struct
 import subprocess
 import sys
+import threading
+import traceback
+from multiprocessing.connection import Connection
 from typing import Any
 
-from monstertruck_runtime.actors import channel
 from monstertruck_runtime.errors import WorkerError
 
+NICE = 5
+_TIMEVAL = struct.Struct("@ll")
+"""Seconds and microseconds, see socket(7)."""
 _SINGLE_THREADED = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA", "VECLIB")
 }
@@ -20,14 +34,17 @@ class WorkerProcess:
     Args:
         name: for error texts.
         target: ``module:factory``; what the factory returns has ``step(inputs) -> outputs``.
+        send_timeout: seconds after which a process that takes no inputs is given up.
     """
 
-    def __init__(self, name: str, target: str) -> None:
+    def __init__(self, name: str, target: str, send_timeout: float = 30.0) -> None:
         self._name = name
-        self._end, theirs = socket.socketpair()
+        ours, theirs = socket.socketpair()
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*divmod(round(send_timeout * 1e6), 10**6)))
+        self._connection = Connection(ours.detach())
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
-                [sys.executable, "-m", "monstertruck_runtime.actors.child", str(theirs.fileno()), target],
+                [sys.executable, "-m", __name__, str(theirs.fileno()), target],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=2,
@@ -39,31 +56,28 @@ class WorkerProcess:
         """Process number."""
         return self._process.pid
 
-    def send(self, inputs: Any, timeout: float | None = None) -> None:
+    def send(self, inputs: Any) -> None:
         """Submit a step.
 
         Raises:
-            WorkerError: the process is gone.
-            TimeoutError: it took nothing for ``timeout`` seconds.
+            WorkerError: the process is gone, or stopped.
         """
-        self._end.settimeout(timeout)
         try:
-            channel.send(self._end, inputs)
-        except TimeoutError:
-            raise
+            self._connection.send(inputs)
         except OSError as error:
             raise WorkerError(self._gone()) from error
 
     def receive(self, timeout: float | None = None) -> Any:
-        """Wait for the outputs of a step, or for the news that the worker is built.
+        """Wait for the outputs of a step, or for the message that the worker is built.
 
         Raises:
             WorkerError: the process is gone or its code raised; the text holds its traceback.
             TimeoutError: nothing came for ``timeout`` seconds.
         """
-        self._end.settimeout(timeout)
         try:
-            success, value = channel.receive(self._end)
+            if not self._connection.poll(timeout):
+                raise TimeoutError
+            success, value = self._connection.recv()
         except TimeoutError:
             raise
         except (EOFError, OSError) as error:
@@ -79,10 +93,43 @@ class WorkerProcess:
         return self.receive()
 
     def kill(self) -> None:
-        """End the process at once, whatever it does, and leave no zombie."""
+        """End the process at once, whatever it does, and leave no zombie.
+
+        The connection ends with its last user: a thread may still wait for it.
+        """
         self._process.kill()
         self._process.wait()
-        self._end.close()
 
     def _gone(self) -> str:
         return f"worker {self._name} (process {self._process.pid}) is gone"
+
+
+def main() -> int:
+    """Serve one parent; returns the exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(NICE)
+    connection = Connection(int(sys.argv[1]))
+    steps: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(connection, steps), daemon=True).start()
+    try:
+        module, _, factory = sys.argv[2].partition(":")
+        worker = getattr(importlib.import_module(module), factory)()
+        connection.send((True, None))
+        while True:
+            connection.send((True, worker.step(steps.get())))
+    except Exception:  # noqa: BLE001  # reported to the parent, which decides
+        connection.send((False, traceback.format_exc()))
+        return 1
+
+
+def _read(connection: Connection, steps: "queue.SimpleQueue[Any]") -> None:
+    try:
+        while True:
+            steps.put(connection.recv())
+    except (EOFError, OSError):
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

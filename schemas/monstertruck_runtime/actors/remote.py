@@ -1,17 +1,32 @@
 """Steps taken on another machine: it calls the robot for work and brings the outputs back.
 
 So the robot listens as always, and whoever may call it may compute for it (``monstertruckd plan-server``). What travels
-is JSON of listed classes, see ``codec``; nothing that comes in is executed.
+is JSON of known classes, see ``StepCodec``; nothing that comes in is executed.
 """
 
 import asyncio
+import base64
+import dataclasses
+import importlib
 import json
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import AbstractAsyncContextManager
+from enum import Enum
+from functools import cached_property, partial
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self, get_type_hints
 
-from monstertruck_runtime.actors.codec import StepCodec
+import numpy as np
+
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError, WorkerError, WorkerTimeoutError
+from monstertruck_runtime.plugins import classes_in
+from monstertruck_runtime.threads import in_thread
+from monstertruck_schemas.base import Schema
+
+log = logging.getLogger(__name__)
 
 RPC: Final = "remote_step"
 POLL: Final = 2.0
@@ -20,6 +35,119 @@ PART: Final = 8192
 """Characters of outputs in one call."""
 MOST: Final = 1_000_000
 """Characters of outputs at all."""
+RETRY: Final = 1.0
+"""Seconds between two tries to reach a robot."""
+_DTYPES: Final = ("float64", "int8", "uint8", "int64")
+
+
+class StepCodec:
+    """Converts trees of known classes, arrays, tuples, lists, dicts with text keys, paths and scalars.
+
+    Args:
+        roots: dataclasses and ``Schema`` models that may travel. Known are these and every dataclass, model and enum
+            that their fields hold, the settings of plug-ins included.
+    """
+
+    def __init__(self, *roots: type[Any]) -> None:
+        self._roots = roots
+
+    @cached_property
+    def _classes(self) -> dict[str, type[Any]]:
+        found: dict[str, type[Any]] = {}
+        waiting = list(self._roots)
+        while waiting:
+            cls = waiting.pop()
+            if found.setdefault(_name(cls), cls) is cls and not issubclass(cls, Enum):
+                held = {inner for field in _annotations(cls) for inner in classes_in(field) if _travels(inner)}
+                waiting += held - set(found.values())
+        return found
+
+    def to_json(self, value: Any) -> Any:
+        """The value as what JSON can say.
+
+        Raises:
+            InputError: a class that is not known.
+        """
+        match value:
+            case Enum() if self._knows(value):
+                return {"enum": _name(type(value)), "value": value.value}
+            case None | bool() | int() | float() | str():
+                return value
+            case np.ndarray() if str(value.dtype) in _DTYPES:
+                data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
+                return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
+            case Path():
+                return {"path": str(value)}
+            case tuple():
+                return {"tuple": [self.to_json(inner) for inner in value]}
+            case list():
+                return [self.to_json(inner) for inner in value]
+            case dict():
+                return {"dict": [[key, self.to_json(inner)] for key, inner in value.items()]}
+        if not self._knows(value):
+            raise InputError(f"step: no {type(value).__name__} travels to another machine")
+        names = type(value).model_fields if isinstance(value, Schema) else [f.name for f in dataclasses.fields(value)]
+        return {
+            "class": _name(type(value)),
+            "fields": {field: self.to_json(getattr(value, field)) for field in names},
+        }
+
+    def from_json(self, value: Any) -> Any:
+        """Back.
+
+        Raises:
+            InputError: nothing that ``to_json`` makes.
+        """
+        try:
+            return self._back(value)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"step: not readable: {type(error).__name__}: {error}") from error
+
+    def _knows(self, value: Any) -> bool:
+        return self._classes.get(_name(type(value))) is type(value)
+
+    def _back(self, value: Any) -> Any:
+        match value:
+            case {"enum": name, "value": inner}:
+                return self._named(name, Enum)(inner)
+            case {"array": dtype, "shape": shape, "data": data} if dtype in _DTYPES:
+                return np.frombuffer(base64.b64decode(data, validate=True), dtype).reshape(shape)
+            case {"path": text}:
+                return Path(text)
+            case {"tuple": inner}:
+                return tuple(map(self._back, inner))
+            case {"dict": rows}:
+                return {key: self._back(inner) for key, inner in rows}
+            case {"class": name, "fields": fields}:
+                return self._named(name, object)(**{field: self._back(inner) for field, inner in fields.items()})
+            case list():
+                return [self._back(inner) for inner in value]
+            case None | bool() | int() | float() | str():
+                return value
+        raise ValueError(f"unknown object {str(value)[:64]}")
+
+    def _named(self, name: str, base: type[Any]) -> type[Any]:
+        found = self._classes[name]
+        if not issubclass(found, base):
+            raise TypeError(f"{name} is no {base.__name__}")
+        return found
+
+
+def _name(cls: type[Any]) -> str:
+    """Plug-ins of two distributions may use one class name."""
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _travels(cls: type[Any]) -> bool:
+    return dataclasses.is_dataclass(cls) or issubclass(cls, Schema | Enum)
+
+
+def _annotations(cls: type[Any]) -> list[Any]:
+    """Of the fields of a dataclass or model."""
+    if issubclass(cls, Schema):
+        return [part for field in cls.model_fields.values() for part in (field.annotation, *field.metadata)]
+    hints = get_type_hints(cls, include_extras=True)
+    return [hints[field.name] for field in dataclasses.fields(cls)]
 
 
 class RemoteActor:
@@ -30,20 +158,20 @@ class RemoteActor:
         codec: of their inputs and outputs.
         clock: time.
         deadline: seconds for a step.
-        patience: seconds to wait for a caller.
+        start_timeout: seconds to wait for a caller.
     """
 
-    def __init__(self, name: str, codec: StepCodec, clock: Clock, *, deadline: float, patience: float) -> None:
+    def __init__(self, name: str, codec: StepCodec, clock: Clock, *, deadline: float, start_timeout: float) -> None:
         self._name, self._codec, self._clock = name, codec, clock
-        self._deadline, self._patience = deadline, patience
+        self._deadline, self._start_timeout = deadline, start_timeout
         self._server: str | None = None
         self._changed = False
         self._number = 0
         self._task: Any = None
         self._result: asyncio.Future[Any] | None = None
         self._parts: list[str] = []
-        self._news = asyncio.Event()
-        self._turn = asyncio.Lock()
+        self._update = asyncio.Event()
+        self._lock = asyncio.Lock()
 
     async def start(self) -> None:
         """Wait for the first call.
@@ -52,11 +180,11 @@ class RemoteActor:
             WorkerTimeoutError: none came in time.
         """
         try:
-            async with self._clock.deadline(self._patience):
+            async with self._clock.deadline(self._start_timeout):
                 while self._server is None:
                     await self._wait()
         except TimeoutError:
-            raise WorkerTimeoutError(f"{self._name}: no plan-server called for {self._patience:g} s") from None
+            raise WorkerTimeoutError(f"{self._name}: no plan-server called for {self._start_timeout:g} s") from None
         self._changed = False
 
     async def step(self, inputs: Any) -> Any:
@@ -66,14 +194,14 @@ class RemoteActor:
             WorkerTimeoutError: no outputs in time.
             WorkerError: the step failed, or another server took over, which knows nothing yet.
         """
-        async with self._turn:
+        async with self._lock:
             if self._changed:
                 self._changed = False
                 raise WorkerError(f"{self._name}: another plan-server took over")
             self._number += 1
             self._task = self._codec.to_json(inputs)
             result = self._result = asyncio.get_running_loop().create_future()
-            self._tell()
+            self._notify()
             try:
                 async with self._clock.deadline(self._deadline):
                     return await result
@@ -112,7 +240,7 @@ class RemoteActor:
         if self._changed and self._result is not None and not self._result.done():
             self._changed = False
             self._result.set_exception(WorkerError(f"{self._name}: another plan-server took over"))
-        self._tell()
+        self._notify()
 
     def _take(self, payload: dict[str, Any]) -> bool:
         """Whether these outputs are complete."""
@@ -135,12 +263,12 @@ class RemoteActor:
             result.set_exception(WorkerError(f"{self._name}: {error}"))
         return True
 
-    def _tell(self) -> None:
-        news, self._news = self._news, asyncio.Event()
-        news.set()
+    def _notify(self) -> None:
+        update, self._update = self._update, asyncio.Event()
+        update.set()
 
     async def _wait(self) -> None:
-        await self._news.wait()
+        await self._update.wait()
 
     async def __aenter__(self) -> Self:
         return self
@@ -151,7 +279,7 @@ class RemoteActor:
         self._task = None
 
 
-class RemoteDesk:
+class RemoteWorkQueue:
     """The remote actors of a daemon by name.
 
     Args:
@@ -162,9 +290,9 @@ class RemoteDesk:
         self._codec = codec
         self._actors: dict[str, RemoteActor] = {}
 
-    def actor(self, name: str, clock: Clock, *, deadline: float, patience: float) -> RemoteActor:
+    def actor(self, name: str, clock: Clock, *, deadline: float, start_timeout: float) -> RemoteActor:
         """A new one."""
-        self._actors[name] = RemoteActor(name, self._codec, clock, deadline=deadline, patience=patience)
+        self._actors[name] = RemoteActor(name, self._codec, clock, deadline=deadline, start_timeout=start_timeout)
         return self._actors[name]
 
     async def serve(self, payload: dict[str, Any]) -> dict[str, Any]:
@@ -178,3 +306,85 @@ class RemoteDesk:
         if actor is None:
             raise NotFoundError(f"{payload.get('actor')!r} is not placed on another machine")
         return await actor.serve(payload)
+
+
+class Caller(Protocol):
+    """What is needed of a ``TruckClient``."""
+
+    @property
+    def source(self) -> str:
+        """Who calls."""
+        ...
+
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Call the robot."""
+        ...
+
+
+async def serve(
+    clock: Clock,
+    connect: Callable[[], AbstractAsyncContextManager[Caller]],
+    steps: Mapping[str, str],
+    codec: StepCodec,
+) -> None:
+    """Serve a robot until cancelled, over all its restarts.
+
+    Args:
+        clock: time.
+        connect: opens a client of the robot; its calls may take twice ``POLL``.
+        steps: what can be computed here: ``module:factory`` by name.
+        codec: of inputs and outputs.
+    """
+    while True:
+        try:
+            async with (
+                connect() as client,
+                asyncio.TaskGroup() as tasks,
+            ):
+                for name, target in steps.items():
+                    tasks.create_task(work(client, clock, name, target, codec, f"{client.source[:40]}.{clock.now():x}"))
+        except* TruckError as group:
+            log.warning("%s; tries again", group.exceptions[0])
+        await clock.sleep(RETRY)
+
+
+async def work(caller: Caller, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
+    """Call for one kind of steps, take them, bring the outputs; until cancelled.
+
+    Raises:
+        TruckError: the robot is gone.
+    """
+    who = {"actor": name, "server": server}
+    step = await in_thread(partial(_build, target))
+    reply: dict[str, Any] = {}
+    done = 0
+    while True:
+        try:
+            reply = await caller.call(RPC, {**who, "after": done}) if "inputs" not in reply else reply
+        except NotFoundError as error:
+            if "not placed" not in str(error) and "no rpc" not in str(error):
+                raise
+            await clock.sleep(RETRY)
+            continue
+        if "inputs" not in reply:
+            continue
+        done = int(reply["number"])
+        failed = False
+        try:
+            text = await in_thread(partial(_answer, step, codec, reply["inputs"]))
+        except Exception as error:  # noqa: BLE001 - told to the robot, which decides
+            failed, text = True, f"{type(error).__name__}: {error}"
+            step = await in_thread(partial(_build, target))
+        parts = [text[i : i + PART] for i in range(0, len(text), PART)] or [""]
+        for i, part in enumerate(parts, start=1):
+            outputs = {"number": done, "part": part, "last": i == len(parts), "failed": failed}
+            reply = await caller.call(RPC, {**who, "after": done, **outputs})
+
+
+def _build(target: str) -> Any:
+    module, _, factory = target.partition(":")
+    return getattr(importlib.import_module(module), factory)()
+
+
+def _answer(step: Any, codec: StepCodec, inputs: Any) -> str:
+    return json.dumps(codec.to_json(step.step(codec.from_json(inputs))))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from monstertruck_runtime.actors.codec import StepCodec
+from monstertruck_runtime.actors.remote import StepCodec
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, classes_in, kind_of
 from monstertruck_schemas.base import Schema

@@ -1,4 +1,4 @@
-"""Places of which only a part was seen before, found again at the end of a run."""
+"""ActorFactory of which only a part was seen before, found again at the end of a run."""
 
 import math
 

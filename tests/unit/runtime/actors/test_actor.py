@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.actors.actor import WorkerActor, delivery_of
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
 
@@ -50,7 +50,7 @@ async def test_a_worker_is_niced_single_threaded_and_light():
     assert facts["pid"] != os.getpid()
     assert facts["nice"] >= os.nice(0) + 5
     assert facts["threads"] == "1"
-    assert not {"zenoh", "asyncio", "pydantic", "multiprocessing"} & set(facts["modules"])
+    assert not {"zenoh", "asyncio", "pydantic"} & set(facts["modules"])
 
 
 async def test_concurrent_steps_are_taken_in_order():
@@ -118,8 +118,8 @@ async def test_a_factory_that_fails_is_an_error_with_its_text():
             assert worker.pid is None
 
 
-async def test_a_start_takes_no_longer_than_the_patience():
-    async with counter(WallClock(), "slow_to_build", patience=0.3) as worker:
+async def test_a_start_takes_no_longer_than_its_timeout():
+    async with counter(WallClock(), "slow_to_build", start_timeout=0.3) as worker:
         with pytest.raises(WorkerTimeoutError, match=r"did not start within 0.3 s"):
             await worker.step(None)
     async with counter(WallClock(), "nothing_here") as worker:
@@ -180,6 +180,21 @@ async def test_a_worker_ends_with_its_killed_parent(tmp_path: Path):
             await asyncio.sleep(0.01)
 
 
+def test_a_stopped_worker_on_the_virtual_clock_is_killed_too():
+    async def main(clock: VirtualClock) -> int:
+        async with counter(clock, start_timeout=5.0) as worker:
+            await worker.step(None)
+            pid = worker.pid
+            assert pid is not None
+            os.kill(pid, signal.SIGSTOP)
+            with pytest.raises(WorkerError):
+                await worker.step({"double": np.zeros(1_000_000)})
+            assert gone(pid)
+            return await worker.step(None)
+
+    assert run_virtual(main) == 1
+
+
 def test_on_the_virtual_clock_a_result_comes_exactly_at_its_declared_latency():
     async def main(clock: VirtualClock) -> list[tuple[int, int]]:
         got = []
@@ -235,7 +250,7 @@ def test_too_slow_a_computer_misses_the_deadline_on_the_virtual_clock():
 
 def test_a_hang_on_the_virtual_clock_ends_at_the_deadline_too():
     async def main(clock: VirtualClock) -> tuple[float, int]:
-        async with counter(clock, latency=0.2, deadline=0.5, patience=1.0) as worker:
+        async with counter(clock, latency=0.2, deadline=0.5, start_timeout=1.0) as worker:
             start = clock.now()
             with pytest.raises(WorkerTimeoutError):
                 await worker.step({"sleep": 60})
@@ -249,7 +264,7 @@ def test_a_hang_on_the_virtual_clock_ends_at_the_deadline_too():
 
 def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
     async def main(clock: VirtualClock) -> None:
-        async with counter(clock, "slow_to_build", patience=0.3) as worker:
+        async with counter(clock, "slow_to_build", start_timeout=0.3) as worker:
             with pytest.raises(WorkerTimeoutError, match="did not start"):
                 await worker.step(None)
 
@@ -261,7 +276,7 @@ def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
 )
 def test_on_the_virtual_clock_a_worker_starts_beside_the_run(target: str, error: type[Exception] | None):
     async def main(clock: VirtualClock) -> None:
-        async with counter(clock, target, patience=0.3 if target == "slow_to_build" else 30.0) as worker:
+        async with counter(clock, target, start_timeout=0.3 if target == "slow_to_build" else 30.0) as worker:
             await worker.start()
             pid = worker.pid
             await worker.start()
@@ -276,3 +291,25 @@ def test_on_the_virtual_clock_a_worker_starts_beside_the_run(target: str, error:
             assert gone(pid)
 
     run_virtual(main)
+
+
+def test_results_due_together_are_delivered_in_the_order_of_waiting_and_cancelled_ones_are_skipped():
+    async def main(clock: VirtualClock) -> list[int]:
+        delivery = delivery_of(clock)
+        assert delivery is delivery_of(clock)
+        delivered: list[int] = []
+        same = clock.now() + SECOND
+
+        async def wait(number: int, due: int) -> None:
+            await delivery.wait(clock, due)
+            assert clock.now() == pytest.approx(due, abs=10)
+            delivered.append(number)
+
+        tasks = [asyncio.create_task(wait(number, same)) for number in range(50)]
+        tasks += [asyncio.create_task(wait(99, same - 1000)), asyncio.create_task(wait(100, same + 1000))]
+        await clock.sleep(0.5)
+        tasks[7].cancel()
+        await asyncio.wait(tasks)
+        return delivered
+
+    assert run_virtual(main) == [99, *(number for number in range(50) if number != 7), 100]

@@ -13,8 +13,8 @@ from monstertruck_planners.goals.exchange import PlanAnswer
 from monstertruck_planners.goals.planning import PlanningStep
 from monstertruck_planners.steps import CODEC, STEPS
 from monstertruck_planners.track.service import TrackingWorker, TrackInput
-from monstertruck_runtime.actors import server as plan_server
-from monstertruck_runtime.actors.remote import RemoteDesk
+from monstertruck_runtime.actors import remote as plan_server
+from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import InputError, NotFoundError, WorkerError, WorkerTimeoutError
 from monstertruck_schemas.base import Schema
@@ -25,21 +25,21 @@ from tests.unit.runtime.actors.step_kit import numbers, plan_task, track_inputs
 class Wire:
     """A robot that is called: everything goes through JSON."""
 
-    def __init__(self, desk: RemoteDesk) -> None:
-        self._desk = desk
+    def __init__(self, queue: RemoteWorkQueue) -> None:
+        self._queue = queue
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
         assert rpc == "remote_step"
-        return json.loads(json.dumps(await self._desk.serve(json.loads(json.dumps(payload)))))
+        return json.loads(json.dumps(await self._queue.serve(json.loads(json.dumps(payload)))))
 
 
 def test_planner_and_tracker_give_the_same_on_another_machine():
     async def main(clock: Clock) -> tuple[PlanAnswer, list[Any]]:
-        desk = RemoteDesk(CODEC)
-        planning = desk.actor("planning", clock, deadline=60.0, patience=60.0)
-        tracking = desk.actor("tracking", clock, deadline=60.0, patience=60.0)
+        queue = RemoteWorkQueue(CODEC)
+        planning = queue.actor("planning", clock, deadline=60.0, start_timeout=60.0)
+        tracking = queue.actor("tracking", clock, deadline=60.0, start_timeout=60.0)
         servers = [
-            asyncio.create_task(plan_server.work(Wire(desk), clock, name, STEPS[name], CODEC, "s1"))
+            asyncio.create_task(plan_server.work(Wire(queue), clock, name, STEPS[name], CODEC, "s1"))
             for name in ("planning", "tracking")
         ]
         try:
@@ -66,11 +66,11 @@ def test_planner_and_tracker_give_the_same_on_another_machine():
 
 def test_failures_reach_the_robot_as_worker_errors():
     async def main(clock: Clock) -> None:
-        desk = RemoteDesk(CODEC)
-        actor = desk.actor("tracking", clock, deadline=0.2, patience=0.05)
+        queue = RemoteWorkQueue(CODEC)
+        actor = queue.actor("tracking", clock, deadline=0.2, start_timeout=0.05)
         with pytest.raises(WorkerTimeoutError, match="no plan-server"):
             await actor.start()
-        server = asyncio.create_task(plan_server.work(Wire(desk), clock, "tracking", STEPS["tracking"], CODEC, "s1"))
+        server = asyncio.create_task(plan_server.work(Wire(queue), clock, "tracking", STEPS["tracking"], CODEC, "s1"))
         await asyncio.sleep(0.05)
         await actor.start()
         with pytest.raises(WorkerError, match="expected a setup"):
@@ -78,7 +78,7 @@ def test_failures_reach_the_robot_as_worker_errors():
         server.cancel()
         with pytest.raises(WorkerTimeoutError, match="no outputs"):
             await actor.step(TrackInput(0, {}))
-        await desk.serve({"actor": "tracking", "server": "s2", "part": "", "last": True, "after": 99, "number": 0})
+        await queue.serve({"actor": "tracking", "server": "s2", "part": "", "last": True, "after": 99, "number": 0})
         with pytest.raises(WorkerError, match="took over"):
             await actor.step(TrackInput(0, {}))
 
@@ -87,12 +87,12 @@ def test_failures_reach_the_robot_as_worker_errors():
 
 def test_calls_that_make_no_sense_are_refused():
     async def main(clock: Clock) -> None:
-        desk = RemoteDesk(CODEC)
-        desk.actor("planning", clock, deadline=1.0, patience=1.0)
+        queue = RemoteWorkQueue(CODEC)
+        queue.actor("planning", clock, deadline=1.0, start_timeout=1.0)
         with pytest.raises(NotFoundError, match="not placed"):
-            await desk.serve({"actor": "tracking", "server": "s"})
+            await queue.serve({"actor": "tracking", "server": "s"})
         with pytest.raises(InputError, match="server"):
-            await desk.serve({"actor": "planning"})
+            await queue.serve({"actor": "planning"})
 
     run_wall(main)
 

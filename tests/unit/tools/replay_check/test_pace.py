@@ -2,7 +2,7 @@
 
 import asyncio
 
-from monstertruck_runtime.actors.agenda import agenda_of, use_agenda
+from monstertruck_runtime.actors.actor import delivery_of, use_delivery
 from monstertruck_runtime.clock import SECOND, VirtualLoop
 from monstertruck_runtime.schedule import Schedule
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
@@ -53,10 +53,10 @@ def test_others_keep_the_time_of_the_loop_to_the_nanosecond():
 def test_results_of_workers_count_when_they_are_called_in_their_order():
     async def main(clock):
         turns, told = RecordedTurns(), []
-        use_agenda(clock, turns)
+        use_delivery(clock, turns)
 
         async def step(name):
-            await agenda_of(clock).wait(clock, 2 * SECOND)
+            await delivery_of(clock).wait(clock, 2 * SECOND)
             told.append((name, clock.now()))
 
         turns.next()  # nobody waits
