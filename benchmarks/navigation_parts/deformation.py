@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 
-from monstertruck_planners.local.api import Session
-from monstertruck_planners.local.catalog import make_deformer
-from monstertruck_planners.local.config import DeformConfig, PublishedConfig, RsbandConfig, TebConfig
+from monstertruck_planners.local.api import LocalPlannerState
+from monstertruck_planners.local.catalog import make_local_planner
+from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
@@ -38,7 +38,7 @@ ANGLE = 0.4
 
 def run(options: Options) -> Part:
     part = Part()
-    ours: dict[str, DeformConfig] = {s: RsbandConfig(strategy=s) for s in STRATEGIES}
+    ours: dict[str, LocalPlannerConfig] = {s: RsbandConfig(strategy=s) for s in STRATEGIES}
     ours["teb"] = TebConfig()
     published = {s: PublishedConfig(strategy=s) for s in STRATEGIES}
     scenarios = SCENARIOS[:1] if options.quick else SCENARIOS
@@ -65,11 +65,11 @@ def run(options: Options) -> Part:
     return part
 
 
-def drive(scenario: Scenario, car: str, config: DeformConfig, limit: float = LIMIT) -> dict:
+def drive(scenario: Scenario, car: str, config: LocalPlannerConfig, limit: float = LIMIT) -> dict:
     """One run in closed loop."""
     vehicle = Vehicle.truck(car)
-    guide, world, window = scenario.guide(vehicle), World(scenario), Window()
-    session, truck = Session(make_deformer(vehicle, config)), Truck(scenario.start)
+    route, world, window = scenario.route(vehicle), World(scenario), Window()
+    planner, state, truck = make_local_planner(vehicle, config), LocalPlannerState(), Truck(scenario.start)
     follower: Follower | None = None
     cycles, trace, reasons = [], [], []
     violations, contacts, touching, least, waited, t = 0, 0, False, math.inf, 0.0, 0.0
@@ -78,9 +78,10 @@ def drive(scenario: Scenario, car: str, config: DeformConfig, limit: float = LIM
         world.at(t, truck.pose)
         world.scan(truck.pose, window)
         begin = time.thread_time()
-        surroundings = window.field(world.known)
-        result = session.step(guide, surroundings, vehicle.reference_pose(truck.pose))
+        obstacles = window.field(world.known)
+        result = planner.plan(route, obstacles, vehicle.reference_pose(truck.pose), state)
         cycles.append((time.thread_time() - begin) * 1e3)
+        state = result.state
         if result.path is not None and len(result.path.segments):
             violations += beyond(result.path, vehicle)
             follower, waited = Follower(result.path, vehicle), 0.0
@@ -165,7 +166,7 @@ def draw(options: Options, rows: list[dict], scenarios: tuple[Scenario, ...]) ->
             world = World(scenario)
             world.at(30.0, None)
             ax.imshow(world.occupied, origin="lower", extent=(0, 7, 0, 5), cmap="Greys", alpha=0.6)
-            ax.plot(*scenario.guide(Vehicle.truck(car)).poses[:, :2].T, "k:", lw=1)
+            ax.plot(*scenario.route(Vehicle.truck(car)).poses[:, :2].T, "k:", lw=1)
             own = [row for row in rows if row["scenario"] == scenario.name and row["car"] == car]
             for row in own:
                 ax.plot(*np.array(row["peer"]["trace"])[:, :2].T, color="0.65", lw=1)

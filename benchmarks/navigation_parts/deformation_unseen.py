@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 
-from monstertruck_planners.local.config import DeformConfig, RsbandConfig, TebConfig
+from monstertruck_planners.local.config import LocalPlannerConfig, RsbandConfig, TebConfig
 from navigation_parts import Options, Part
 from navigation_parts.deformation import CARS, drive, told
 from navigation_parts.deformation_world import unseen
 
 SEEDS = 8
-METHODS: dict[str, DeformConfig] = {"rsband": RsbandConfig(), "teb": TebConfig()}
+METHODS: dict[str, LocalPlannerConfig] = {"rsband": RsbandConfig(), "teb": TebConfig()}
 
 
 def run(options: Options) -> Part:

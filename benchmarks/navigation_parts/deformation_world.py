@@ -8,7 +8,7 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import DistanceField, Footprint, clearance_to_points
-from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.api import PosePath
 from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
@@ -52,7 +52,7 @@ class Scenario:
     planned: bool = False
     """The route is planned on the known map, otherwise it is a straight line."""
 
-    def guide(self, vehicle: Vehicle) -> Guide:
+    def route(self, vehicle: Vehicle) -> PosePath:
         """The route."""
         start, goal = (np.array(p) for p in (self.start, self.goal))
         if self.planned:
@@ -60,11 +60,11 @@ class Scenario:
             planner = HybridPlanner(vehicle, HybridConfig(margin=0.05, effort=20_000))
             path = planner.plan(ground, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
             assert path is not None
-            return Guide.from_motion(path)
+            return PosePath.from_motion(path)
         x = np.arange(start[0], goal[0] + 0.04, 0.08)
         x[-1] = goal[0]
         poses = np.column_stack((x, np.full(len(x), start[1]), np.zeros(len(x))))
-        return Guide(moved(poses, vehicle.reference), np.ones(len(x)))
+        return PosePath(moved(poses, vehicle.reference), np.ones(len(x)))
 
 
 def _leaf(t: float) -> tuple[Box, ...]:

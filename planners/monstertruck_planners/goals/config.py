@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_planners.local.catalog import AnyDeformer
+from monstertruck_planners.local.catalog import AnyLocalPlanner
 from monstertruck_planners.route.catalog import AnyRoutePlanner
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_schemas.base import Schema
@@ -69,7 +69,7 @@ class PlannerConfig(Schema):
     """Greatest axle angle of routes, rad; what the truck has beyond is left to the tracker"""
     map: Path | None = None
     """map_server YAML file to plan on where there is no slam"""
-    deform: AnyDeformer | None = None
+    deform: AnyLocalPlanner | None = None
     """What leads the truck round things that stand on its route; null = the route is planned anew"""
     local: LocalConfig = LocalConfig()
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0

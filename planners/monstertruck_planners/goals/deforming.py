@@ -13,9 +13,9 @@ from monstertruck_planners.collision import OCCUPIED, DistanceField, first_conta
 from monstertruck_planners.goals.escape import placed, seen_from
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
 from monstertruck_planners.goals.planning import answer_of
-from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
-from monstertruck_planners.local.catalog import make_deformer
-from monstertruck_planners.local.core import passed
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
+from monstertruck_planners.local.catalog import make_local_planner
+from monstertruck_planners.local.core import nearest_pose
 from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import moved
@@ -23,7 +23,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid
 
 Array = NDArray[np.float64]
 
@@ -40,7 +39,7 @@ class DeformStep:
         self._setup: Setup | None = None
         self._known: DistanceField | None = None
         self._way: Way | None = None
-        self._rest: Guide | None = None
+        self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
 
     def step(self, task: DeformTask) -> DeformAnswer:
@@ -55,7 +54,7 @@ class DeformStep:
         if setup is None:
             raise InputError("deforming: expected a setup before anything else")
         if task.grid is not None:
-            self._known = _walls(task.grid)
+            self._known = DistanceField.from_grid(task.grid, unknown_blocks=False)
         points = self._look(setup, task.scan, task.pose)
         if task.way is not None:
             self._begin(task.way)
@@ -64,12 +63,12 @@ class DeformStep:
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
         if self._free(setup, here, task.pose, points):
-            self._rest, self._memory = None, Memory()
+            self._rest, self._state = None, LocalPlannerState()
             return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
-        result = self._deformer.deform(self._rest, self._window.field(self._known), here, self._memory)
-        self._memory = result.memory
+        result = self._planner.plan(self._rest, self._window.field(self._known), here, self._state)
+        self._state = result.state
         return self._told(result)
 
     def _set_up(self, setup: Setup) -> None:
@@ -80,7 +79,7 @@ class DeformStep:
         self._vehicle = Vehicle.truck(
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
-        self._deformer = make_deformer(self._vehicle, config.deform)
+        self._planner = make_local_planner(self._vehicle, config.deform)
         self._window = Window()
         if config.map is not None:
             world = load_map(config.map)
@@ -88,9 +87,9 @@ class DeformStep:
 
     def _begin(self, way: Way) -> None:
         self._way, self._place = way, 0
-        self._guide = Guide(moved(way.poses, self._vehicle.reference), way.directions)
+        self._guide = PosePath(moved(way.poses, self._vehicle.reference), way.directions)
         self._travelled = self._guide.travelled
-        self._rest, self._memory = None, Memory()
+        self._rest, self._state = None, LocalPlannerState()
 
     def _look(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
         """Put a scan into the window; returns its points in base. Beams without a return say nothing."""
@@ -109,13 +108,13 @@ class DeformStep:
         first += int(cusps[-1]) if len(cusps) else 0
         directions = guide.directions[first : last + 1].copy()
         directions[:1] = directions[1:2] if len(directions) > 1 else directions
-        self._place = first + passed(Guide(guide.poses[first : last + 1], directions), here)
+        self._place = first + nearest_pose(PosePath(guide.poses[first : last + 1], directions), here)
 
     def _free(self, setup: Setup, here: Array, pose: Pose, points: Array) -> bool:
         """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked."""
         local, guide, at = setup.config.local, self._guide, self._place
         deformed = self._rest is not None
-        if deformed and apart(guide.poses[at], here) > local.beside:
+        if deformed and pose_distance(guide.poses[at], here) > local.beside:
             return False
         end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
         way = np.vstack((here, guide.poses[at + 1 : end]))
@@ -123,7 +122,7 @@ class DeformStep:
         relative = np.column_stack((seen_from(moved(way, -self._vehicle.reference)[:, :2], pose), way[:, 2] - pose[2]))
         return first_contact(setup.footprint, relative, points, margin) is None
 
-    def _told(self, result: DeformResult) -> DeformAnswer:
+    def _told(self, result: LocalPlan) -> DeformAnswer:
         assert self._way is not None
         number, path = self._way.number, result.path
         if path is not None and path.length < SHORTEST and self._place == len(self._guide.poses) - 1:
@@ -135,8 +134,3 @@ class DeformStep:
             return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
         answer = answer_of(path, cost=path.length)
         return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
-
-
-def _walls(grid: Grid) -> DistanceField:
-    cells = grid.cells.reshape(grid.height, grid.width)
-    return DistanceField(cells >= OCCUPIED, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))

@@ -7,8 +7,8 @@ import numpy as np
 
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.goals.deforming import DeformStep
-from monstertruck_planners.local.api import Guide, Memory
-from monstertruck_planners.local.catalog import make_deformer
+from monstertruck_planners.local.api import LocalPlannerState, PosePath
+from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
 from monstertruck_planners.route.api import Vehicle
 
@@ -21,6 +21,6 @@ class DeformingWorker(DeformStep):
         cells = np.zeros((100, 100), np.bool_)
         cells[45:55, 45:55] = True
         poses = np.column_stack((np.linspace(0.5, 3.5, 31), np.full(31, 2.0), np.zeros(31)))
-        guide, surroundings = Guide(poses, np.ones(31)), DistanceField(cells, 0.04)
+        guide, surroundings = PosePath(poses, np.ones(31)), DistanceField(cells, 0.04)
         for config in (RsbandConfig(effort=200), TebConfig(effort=200)):
-            make_deformer(Vehicle.truck(), config).deform(guide, surroundings, poses[0], Memory())
+            make_local_planner(Vehicle.truck(), config).plan(guide, surroundings, poses[0], LocalPlannerState())

@@ -1,1 +1,1 @@
-"""Deformation of a route in the truck's surroundings: elastic bands and what makes them drivable."""
+"""Local planners: elastic bands around the obstacles on a route, and paths that make them drivable."""

@@ -1,4 +1,4 @@
-"""Settings of the deformers: light models, one ``kind`` each."""
+"""Settings of the local planners: light models, one ``kind`` each."""
 
 from typing import Annotated, Literal
 
@@ -19,63 +19,63 @@ class BandConfig(Schema):
     overlap: Annotated[float, Field(gt=0, le=1)] = 0.7
     """Neighbouring bubbles touch if they are nearer than this share of the sum of their radii."""
     internal_gain: NotNegative = 1.0
-    """Of the pull of both neighbours."""
+    """Of the attraction of both neighbours."""
     external_gain: NotNegative = 2.0
-    """Of the push away from obstacles."""
+    """Of the repulsion of obstacles."""
     iterations: Count = 5
-    """Sweeps there and back."""
+    """Sweeps over the band and back."""
     depth: Count = 5
-    """Times a step that overshoots is halved, and a gap is."""
+    """Times an overshooting step, or a gap, is halved."""
     overshoot: Positive = 0.75
-    """A force that turned round has overshot if it is greater than this share of the one before."""
+    """A reversed force is an overshoot if it is greater than this share of the previous one."""
     significant: Positive = 0.1
-    """Smaller forces do not overshoot."""
+    """Smaller forces are never an overshoot."""
     tiny: Positive = 0.01
-    """Bubbles up to this radius do not count, m."""
+    """Bubbles up to this radius are in collision, m."""
     largest: Positive = 0.4
-    """Clearance beyond which obstacles do not matter, m."""
+    """Clearance beyond which obstacles exert no force, m."""
 
 
-class DeformConfig(Schema):
-    """What all deformers share."""
+class LocalPlannerConfig(Schema):
+    """Shared by all local planners."""
 
     band: BandConfig = BandConfig()
     margin: NotNegative = 0.02
     """Kept between footprint and obstacles, m."""
     reach: Positive = 3.0
-    """Length of the route looked at, m."""
+    """Length of the route regarded, m."""
     inset: NotNegative = 0.1
-    """Kept between the window's border and the circle round the footprint where the route is cut, m."""
+    """Distance between the window's border and the circle around the footprint where the route is cut, m."""
     effort: Count = 1100
-    """Search steps and improvement trials of a local search: bounds the time of a cycle."""
+    """Nodes expanded and smoothing trials of a local search: bounds the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
     """Of a metre backward, where the lidar does not look, m."""
     cusp_cost: NotNegative = 0.3
     """Of a change of direction, m."""
     crab_cost: Annotated[float, Field(ge=1)] = 1.05
-    """Of a metre beside the heading, m."""
+    """Of a metre of translation, m."""
     clearance_cost: NotNegative = 0.5
     """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away, m."""
     shortest: Positive = 0.15
-    """A free beginning of a blocked path is used from this length on, m."""
+    """Least length of a free beginning of a blocked path that is driven, m."""
 
 
-class RsbandConfig(DeformConfig):
+class RsbandConfig(LocalPlannerConfig):
     """Elastic band, then Reeds-Shepp motions that join its poses, with the truck's own turning radius."""
 
     kind: Literal["rsband"] = "rsband"
     strategy: Strategy = "start_to_next"
     sub_goal: Positive = 0.6
-    """Length of band to the pose aimed at by ``start_to_next``, m."""
+    """Length of band to the goal of ``start_to_next``, m."""
     spacing: Positive = 0.4
-    """Of the band poses joined one by one, m."""
+    """Of the band poses that are joined one by one, m."""
     renew: Positive = 0.5
     """A path is replaced when less than this share of its length is left."""
     off_path: Positive = 0.1
     """A path is replaced when the truck is further away from it, m."""
 
 
-class PublishedConfig(DeformConfig):
+class PublishedConfig(LocalPlannerConfig):
     """The published planner: turning radius 1.0 m whatever the truck, states 0.3 m from obstacles, its known faults."""
 
     kind: Literal["rsband-as-published"] = "rsband-as-published"
@@ -86,10 +86,10 @@ class PublishedConfig(DeformConfig):
     inflation: Positive = 0.3
     """Radius of the inflation; states must lie outside of it, m."""
     emergency: bool = True
-    """Turn on the spot by 45 degrees and more when nothing else is found."""
+    """Turn by 45 degrees and more when nothing else is found."""
 
 
-class TebConfig(DeformConfig):
+class TebConfig(LocalPlannerConfig):
     """Timed elastic band: poses and time steps, by sparse least squares."""
 
     kind: Literal["teb"] = "teb"
@@ -98,7 +98,7 @@ class TebConfig(DeformConfig):
     iterations: Count = 8
     """Gauss-Newton steps in one cycle."""
     clearance: Positive = 0.1
-    """Wanted between footprint and obstacles, m."""
+    """Preferred between footprint and obstacles, m."""
     obstacle_weight: Positive = 30.0
     steering_weight: Positive = 200.0
     """Of axle angles beyond their limits."""
@@ -107,7 +107,7 @@ class TebConfig(DeformConfig):
     smooth_weight: NotNegative = 0.02
     """Of changes of the axle angles."""
     crab_weight: NotNegative = 0.05
-    """Of travel beside the heading."""
+    """Of translation."""
     time_weight: Positive = 0.3
     """Of the time."""
     speed: Positive = 0.2

@@ -1,8 +1,8 @@
-"""Elastic band of bubbles, compiled.
+"""Elastic band: poses of a path move away from obstacles and towards each other. Loads numba.
 
 A bubble is a pose and how far every part of the footprint may move from there. Forces and refinement after S. Quinlan
-and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the rules and parameters of the
-published planner; what is different there is named at ``Rules``.
+and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the parameters and parameters of the
+published planner; differences are named at ``BandParameters``.
 """
 
 import math
@@ -17,29 +17,29 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DiscFootprint, DistanceField, Footprint
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.api import PosePath
 from monstertruck_planners.local.config import BandConfig
 
 BoolArray = NDArray[np.bool_]
 
-MOST = 400
+MAX_BUBBLES = 400
 """Bubbles in a band."""
 
 
-class Cover(NamedTuple):
-    """Discs that together cover a footprint, and hardly more."""
+class CoveringDiscs(NamedTuple):
+    """Discs that together cover a footprint tightly."""
 
     x: Array
     y: Array
-    """Centres, m, seen from the pose."""
+    """Centres relative to the pose, m."""
     radius: Array
     """m."""
     reach: float
     """Greatest distance of a centre from the pose, m."""
 
 
-class Rules(NamedTuple):
-    """How a band moves."""
+class BandParameters(NamedTuple):
+    """Parameters of the band's forces."""
 
     overlap: float
     internal: float
@@ -52,17 +52,17 @@ class Rules(NamedTuple):
     largest: float
     """Largest radius, m."""
     scale: float
-    """Of radii: 1; the published weights make them half of the clearance."""
+    """Of a bubble's radius to its clearance: 1; half of it in the published planner."""
     reach: float
-    """Metres that a radian between two headings counts; 0 in the published planner."""
+    """Metres per radian between two headings; 0 in the published planner."""
     spacing: float
     """Largest distance of neighbours, m."""
     published: bool
-    """Steps of a whole radius, and a force before that counts its x twice and its y never."""
+    """Steps of a whole radius, and a previous force that counts its x twice and its y never."""
 
 
 @njit(cache=True)
-def distance(field: FieldData, x: float, y: float) -> tuple[float, float, float]:
+def distance_and_gradient(field: FieldData, x: float, y: float) -> tuple[float, float, float]:
     """Distance of a point from the nearest occupied square, m, and its gradient; bilinear, 0 outside."""
     dx, dy = x - field.x, y - field.y
     px = (dx * field.cos + dy * field.sin) / field.resolution - 0.5
@@ -81,36 +81,38 @@ def distance(field: FieldData, x: float, y: float) -> tuple[float, float, float]
 
 
 @njit(cache=True)
-def clearance(field: FieldData, cover: Cover, x: float, y: float, yaw: float) -> float:
-    """Least distance of the footprint's discs from what is occupied, m; negative where they overlap it."""
+def clearance(field: FieldData, cover: CoveringDiscs, x: float, y: float, yaw: float) -> float:
+    """Least distance_and_gradient of the footprint's discs from what is occupied, m; negative where they overlap it."""
     least = 1e9
     c, s = cos(yaw), sin(yaw)
     for k in range(len(cover.x)):
         px, py = x + cover.x[k] * c - cover.y[k] * s, y + cover.x[k] * s + cover.y[k] * c
-        value, _, _ = distance(field, px, py)
+        value, _, _ = distance_and_gradient(field, px, py)
         least = min(least, value - cover.radius[k])
     return least
 
 
 @njit(cache=True)
-def _radius(field: FieldData, cover: Cover, rules: Rules, x: float, y: float, yaw: float) -> float:
-    return float(min(rules.scale * clearance(field, cover, x, y, yaw), rules.largest))
+def _radius(
+    field: FieldData, cover: CoveringDiscs, parameters: BandParameters, x: float, y: float, yaw: float
+) -> float:
+    return float(min(parameters.scale * clearance(field, cover, x, y, yaw), parameters.largest))
 
 
 @njit(cache=True)
-def _apart(rules: Rules, band: Array, i: int, j: int) -> float:
+def _apart(parameters: BandParameters, band: Array, i: int, j: int) -> float:
     turned = abs((band[i, 2] - band[j, 2] + pi) % (2 * pi) - pi)
-    return float(hypot(band[i, 0] - band[j, 0], band[i, 1] - band[j, 1]) + rules.reach * turned)
+    return float(hypot(band[i, 0] - band[j, 0], band[i, 1] - band[j, 1]) + parameters.reach * turned)
 
 
 @njit(cache=True)
-def _touch(rules: Rules, band: Array, i: int, j: int) -> bool:
-    return bool(_apart(rules, band, i, j) < rules.overlap * (band[i, 3] + band[j, 3]))
+def _touch(parameters: BandParameters, band: Array, i: int, j: int) -> bool:
+    return bool(_apart(parameters, band, i, j) < parameters.overlap * (band[i, 3] + band[j, 3]))
 
 
 @njit(cache=True)
 def _insert(band: Array, fixed: BoolArray, count: int, i: int) -> None:
-    """A bubble half-way between i - 1 and i, at index i; it takes the direction of the later one."""
+    """Insert a bubble half-way between i - 1 and i, at index i, with the direction of the later one."""
     for k in range(count, i, -1):
         for m in range(6):
             band[k, m] = band[k - 1, m]
@@ -124,38 +126,44 @@ def _insert(band: Array, fixed: BoolArray, count: int, i: int) -> None:
 
 
 @njit(cache=True)
-def refine(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int) -> tuple[int, bool]:
-    """Fill gaps between bubbles and take out those that are not needed.
+def _refine(
+    field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, fixed: BoolArray, count: int
+) -> tuple[int, bool]:
+    """Fill gaps between bubbles and remove redundant ones.
 
     Args:
         field: obstacles.
         cover: footprint.
-        rules: of the band.
-        band: shape (MOST, 6): x, y, yaw, radius, direction, sideslip; changed in place.
-        fixed: shape (MOST,): bubbles that stay.
+        parameters: of the band.
+        band: shape (MAX_BUBBLES, 6): x, y, yaw, radius, direction, sideslip; changed in place.
+        fixed: shape (MAX_BUBBLES,): bubbles that do not move.
         count: of bubbles.
 
     Returns:
-        Number of bubbles, and whether the band holds.
+        Number of bubbles, and whether the band is connected.
     """
     i, deep = 1, 0
     while i < count:
-        if _touch(rules, band, i - 1, i) and hypot(band[i, 0] - band[i - 1, 0], band[i, 1] - band[i - 1, 1]) <= (
-            rules.spacing
+        if _touch(parameters, band, i - 1, i) and hypot(band[i, 0] - band[i - 1, 0], band[i, 1] - band[i - 1, 1]) <= (
+            parameters.spacing
         ):
             i, deep = i + 1, 0
             continue
-        if count >= MOST or deep > 2 * rules.depth or _apart(rules, band, i - 1, i) < 0.5 * rules.tiny:
+        if (
+            count >= MAX_BUBBLES
+            or deep > 2 * parameters.depth
+            or _apart(parameters, band, i - 1, i) < 0.5 * parameters.tiny
+        ):
             return count, False
         _insert(band, fixed, count, i)
         count, deep = count + 1, deep + 1
-        band[i, 3] = _radius(field, cover, rules, band[i, 0], band[i, 1], band[i, 2])
-        if band[i, 3] <= rules.tiny:
+        band[i, 3] = _radius(field, cover, parameters, band[i, 0], band[i, 1], band[i, 2])
+        if band[i, 3] <= parameters.tiny:
             return count, False
     i = 1
     while i < count - 1:
-        near = hypot(band[i + 1, 0] - band[i - 1, 0], band[i + 1, 1] - band[i - 1, 1]) <= rules.spacing
-        if not fixed[i] and near and _touch(rules, band, i - 1, i + 1):
+        near = hypot(band[i + 1, 0] - band[i - 1, 0], band[i + 1, 1] - band[i - 1, 1]) <= parameters.spacing
+        if not fixed[i] and near and _touch(parameters, band, i - 1, i + 1):
             for k in range(i, count - 1):
                 for m in range(6):
                     band[k, m] = band[k + 1, m]
@@ -168,23 +176,23 @@ def refine(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: Boo
 
 @njit(cache=True)
 def _force(
-    field: FieldData, cover: Cover, rules: Rules, before: Array, here: Array, after: Array
+    field: FieldData, cover: CoveringDiscs, parameters: BandParameters, before: Array, here: Array, after: Array
 ) -> tuple[float, float]:
-    """Pull of both neighbours and push of obstacles on a bubble, across the band."""
+    """Attraction of both neighbours and repulsion of obstacles on a bubble, across the band."""
     fx, fy = 0.0, 0.0
     for other in (before, after):
         dx, dy = other[0] - here[0], other[1] - here[1]
         away = hypot(dx, dy)
-        if away > rules.tiny:
-            fx += rules.internal * dx / away
-            fy += rules.internal * dy / away
-    if here[3] < rules.largest:
+        if away > parameters.tiny:
+            fx += parameters.internal * dx / away
+            fy += parameters.internal * dy / away
+    if here[3] < parameters.largest:
         h = max(here[3], 0.5 * field.resolution)
         x, y, yaw = here[0], here[1], here[2]
-        right, left = _radius(field, cover, rules, x + h, y, yaw), _radius(field, cover, rules, x - h, y, yaw)
-        up, down = _radius(field, cover, rules, x, y + h, yaw), _radius(field, cover, rules, x, y - h, yaw)
-        fx += rules.external * (right - left) / (2 * h)
-        fy += rules.external * (up - down) / (2 * h)
+        right, left = _radius(field, cover, parameters, x + h, y, yaw), _radius(field, cover, parameters, x - h, y, yaw)
+        up, down = _radius(field, cover, parameters, x, y + h, yaw), _radius(field, cover, parameters, x, y - h, yaw)
+        fx += parameters.external * (right - left) / (2 * h)
+        fy += parameters.external * (up - down) / (2 * h)
     tx, ty = before[0] - after[0], before[1] - after[1]
     along = tx * tx + ty * ty
     if along > 1e-12:
@@ -195,44 +203,48 @@ def _force(
 
 
 @njit(cache=True)
-def _move(field: FieldData, cover: Cover, rules: Rules, band: Array, i: int) -> None:
-    """Let one bubble go where its force pushes it, as long as it stays free and near its neighbours."""
+def _move(field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, i: int) -> None:
+    """Move one bubble along its force, as long as it stays free and near its neighbours."""
     before, here, after = band[i - 1], band[i], band[i + 1]
-    fx, fy = _force(field, cover, rules, before, here, after)
-    gain = max(here[3], rules.tiny)
-    if not rules.published:
+    fx, fy = _force(field, cover, parameters, before, here, after)
+    gain = max(here[3], parameters.tiny)
+    if not parameters.published:
         # A whole radius overshoots where neighbours are nearer than that.
         near = min(hypot(here[0] - before[0], here[1] - before[1]), hypot(here[0] - after[0], here[1] - after[1]))
         gain = min(gain, 0.5 * near)
     trial = here.copy()
     step = 1.0
-    for _ in range(rules.depth + 1):
+    for _ in range(parameters.depth + 1):
         trial[0], trial[1] = here[0] + step * gain * fx, here[1] + step * gain * fy
-        trial[3] = _radius(field, cover, rules, trial[0], trial[1], trial[2])
-        if trial[3] <= rules.tiny:
+        trial[3] = _radius(field, cover, parameters, trial[0], trial[1], trial[2])
+        if trial[3] <= parameters.tiny:
             step *= 0.5
             continue
-        gx, gy = _force(field, cover, rules, before, trial, after)
+        gx, gy = _force(field, cover, parameters, before, trial, after)
         new = hypot(gx, gy)
-        old = sqrt(2.0) * abs(fx) if rules.published else hypot(fx, fy)
-        if gx * fx + gy * fy < 0.0 and new > rules.overshoot * old and new > rules.significant:
+        old = sqrt(2.0) * abs(fx) if parameters.published else hypot(fx, fy)
+        if gx * fx + gy * fy < 0.0 and new > parameters.overshoot * old and new > parameters.significant:
             step *= 0.5
             continue
         break
-    if trial[3] <= rules.tiny:
+    if trial[3] <= parameters.tiny:
         return
     for other in (before, after):
         far = hypot(other[0] - trial[0], other[1] - trial[1])
-        if far >= rules.overlap * (other[3] + trial[3]):
-            middle = _radius(field, cover, rules, 0.5 * (other[0] + trial[0]), 0.5 * (other[1] + trial[1]), trial[2])
-            if middle <= rules.tiny:
+        if far >= parameters.overlap * (other[3] + trial[3]):
+            middle = _radius(
+                field, cover, parameters, 0.5 * (other[0] + trial[0]), 0.5 * (other[1] + trial[1]), trial[2]
+            )
+            if middle <= parameters.tiny:
                 return
     here[0], here[1], here[3] = trial[0], trial[1], trial[3]
 
 
 @njit(cache=True)
-def face(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int) -> None:
-    """Turn every bubble along the band, by its sideslip beside it, unless it is fixed or would touch something."""
+def _align_headings(
+    field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, fixed: BoolArray, count: int
+) -> None:
+    """Turn every bubble along the band, less its sideslip, unless it is fixed or would touch something."""
     for i in range(1, count - 1):
         if fixed[i]:
             continue
@@ -240,146 +252,150 @@ def face(field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolA
         if hypot(dx, dy) > 1e-6:
             course = atan2(dy, dx) + (0.0 if band[i, 4] > 0.0 else pi)
             yaw = band[i, 2] + (course - band[i, 5] - band[i, 2] + pi) % (2 * pi) - pi
-            if _radius(field, cover, rules, band[i, 0], band[i, 1], yaw) > rules.tiny:
+            if _radius(field, cover, parameters, band[i, 0], band[i, 1], yaw) > parameters.tiny:
                 band[i, 2] = yaw
 
 
 @njit(cache=True)
-def measure(field: FieldData, cover: Cover, rules: Rules, band: Array, count: int) -> int:
-    """Take all radii anew.
+def update_radii(field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, count: int) -> int:
+    """Compute all radii.
 
     Returns:
         Index of the first bubble that is too small, or ``count``.
     """
     broken = count
     for i in range(count - 1, -1, -1):
-        band[i, 3] = _radius(field, cover, rules, band[i, 0], band[i, 1], band[i, 2])
-        if band[i, 3] <= rules.tiny:
+        band[i, 3] = _radius(field, cover, parameters, band[i, 0], band[i, 1], band[i, 2])
+        if band[i, 3] <= parameters.tiny:
             broken = i
     return broken
 
 
 @njit(cache=True)
-def optimise(
-    field: FieldData, cover: Cover, rules: Rules, band: Array, fixed: BoolArray, count: int
+def _relax(
+    field: FieldData, cover: CoveringDiscs, parameters: BandParameters, band: Array, fixed: BoolArray, count: int
 ) -> tuple[int, bool]:
-    """Move a band that holds to its equilibrium; ends and cusps stay.
+    """Move a connected band to its equilibrium; ends and cusps stay.
 
     Returns:
-        Number of bubbles, and whether the band still holds; if not, it is in an unfinished state.
+        Number of bubbles, and whether the band is still connected; if not, its state is undefined.
     """
-    for _ in range(rules.iterations):
+    for _ in range(parameters.iterations):
         for k in range(2 * (count - 2)):
             i = k + 1 if k < count - 2 else 2 * (count - 2) - k
             if not fixed[i]:
-                _move(field, cover, rules, band, i)
-        if not rules.published:
-            face(field, cover, rules, band, fixed, count)
-        if measure(field, cover, rules, band, count) < count:
+                _move(field, cover, parameters, band, i)
+        if not parameters.published:
+            _align_headings(field, cover, parameters, band, fixed, count)
+        if update_radii(field, cover, parameters, band, count) < count:
             return count, False
-        count, holds = refine(field, cover, rules, band, fixed, count)
+        count, holds = _refine(field, cover, parameters, band, fixed, count)
         if not holds:
             return count, False
     return count, True
 
 
-LAYER = 0.035
-"""Depth of the outline's discs below it, m: they stand out by 0.4 of it."""
+DISC_DEPTH = 0.035
+"""Depth of the outline's disc centres inside it, m; the discs protrude by 0.4 of it."""
 
 SPACING = 0.2
 """Largest distance of bubbles, m."""
 
 
 @dataclass(frozen=True)
-class Band:
-    """What became of a band."""
+class BandResult:
+    """A band after relaxation."""
 
-    guide: Guide | None
-    """None: it does not hold."""
+    path: PosePath | None
+    """None: it is broken."""
     broken: int
     """Bubbles before the first one that touches something; their number if none does."""
     radii: Array
-    """Shape (n,), m; of the guide's poses."""
+    """Shape (n,), m; of the path's poses."""
 
 
-def cover_of(footprint: Footprint | DiscFootprint) -> Cover:
+def cover_footprint(footprint: Footprint | DiscFootprint) -> CoveringDiscs:
     """Discs that cover a footprint: of a rectangle small ones along the outline and large ones inside."""
     if isinstance(footprint, DiscFootprint):
         x = np.array(footprint.centres)
-        return _cover(x, np.zeros(len(x)), np.full(len(x), footprint.radius))
-    length, width = footprint.half_length - LAYER, footprint.half_width - LAYER
-    along = np.linspace(-length, length, math.ceil(length / LAYER) + 1)
-    across = np.linspace(-width, width, math.ceil(width / LAYER) + 1)[1:-1]
+        return _discs(x, np.zeros(len(x)), np.full(len(x), footprint.radius))
+    length, width = footprint.half_length - DISC_DEPTH, footprint.half_width - DISC_DEPTH
+    along = np.linspace(-length, length, math.ceil(length / DISC_DEPTH) + 1)
+    across = np.linspace(-width, width, math.ceil(width / DISC_DEPTH) + 1)[1:-1]
     inner = np.linspace(-max(length - width, 0.0), max(length - width, 0.0), 3)
     x = np.concatenate((along, along, np.full(len(across), length), np.full(len(across), -length), inner))
     sides = (np.full(len(along), width), np.full(len(along), -width))
     y = np.concatenate((*sides, across, across, np.zeros(len(inner))))
-    radius = np.full(len(x), LAYER * math.sqrt(2.0))
+    radius = np.full(len(x), DISC_DEPTH * math.sqrt(2.0))
     radius[-len(inner) :] = width
-    return _cover(x + footprint.offset, y, radius)
+    return _discs(x + footprint.offset, y, radius)
 
 
-def _cover(x: Array, y: Array, radius: Array) -> Cover:
-    return Cover(x, y, radius, float(np.hypot(x, y).max()))
+def _discs(x: Array, y: Array, radius: Array) -> CoveringDiscs:
+    return CoveringDiscs(x, y, radius, float(np.hypot(x, y).max()))
 
 
-def rules_of(config: BandConfig, cover: Cover) -> Rules:
-    """The corrected rules."""
-    return Rules(
+def band_parameters(config: BandConfig, cover: CoveringDiscs) -> BandParameters:
+    """Parameters of the corrected band."""
+    return BandParameters(
         config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
         config.overshoot, config.significant, config.tiny, config.largest,
         1.0, 0.5 * cover.reach, SPACING, False,
     )  # fmt: skip
 
 
-def stretch(guide: Guide, surroundings: DistanceField, cover: Cover, rules: Rules) -> Band:
-    """Let an elastic band go: first and last pose and cusps stay, what is between keeps clear of obstacles.
+def relax_band(
+    path: PosePath, obstacles: DistanceField, cover: CoveringDiscs, parameters: BandParameters
+) -> BandResult:
+    """Relax an elastic band: first and last pose and cusps stay, the others keep clear of obstacles.
 
     Args:
-        guide: poses of the reference point, fewer than ``MOST``.
-        surroundings: obstacles.
-        cover: footprint, see ``cover_of``.
-        rules: of the forces.
+        path: poses of the reference point, fewer than ``MAX_BUBBLES``.
+        obstacles: in the window.
+        cover: footprint, see ``cover_footprint``.
+        parameters: of the forces.
     """
-    count = len(guide.poses)
-    band, fixed = np.zeros((MOST, 6)), np.zeros(MOST, np.bool_)
-    if count > MOST // 2:
-        keep = np.unique(np.concatenate((np.linspace(0, count - 1, MOST // 2).round().astype(int), _cusps(guide))))
-        guide = Guide(guide.poses[keep], guide.directions[keep])
+    count = len(path.poses)
+    band, fixed = np.zeros((MAX_BUBBLES, 6)), np.zeros(MAX_BUBBLES, np.bool_)
+    if count > MAX_BUBBLES // 2:
+        keep = np.unique(
+            np.concatenate((np.linspace(0, count - 1, MAX_BUBBLES // 2).round().astype(int), _cusps(path)))
+        )
+        path = PosePath(path.poses[keep], path.directions[keep])
         count = len(keep)
-    band[:count, :3] = guide.poses
-    band[:count, 2] = np.unwrap(guide.poses[:, 2])
-    band[:count, 4] = guide.directions
-    band[:count, 5] = 0.0 if rules.published else _sideslips(guide)
+    band[:count, :3] = path.poses
+    band[:count, 2] = np.unwrap(path.poses[:, 2])
+    band[:count, 4] = path.directions
+    band[:count, 5] = 0.0 if parameters.published else _sideslips(path)
     fixed[[0, count - 1]] = True
-    fixed[_cusps(guide)] = True
-    field = surroundings.data()
-    broken = int(measure(field, cover, rules, band, count))
+    fixed[_cusps(path)] = True
+    field = obstacles.data()
+    broken = int(update_radii(field, cover, parameters, band, count))
     if broken < count:
-        return Band(None, broken, band[:count, 3].copy())
-    count, holds = refine(field, cover, rules, band, fixed, count)
+        return BandResult(None, broken, band[:count, 3].copy())
+    count, holds = _refine(field, cover, parameters, band, fixed, count)
     if not holds:
-        return Band(None, broken, band[:count, 3].copy())
+        return BandResult(None, broken, band[:count, 3].copy())
     moved, pinned = band.copy(), fixed.copy()
-    more, settled = optimise(field, cover, rules, moved, pinned, count)
+    more, settled = _relax(field, cover, parameters, moved, pinned, count)
     if settled:
         band, count = moved, more
-    result = Guide(band[:count, :3].copy(), band[:count, 4].copy())
-    return Band(result, count, band[:count, 3].copy())
+    result = PosePath(band[:count, :3].copy(), band[:count, 4].copy())
+    return BandResult(result, count, band[:count, 3].copy())
 
 
-def _cusps(guide: Guide) -> NDArray[np.int64]:
+def _cusps(path: PosePath) -> NDArray[np.int64]:
     """Indices of the poses at which the direction changes."""
-    return np.asarray(np.flatnonzero(np.diff(guide.directions)))
+    return np.asarray(np.flatnonzero(np.diff(path.directions)))
 
 
-def _sideslips(guide: Guide) -> Array:
-    """From the heading to the way driven, rad, for every pose; small ones are corners of the guide, not crab."""
-    steps = np.diff(guide.poses[:, :2], axis=0)
+def _sideslips(path: PosePath) -> Array:
+    """From the heading to the course, rad, for every pose; small ones are corners of the path, not crab."""
+    steps = np.diff(path.poses[:, :2], axis=0)
     if not len(steps):
-        return np.zeros(len(guide.poses))
-    course = np.arctan2(steps[:, 1], steps[:, 0]) + np.where(guide.directions[1:] > 0, 0.0, math.pi)
-    middle = 0.5 * (guide.poses[1:, 2] + guide.poses[:-1, 2])
+        return np.zeros(len(path.poses))
+    course = np.arctan2(steps[:, 1], steps[:, 0]) + np.where(path.directions[1:] > 0, 0.0, math.pi)
+    middle = 0.5 * (path.poses[1:, 2] + path.poses[:-1, 2])
     slip = np.remainder(course - middle + math.pi, math.tau) - math.pi
     slip[(np.hypot(*steps.T) < 1e-6) | (np.abs(slip) > 0.5) | (np.abs(slip) < 0.1)] = 0.0
     return np.concatenate((slip[:1], slip))

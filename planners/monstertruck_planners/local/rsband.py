@@ -1,8 +1,8 @@
-"""Elastic band, then Reeds-Shepp motions of the truck's own turning radius that join its poses. Compiled.
+"""Elastic band, then Reeds-Shepp motions of the truck's own turning radius that join its poses. Loads numba.
 
 The five strategies are those of the published planner: one motion to the band's end, to the next sub-goal, from pose to
-pose until one fails, the same leaving out poses that fail, and to the furthest pose that can be reached. What they
-cannot reach, a small search does; a path is kept while it is free.
+pose until one fails, the same leaving out poses that fail, and to the furthest pose that can be reached. Where they
+fail a local search takes over; a path is kept while it is free.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,26 +13,36 @@ from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import DeformResult, Guide, Memory, apart
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
 from monstertruck_planners.local.config import RsbandConfig
-from monstertruck_planners.local.core import CUSP_REACHED, RUN_ENDED, Local, Surveyor, costs_of, rest_of, runs
-from monstertruck_planners.local.elastic_band import rules_of, stretch
+from monstertruck_planners.local.core import (
+    CUSP_REACHED,
+    PATH_CUSP_REACHED,
+    LocalPlannerCore,
+    LocalRoute,
+    costs_of,
+    direction_runs,
+    ends_at,
+    remaining_path,
+    starting_at,
+)
+from monstertruck_planners.local.elastic_band import band_parameters, relax_band
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_schemas.reasons import Reason
 
-FURTHER = (1.0, 1.5, 2.0, 3.0)
+SUB_GOAL_FACTORS = (1.0, 1.5, 2.0, 3.0)
 """Sub-goals tried, as factors on their distance."""
 
-CRUMB = 0.05
-"""What is left of a path to a cusp when it is replaced, m."""
+MIN_CUSP_REST = 0.05
+"""A path to a cusp is replaced when no more than this is left of it, m."""
 
-ROUNDABOUT = 1.6
-"""A motion between two band poses longer than this factor on their distance is none: it turns round."""
+MAX_DETOUR = 1.6
+"""A motion between two band poses is a detour if it is longer than this factor on their distance."""
 
 
 @dataclass(frozen=True)
-class Motion:
+class JoinedMotion:
     """A motion found by a strategy."""
 
     path: MotionPath
@@ -40,8 +50,8 @@ class Motion:
     """Index of the band's pose at which it ends."""
 
 
-class Rsband:
-    """The deformer of kind ``rsband``.
+class RsbandPlanner:
+    """The local planner of kind ``rsband``.
 
     Args:
         vehicle: what is driven.
@@ -52,136 +62,141 @@ class Rsband:
         self.vehicle = vehicle
         self.config = config or RsbandConfig()
         costs = costs_of(self.config)
-        self._steer = vehicle.reeds_shepp(costs)
-        self._surveyor = Surveyor(vehicle, self.config, costs)
-        self._rules = rules_of(self.config.band, self._surveyor.cover)
-        self._strategy: Callable[[Guide, DistanceField, Array], Motion | None] = getattr(
+        self._reeds_shepp = vehicle.reeds_shepp(costs)
+        self._core = LocalPlannerCore(vehicle, self.config, costs)
+        self._band_parameters = band_parameters(self.config.band, self._core.cover)
+        self._strategy: Callable[[PosePath, DistanceField, Array], JoinedMotion | None] = getattr(
             self, f"_{self.config.strategy}"
         )
 
-    def deform(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> DeformResult:
-        """One cycle, see ``api.Deformer``.
-
-        Raises:
-            InputError: a pose that is none.
-        """
-        cycle = self._surveyor.begin(guide, surroundings, pose, memory)
-        if isinstance(cycle, DeformResult):
+    def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
+        """One cycle, see ``LocalPlanner``."""
+        cycle = self._core.begin(route, obstacles, pose, state)
+        if isinstance(cycle, LocalPlan):
             return cycle
-        here, local, memory = cycle.here, cycle.local, cycle.memory
-        rest, far = rest_of(memory.path, here) if memory.path is not None else (None, 0.0)
-        ended_there = rest is not None and ends_at(rest, guide.poses[-1])
+        robot_pose, local, state = cycle.robot_pose, cycle.local, cycle.state
+        rest, far = remaining_path(state.path, robot_pose) if state.path is not None else (None, 0.0)
+        ended_there = rest is not None and ends_at(rest, route.poses[-1])
         if (
             rest is not None
-            and self._good(rest, far, to_end=ended_there, to_cusp=to_cusp(rest, local.band))
-            and self._surveyor.free(surroundings, rest)
+            and self._worth_keeping(rest, far, to_end=ended_there, to_cusp=ends_at_cusp(rest, local.band))
+            and self._core.free(obstacles, rest)
         ):
-            kept = replace(memory, path=rest)
-            return DeformResult(Reason.OK, kept, rest, ended_there, statistics={"kept": 1.0})
-        return self._fresh(local, surroundings, here, memory, rest)
+            kept = replace(state, path=rest)
+            return LocalPlan(Reason.OK, kept, rest, ended_there, statistics={"kept": 1.0})
+        return self._new_path(local, obstacles, robot_pose, state, rest)
 
-    def _good(self, rest: MotionPath, far: float, *, to_end: bool, to_cusp: bool) -> bool:
+    def _worth_keeping(self, rest: MotionPath, far: float, *, to_end: bool, to_cusp: bool) -> bool:
         if far > self.config.off_path or not len(rest.segments):
             return False
         if to_end or to_cusp:
-            return rest.length > (RUN_ENDED if to_end else CRUMB)
+            return rest.length > (PATH_CUSP_REACHED if to_end else MIN_CUSP_REST)
         return rest.length > self.config.renew * self.config.sub_goal
 
-    def _fresh(
-        self, local: Local, surroundings: DistanceField, here: Array, memory: Memory, rest: MotionPath | None
-    ) -> DeformResult:
-        """Deform the band and join it, else search."""
-        whole = with_robot(local.band, here)
-        band = stretch(whole, surroundings, self._surveyor.cover, self._rules)
+    def _new_path(
+        self,
+        local: LocalRoute,
+        obstacles: DistanceField,
+        robot_pose: Array,
+        state: LocalPlannerState,
+        rest: MotionPath | None,
+    ) -> LocalPlan:
+        """Relax the band and join its poses, else search."""
+        whole = starting_at(local.band, robot_pose)
+        band = relax_band(whole, obstacles, self._core.cover, self._band_parameters)
         statistics = {
             "kept": 0.0,
             "bubbles": float(len(band.radii)),
             "searched": 0.0,
-            "broken": float(band.guide is None),
+            "broken": float(band.path is None),
         }
-        if band.guide is not None:
-            motion = self._strategy(band.guide, surroundings, here)
+        if band.path is not None:
+            motion = self._strategy(band.path, obstacles, robot_pose)
             if motion is not None:
-                after = replace(memory, band=band.guide.part(1, len(band.guide.poses)), path=motion.path, failed=0)
-                done = ends_at(motion.path, memory.guide.poses[-1])  # type: ignore[union-attr]
-                return DeformResult(Reason.OK, after, motion.path, done, statistics=statistics)
+                after = replace(state, band=band.path.part(1, len(band.path.poses)), path=motion.path, failed=0)
+                done = ends_at(motion.path, state.route.poses[-1])  # type: ignore[union-attr]
+                return LocalPlan(Reason.OK, after, motion.path, done, statistics=statistics)
         statistics["searched"] = 1.0
-        path, band_of_path, why = self._surveyor.search(surroundings, here, local, memory.failed)
+        path, band_of_path, why = self._core.search(obstacles, robot_pose, local, state.failed)
         if path is None:
-            result = self._surveyor.partial(memory, surroundings, here, rest, why)
+            result = self._core.partial(state, obstacles, robot_pose, rest, why)
             return replace(result, statistics=statistics)
-        after = replace(memory, band=band_of_path, path=path, failed=0)
-        done = ends_at(path, memory.guide.poses[-1])  # type: ignore[union-attr]
-        return DeformResult(Reason.OK, after, path, done, statistics=statistics)
+        after = replace(state, band=band_of_path, path=path, failed=0)
+        done = ends_at(path, state.route.poses[-1])  # type: ignore[union-attr]
+        return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
-    def _join(self, surroundings: DistanceField, here: Array, goal: Array) -> MotionPath | None:
+    def _join(self, obstacles: DistanceField, robot_pose: Array, goal: Array) -> MotionPath | None:
         """Best motion between two poses if it is free."""
-        path = self._steer.path(here, goal)
-        return path if len(path.segments) and self._surveyor.free(surroundings, path) else None
+        path = self._reeds_shepp.path(robot_pose, goal)
+        return path if len(path.segments) and self._core.free(obstacles, path) else None
 
-    def _start_to_end(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
+    def _start_to_end(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
         last = len(band.poses) - 1
-        path = self._join(surroundings, here, band.poses[last])
-        return Motion(path, last) if path is not None else None
+        path = self._join(obstacles, robot_pose, band.poses[last])
+        return JoinedMotion(path, last) if path is not None else None
 
-    def _start_to_next(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
+    def _start_to_next(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
         """To the first pose at the sub-goal's distance, or further if that needs no change of direction."""
         travelled = band.travelled
         end = next(
-            end for _, end in runs(band.directions) if travelled[end - 1] > CUSP_REACHED or end == len(travelled)
+            end
+            for _, end in direction_runs(band.directions)
+            if travelled[end - 1] > CUSP_REACHED or end == len(travelled)
         )
         found = None
         tried = -1
-        for factor in FURTHER:
+        for factor in SUB_GOAL_FACTORS:
             last = min(int(np.searchsorted(travelled, factor * self.config.sub_goal)), end - 1)
             if last == tried:
                 break
             tried = last
-            path = self._join(surroundings, here, band.poses[last])
+            path = self._join(obstacles, robot_pose, band.poses[last])
             if path is None:
                 continue
             if path.cusps == 0:
-                return Motion(path, last)
+                return JoinedMotion(path, last)
             if found is None or path.length + self.config.sub_goal * factor < found.path.length:
-                found = Motion(path, last)
+                found = JoinedMotion(path, last)
         return found
 
-    def _start_to_receding_end(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
-        for last in reversed(list(self._posts(band))):
-            path = self._join(surroundings, here, band.poses[last])
+    def _start_to_receding_end(
+        self, band: PosePath, obstacles: DistanceField, robot_pose: Array
+    ) -> JoinedMotion | None:
+        for last in reversed(list(self._via_indices(band))):
+            path = self._join(obstacles, robot_pose, band.poses[last])
             if path is not None:
-                return Motion(path, last)
+                return JoinedMotion(path, last)
         return None
 
-    def _point_to_point(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
-        return self._chain(band, surroundings, here, skip=False)
+    def _point_to_point(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
+        return self._chain(band, obstacles, robot_pose, skip=False)
 
-    def _skip_failures(self, band: Guide, surroundings: DistanceField, here: Array) -> Motion | None:
-        return self._chain(band, surroundings, here, skip=True)
+    def _skip_failures(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
+        return self._chain(band, obstacles, robot_pose, skip=True)
 
-    def _chain(self, band: Guide, surroundings: DistanceField, here: Array, *, skip: bool) -> Motion | None:
+    def _chain(self, band: PosePath, obstacles: DistanceField, robot_pose: Array, *, skip: bool) -> JoinedMotion | None:
         legs: list[MotionPath] = []
-        at, reached = here, 0
-        for last in self._posts(band):
-            path = self._join(surroundings, at, band.poses[last])
+        at, reached = robot_pose, 0
+        for last in self._via_indices(band):
+            path = self._join(obstacles, at, band.poses[last])
             backs = legs and path is not None and (path.segments[:, 0] * band.directions[last] < 0).any()
-            if path is None or backs or self._roundabout(path, at):
+            if path is None or backs or self._is_detour(path, at):
                 if not skip:
                     break
                 continue
             legs.append(path)
             at, reached = path.end, last
-        return Motion(joined(legs), reached) if legs else None
+        return JoinedMotion(joined(legs), reached) if legs else None
 
     @staticmethod
-    def _roundabout(path: MotionPath, at: Array) -> bool:
-        return path.length > ROUNDABOUT * float(apart(path.end, at))
+    def _is_detour(path: MotionPath, at: Array) -> bool:
+        return path.length > MAX_DETOUR * float(pose_distance(path.end, at))
 
-    def _posts(self, band: Guide) -> Iterator[int]:
-        """Indices of the poses to be joined: one every ``spacing`` metres, cusps and the last one among them."""
+    def _via_indices(self, band: PosePath) -> Iterator[int]:
+        """Indices of the poses to be joined: one every ``spacing`` metres, all cusps, and the last one."""
         travelled = band.travelled
         begin = 0.0
-        cusps = {end - 1 for _, end in runs(band.directions)}
+        cusps = {end - 1 for _, end in direction_runs(band.directions)}
         for i in range(1, len(travelled)):
             if i in cusps:
                 if travelled[i] > CUSP_REACHED or i == len(travelled) - 1:
@@ -194,29 +209,11 @@ class Rsband:
                 begin = travelled[i]
 
 
-def with_robot(band: Guide, here: Array) -> Guide:
-    """A band that begins at the truck; its first pose gives way if it lies behind or at the truck."""
-    first = band.poses[0]
-    if len(band.poses) > 1:
-        step = band.poses[1, :2] - first[:2]
-        behind = float((first[:2] - here[:2]) @ step) <= 0.02 * float(np.hypot(*step))
-        if behind and band.directions[0] == band.directions[1]:
-            band = band.part(1, len(band.poses))
-    return Guide(here[None], band.directions[:1]).then(band)
-
-
-def to_cusp(path: MotionPath, band: Guide) -> bool:
-    """Whether a path leads to where its band changes direction, or the band has done so already."""
+def ends_at_cusp(path: MotionPath, band: PosePath) -> bool:
+    """Whether a path ends at a cusp of its band, or the band has passed that cusp already."""
     if not len(path.segments):
         return False
     if path.segments[-1, 0] * band.directions[0] < 0:
         return True
     cusps = band.poses[np.flatnonzero(np.diff(band.directions))]
-    return bool((apart(cusps, path.end) < 0.05).any())
-
-
-def ends_at(path: MotionPath, goal: Array) -> bool:
-    """Whether a path leads to a pose, within 5 cm and 0.09 rad."""
-    away = path.end - goal
-    turned = abs(float(np.remainder(away[2] + np.pi, 2 * np.pi) - np.pi))
-    return float(np.hypot(away[0], away[1])) < 0.05 and turned < 0.09
+    return bool((pose_distance(cusps, path.end) < 0.05).any())

@@ -1,8 +1,15 @@
-"""Timed elastic band: poses and times of shortest time that keep off obstacles and within the truck's limits. Compiled.
+"""Timed elastic band (TEB): poses and times of shortest time, with clearance, within the truck's limits. Loads numba.
 
-The band keeps its way round every obstacle and its changes of direction; where it is broken a small search lays a new
-one. What the least squares leave of the kinematics is taken off at the end: segments within the limits are driven from
-the truck's pose, so the path is drivable exactly, and it is checked.
+The band keeps its homotopy class and its changes of direction; where it is broken a local search finds a new one. What
+the least squares leave of constraint violations is removed at the end: segments within the limits are driven from the
+truck's pose, so the path is exactly drivable, and it is checked for collisions. Source of the timed band: C. Roesmann
+and others, "Trajectory modification considering dynamic constraints of autonomous robots", 2012.
+
+Least squares with analytic derivatives and banded normal equations. Unknowns are x, y, yaw of each pose and the time of
+the interval before it. A residual touches at most three neighbouring poses, so the normal matrix has eleven diagonals
+next to the main one. An interval is expressed in the frame of its middle heading: ``a`` metres along, ``b`` across,
+turned by ``d``. Then the front axle has moved b + l_f d sideways and the rear axle b - l_r d, and the tangents of their
+angles are these over a: linear where a curvature would be singular.
 """
 
 import math
@@ -17,11 +24,18 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import DeformResult, Guide, Memory
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath
 from monstertruck_planners.local.config import TebConfig
-from monstertruck_planners.local.core import Local, Surveyor, costs_of, rest_of, runs, ways
-from monstertruck_planners.local.elastic_band import Cover, distance, rules_of, stretch
-from monstertruck_planners.local.rsband import ends_at, with_robot
+from monstertruck_planners.local.core import (
+    LocalPlannerCore,
+    LocalRoute,
+    costs_of,
+    direction_runs,
+    ends_at,
+    remaining_path,
+    starting_at,
+)
+from monstertruck_planners.local.elastic_band import CoveringDiscs, band_parameters, distance_and_gradient, relax_band
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
@@ -30,16 +44,16 @@ WIDTH = 12
 """Unknowns that a residual may touch, and diagonals of the matrix."""
 
 LEAST_STEP = 0.01
-"""Shortest way in an interval, m."""
+"""Least distance in an interval, m."""
 
 LEAST_TIME = 0.02
 """Shortest time of an interval, s."""
 
-FAR = 1.0e9
-"""Put on the diagonal for what is given."""
+FIXED = 1.0e9
+"""Added to the diagonal for fixed unknowns."""
 
 
-class Terms(NamedTuple):
+class TebParameters(NamedTuple):
     """Vehicle, limits and weights."""
 
     l_f: float
@@ -54,7 +68,7 @@ class Terms(NamedTuple):
     reverse: float
     acceleration: float
     clearance: float
-    """Wanted, m."""
+    """Preferred, m."""
     w_obstacle: float
     w_steering: float
     w_rate: float
@@ -63,7 +77,7 @@ class Terms(NamedTuple):
     w_time: float
 
 
-class System(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations of one linearisation."""
 
     matrix: Array
@@ -74,7 +88,7 @@ class System(NamedTuple):
 
 
 @njit(cache=True)
-def _add(system: System, base: int, residual: float) -> float:
+def _add(system: NormalEquations, base: int, residual: float) -> float:
     """Take in a residual whose derivatives are in ``jacobian``, first unknown ``base``; clears the jacobian."""
     jacobian = system.jacobian
     for i in range(WIDTH):
@@ -114,46 +128,50 @@ def _spread(jacobian: Array, at: int, v: Array, da: float, db: float, dd: float,
 
 
 @njit(cache=True)
-def _single(terms: Terms, band: Array, sense: Array, i: int, system: System, v: Array) -> float:
-    """Terms of the interval before pose i."""
+def _interval_terms(
+    parameters: TebParameters, band: Array, direction: Array, i: int, system: NormalEquations, v: Array
+) -> float:
+    """Residuals of the interval before pose i."""
     total = 0.0
     base = 4 * (i - 1)
-    jacobian, sign, t = system.jacobian, sense[i], band[i, 3]
+    jacobian, sign, t = system.jacobian, direction[i], band[i, 3]
     _interval(band, i, v)
     ahead = sign * v[0]
     if ahead < LEAST_STEP:
-        _spread(jacobian, 0, v, -sign * terms.w_steering, 0.0, 0.0, 0.0)
-        total += _add(system, base, terms.w_steering * (LEAST_STEP - ahead))
+        _spread(jacobian, 0, v, -sign * parameters.w_steering, 0.0, 0.0, 0.0)
+        total += _add(system, base, parameters.w_steering * (LEAST_STEP - ahead))
     for axle in range(2):
-        arm = terms.l_f if axle == 0 else -terms.l_r
-        limit = terms.front if axle == 0 else terms.rear
+        arm = parameters.l_f if axle == 0 else -parameters.l_r
+        limit = parameters.front if axle == 0 else parameters.rear
         aside = v[1] + arm * v[2]
         over = abs(aside) - limit * max(ahead, 0.0)
         if over > 0.0:
             side = 1.0 if aside > 0.0 else -1.0
-            w = terms.w_steering
+            w = parameters.w_steering
             _spread(jacobian, 0, v, -w * limit * sign if ahead > 0.0 else 0.0, w * side, w * side * arm, 0.0)
             total += _add(system, base, w * over)
-    jacobian[7] = terms.w_time
-    total += _add(system, base, terms.w_time * t)
-    limit = terms.speed if sign > 0.0 else terms.reverse
+    jacobian[7] = parameters.w_time
+    total += _add(system, base, parameters.w_time * t)
+    limit = parameters.speed if sign > 0.0 else parameters.reverse
     long = hypot(v[0], v[1])
     if long > limit * t and long > 1e-9:
-        w = 10.0 * terms.w_rate
+        w = 10.0 * parameters.w_rate
         _spread(jacobian, 0, v, w * v[0] / long, w * v[1] / long, 0.0, -w * limit)
         total += _add(system, base, w * (long - limit * t))
     if t < LEAST_TIME:
         jacobian[7] = -10.0
         total += _add(system, base, 10.0 * (LEAST_TIME - t))
-    if terms.rear > 0.0:
-        _spread(jacobian, 0, v, 0.0, terms.w_crab * 10.0, 0.0, 0.0)
-        total += _add(system, base, terms.w_crab * 10.0 * v[1])
+    if parameters.rear > 0.0:
+        _spread(jacobian, 0, v, 0.0, parameters.w_crab * 10.0, 0.0, 0.0)
+        total += _add(system, base, parameters.w_crab * 10.0 * v[1])
     return total
 
 
 @njit(cache=True)
-def _double(terms: Terms, band: Array, sense: Array, i: int, system: System, v: Array, u: Array) -> float:
-    """Terms of the intervals before and after pose i."""
+def _pair_terms(
+    parameters: TebParameters, band: Array, direction: Array, i: int, system: NormalEquations, v: Array, u: Array
+) -> float:
+    """Residuals of the intervals before and after pose i."""
     total = 0.0
     base, jacobian = 4 * (i - 1), system.jacobian
     _interval(band, i, v)
@@ -161,52 +179,61 @@ def _double(terms: Terms, band: Array, sense: Array, i: int, system: System, v: 
     t0, t1 = band[i, 3], band[i + 1, 3]
     v0, v1 = v[0] / t0, u[0] / t1
     change = v1 - v0
-    over = abs(change) - terms.acceleration * 0.5 * (t0 + t1)
+    over = abs(change) - parameters.acceleration * 0.5 * (t0 + t1)
     if over > 0.0:
-        w = terms.w_rate * (1.0 if change > 0.0 else -1.0)
-        half = 0.5 * terms.w_rate * terms.acceleration
+        w = parameters.w_rate * (1.0 if change > 0.0 else -1.0)
+        half = 0.5 * parameters.w_rate * parameters.acceleration
         _spread(jacobian, 0, v, -w / t0, 0.0, 0.0, w * v0 / t0 - half)
         _spread(jacobian, 4, u, w / t1, 0.0, 0.0, -w * v1 / t1 - half)
-        total += _add(system, base, terms.w_rate * over)
-    if sense[i] != sense[i + 1] or abs(v[0]) < LEAST_STEP or abs(u[0]) < LEAST_STEP:
+        total += _add(system, base, parameters.w_rate * over)
+    if direction[i] != direction[i + 1] or abs(v[0]) < LEAST_STEP or abs(u[0]) < LEAST_STEP:
         return total
     for axle in range(2):
-        if axle == 1 and terms.rear <= 0.0:
+        if axle == 1 and parameters.rear <= 0.0:
             continue
-        arm = terms.l_f if axle == 0 else -terms.l_r
+        arm = parameters.l_f if axle == 0 else -parameters.l_r
         f0, f1 = (v[1] + arm * v[2]) / v[0], (u[1] + arm * u[2]) / u[0]
         turned = f1 - f0
-        over = abs(turned) - terms.rate * 0.5 * (t0 + t1)
+        over = abs(turned) - parameters.rate * 0.5 * (t0 + t1)
         for kind in range(2):
             if kind == 1 and over <= 0.0:
                 continue
-            w = terms.w_smooth if kind == 0 else terms.w_rate * (1.0 if turned > 0.0 else -1.0)
-            half = 0.0 if kind == 0 else 0.5 * terms.w_rate * terms.rate
+            w = parameters.w_smooth if kind == 0 else parameters.w_rate * (1.0 if turned > 0.0 else -1.0)
+            half = 0.0 if kind == 0 else 0.5 * parameters.w_rate * parameters.rate
             _spread(jacobian, 0, v, w * f0 / v[0], -w / v[0], -w * arm / v[0], -half)
             _spread(jacobian, 4, u, -w * f1 / u[0], w / u[0], w * arm / u[0], -half)
-            total += _add(system, base, w * turned if kind == 0 else terms.w_rate * over)
+            total += _add(system, base, w * turned if kind == 0 else parameters.w_rate * over)
     return total
 
 
 @njit(cache=True)
-def _obstacles(field: FieldData, cover: Cover, terms: Terms, band: Array, i: int, system: System) -> float:
+def _obstacles(
+    field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, i: int, system: NormalEquations
+) -> float:
     """Clearance of pose i."""
     total = 0.0
     x, y = band[i, 0], band[i, 1]
     c, s = cos(band[i, 2]), sin(band[i, 2])
     for k in range(len(cover.x)):
         ox, oy = cover.x[k] * c - cover.y[k] * s, cover.x[k] * s + cover.y[k] * c
-        value, gx, gy = distance(field, x + ox, y + oy)
-        lack = terms.clearance - (value - cover.radius[k])
+        value, gx, gy = distance_and_gradient(field, x + ox, y + oy)
+        lack = parameters.clearance - (value - cover.radius[k])
         if lack > 0.0:
-            w = terms.w_obstacle / sqrt(len(cover.x))
+            w = parameters.w_obstacle / sqrt(len(cover.x))
             system.jacobian[0], system.jacobian[1], system.jacobian[2] = -w * gx, -w * gy, -w * (gy * ox - gx * oy)
             total += _add(system, 4 * i, w * lack)
     return total
 
 
 @njit(cache=True)
-def _assemble(field: FieldData, cover: Cover, terms: Terms, band: Array, sense: Array, system: System) -> float:
+def _assemble(
+    field: FieldData,
+    cover: CoveringDiscs,
+    parameters: TebParameters,
+    band: Array,
+    direction: Array,
+    system: NormalEquations,
+) -> float:
     """All residuals at a band; returns the sum of their squares."""
     n = len(band)
     system.matrix[:] = 0.0
@@ -215,10 +242,10 @@ def _assemble(field: FieldData, cover: Cover, terms: Terms, band: Array, sense: 
     v, u = np.empty(5), np.empty(5)
     total = 0.0
     for i in range(1, n):
-        total += _single(terms, band, sense, i, system, v)
+        total += _interval_terms(parameters, band, direction, i, system, v)
         if i < n - 1:
-            total += _double(terms, band, sense, i, system, v, u)
-            total += _obstacles(field, cover, terms, band, i, system)
+            total += _pair_terms(parameters, band, direction, i, system, v, u)
+            total += _obstacles(field, cover, parameters, band, i, system)
     return total
 
 
@@ -252,27 +279,29 @@ def _solve(matrix: Array, vector: Array) -> bool:
 
 
 @njit(cache=True)
-def cost_and_gradient(field: FieldData, cover: Cover, terms: Terms, band: Array, sense: Array) -> tuple[float, Array]:
+def cost_and_gradient(
+    field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, direction: Array
+) -> tuple[float, Array]:
     """Half the sum of squares, and its gradient, shape (4 n,)."""
     n = len(band)
     # Residuals at the last poses reach over the end.
-    system = System(np.zeros((4 * n + WIDTH, WIDTH)), np.zeros(4 * n + WIDTH), np.zeros(WIDTH))
-    total = _assemble(field, cover, terms, band, sense, system)
+    system = NormalEquations(np.zeros((4 * n + WIDTH, WIDTH)), np.zeros(4 * n + WIDTH), np.zeros(WIDTH))
+    total = _assemble(field, cover, parameters, band, direction, system)
     return 0.5 * total, system.gradient[: 4 * n].copy()
 
 
 @njit(cache=True)
-def settle(
-    field: FieldData, cover: Cover, terms: Terms, band: Array, sense: Array, iterations: int
+def optimise(
+    field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, direction: Array, iterations: int
 ) -> tuple[float, int]:
     """Levenberg-Marquardt steps; the first and the last pose stay.
 
     Args:
         field: obstacles.
         cover: footprint.
-        terms: vehicle, limits, weights.
+        parameters: vehicle, limits, weights.
         band: shape (n, 4): x, y, yaw (continuous), seconds of the interval before; changed in place.
-        sense: shape (n,), +1 or -1: direction of the interval before.
+        direction: shape (n,), +1 or -1: direction of the interval before.
         iterations: steps at most.
 
     Returns:
@@ -280,8 +309,8 @@ def settle(
     """
     n = len(band)
     size = 4 * n
-    system = System(np.zeros((size + WIDTH, WIDTH)), np.zeros(size + WIDTH), np.zeros(WIDTH))
-    total = _assemble(field, cover, terms, band, sense, system)
+    system = NormalEquations(np.zeros((size + WIDTH, WIDTH)), np.zeros(size + WIDTH), np.zeros(WIDTH))
+    total = _assemble(field, cover, parameters, band, direction, system)
     damping, gained = 1e-3, 0
     trial = band.copy()
     for _ in range(iterations):
@@ -290,7 +319,7 @@ def settle(
             matrix[i, 0] += damping * (matrix[i, 0] + 1.0)
         for i in range(size):
             if i < 4 or size - 4 <= i < size - 1:
-                matrix[i, 0] += FAR
+                matrix[i, 0] += FIXED
                 step[i] = 0.0
         if not _solve(matrix, step):
             damping *= 10.0
@@ -299,7 +328,7 @@ def settle(
             for k in range(3):
                 trial[i, k] = band[i, k] + step[4 * i + k]
             trial[i, 3] = max(band[i, 3] + step[4 * i + 3], 0.5 * LEAST_TIME)
-        new = _assemble(field, cover, terms, trial, sense, system)
+        new = _assemble(field, cover, parameters, trial, direction, system)
         if new < total:
             gained += 1
             done = total - new < 1e-4 * total
@@ -309,25 +338,25 @@ def settle(
                 break
         else:
             damping *= 8.0
-            _assemble(field, cover, terms, band, sense, system)
+            _assemble(field, cover, parameters, band, direction, system)
     return 0.5 * total, gained
 
 
 AXLE_LIMIT = 0.4
-"""Angle that belongs to the turning radius, for the steering rate of trucks that cannot crab, rad."""
+"""Axle angle at the least turning radius, for the steering rate of trucks that cannot crab, rad."""
 
 BEFORE_CUSP = 0.25
-"""A band that moved its cusp away from the truck for ever would never change direction, m."""
+"""Nearer than this to a cusp the path stays as it is, m: a band could move its cusp away forever."""
 
-WHOLE = 0.05
+BAND_END_REACHED = 0.05
 """A path that ends further from its band's end is only a part of it, m."""
 
-TAUT = 0.9
-"""Share of the steering that the least squares may use: what they leave over has room."""
+STEERING_SHARE = 0.9
+"""Share of the steering that the least squares may use, as a reserve for their remaining violations."""
 
 
-class Teb:
-    """The deformer of kind ``teb``.
+class TebPlanner:
+    """The local planner of kind ``teb``.
 
     Args:
         vehicle: what is driven.
@@ -337,64 +366,60 @@ class Teb:
     def __init__(self, vehicle: Vehicle, config: TebConfig | None = None) -> None:
         self.vehicle = vehicle
         self.config = config or TebConfig()
-        self._surveyor = Surveyor(vehicle, self.config, costs_of(self.config))
-        self._rules = rules_of(self.config.band, self._surveyor.cover)
-        self.terms = terms_of(vehicle, self.config)
+        self._core = LocalPlannerCore(vehicle, self.config, costs_of(self.config))
+        self._band_parameters = band_parameters(self.config.band, self._core.cover)
+        self.parameters = teb_parameters(vehicle, self.config)
 
-    def deform(self, guide: Guide, surroundings: DistanceField, pose: ArrayLike, memory: Memory) -> DeformResult:
-        """One cycle, see ``api.Deformer``.
-
-        Raises:
-            InputError: a pose that is none.
-        """
-        cycle = self._surveyor.begin(guide, surroundings, pose, memory)
-        if isinstance(cycle, DeformResult):
+    def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
+        """One cycle, see ``LocalPlanner``."""
+        cycle = self._core.begin(route, obstacles, pose, state)
+        if isinstance(cycle, LocalPlan):
             return cycle
-        here, local, memory = cycle.here, cycle.local, cycle.memory
+        robot_pose, local, state = cycle.robot_pose, cycle.local, cycle.state
         statistics = {"searched": 0.0, "poses": 0.0, "steps": 0.0, "kept": 0.0}
-        rest = rest_of(memory.path, here)[0] if memory.path is not None else None
+        rest = remaining_path(state.path, robot_pose)[0] if state.path is not None else None
         path = None
         if rest is None or not turns_soon(rest):
-            path = self._from_band(local, surroundings, here, statistics)
-        if path is None and rest is not None and self._usable(rest, local, surroundings):
+            path = self._from_band(local, obstacles, robot_pose, statistics)
+        if path is None and rest is not None and self._usable(rest, local, obstacles):
             path = rest
             statistics["kept"] = 1.0
         if path is None:
             statistics["searched"] = 1.0
-            found, way, why = self._surveyor.search(surroundings, here, local, memory.failed)
+            found, way, why = self._core.search(obstacles, robot_pose, local, state.failed)
             if found is None:
-                result = self._surveyor.partial(memory, surroundings, here, rest, why)
+                result = self._core.partial(state, obstacles, robot_pose, rest, why)
                 return replace(result, statistics=statistics)
-            path = self._settled(Guide.from_motion(found, self.config.spacing), surroundings, statistics) or found
+            path = self._optimised(PosePath.from_motion(found, self.config.spacing), obstacles, statistics) or found
             local = replace(local, band=way or local.band)
-        done = local.final and ends_at(path, guide.poses[-1])
+        done = local.final and ends_at(path, route.poses[-1])
         end = local.band.poses[-1]
-        whole = math.hypot(*(path.end - end)[:2]) < WHOLE
-        band = Guide.from_motion(path, self.config.spacing) if whole else local.band
-        after = replace(memory, band=band, path=path, failed=0)
-        return DeformResult(Reason.OK, after, path, done, statistics=statistics)
+        whole = math.hypot(*(path.end - end)[:2]) < BAND_END_REACHED
+        band = PosePath.from_motion(path, self.config.spacing) if whole else local.band
+        after = replace(state, band=band, path=path, failed=0)
+        return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
-    def _usable(self, rest: MotionPath, local: Local, surroundings: DistanceField) -> bool:
-        """Whether the path so far may be kept: long enough, free, and not one that gave up before the band's end."""
+    def _usable(self, rest: MotionPath, local: LocalRoute, obstacles: DistanceField) -> bool:
+        """Whether the last path may be kept: long enough, free, and not one that ends before the band does."""
         long = rest.length > self.config.shortest
         near = long and math.hypot(*(rest.end - local.band.poses[-1])[:2]) < self.config.reach / 3
-        return near and self._surveyor.free(surroundings, rest)
+        return near and self._core.free(obstacles, rest)
 
     def _from_band(
-        self, local: Local, surroundings: DistanceField, here: Array, statistics: dict[str, float]
+        self, local: LocalRoute, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
     ) -> MotionPath | None:
-        """The band at hand, deformed; None if it is broken or does not come free."""
-        whole = with_robot(local.band, here)
+        """The band after optimisation; None if it is broken or not free."""
+        whole = starting_at(local.band, robot_pose)
         if len(whole.poses) < 2:
             return None
-        stretched = stretch(whole, surroundings, self._surveyor.cover, self._rules)
-        if stretched.guide is None:
+        stretched = relax_band(whole, obstacles, self._core.cover, self._band_parameters)
+        if stretched.path is None:
             return None
-        return self._settled(whole, surroundings, statistics)
+        return self._optimised(whole, obstacles, statistics)
 
-    def _settled(self, guide: Guide, surroundings: DistanceField, statistics: dict[str, float]) -> MotionPath | None:
-        """A guide after the least squares, as a path, if that is free."""
-        even = resampled(guide, self.config.spacing)
+    def _optimised(self, poses: PosePath, obstacles: DistanceField, statistics: dict[str, float]) -> MotionPath | None:
+        """Poses after the least squares, as a path, if that is free."""
+        even = resampled(poses, self.config.spacing)
         count = len(even.poses)
         band = np.empty((count, 4))
         band[:, :3] = even.poses
@@ -403,23 +428,23 @@ class Teb:
         speeds = np.where(even.directions > 0, self.config.speed, self.config.reverse_speed)
         band[0, 3] = 1.0
         band[1:, 3] = np.maximum(way / speeds[1:], 0.05)
-        cost, steps = settle(
-            surroundings.data(), self._surveyor.cover, self.terms, band, even.directions, self.config.iterations
+        cost, steps = optimise(
+            obstacles.data(), self._core.cover, self.parameters, band, even.directions, self.config.iterations
         )
         statistics["poses"], statistics["steps"], statistics["cost"] = float(count), float(steps), float(cost)
-        path = drivable(self.vehicle, self.terms, band, even.directions)
+        path = drivable(self.vehicle, self.parameters, band, even.directions)
         goal = band[-1, :3]
         statistics["gap"] = float(np.hypot(*(path.end - goal)[:2]))
-        if not ends_at(path, goal) or not self._surveyor.free(surroundings, path):
+        if not ends_at(path, goal) or not self._core.free(obstacles, path):
             return None
         return path
 
 
-def terms_of(vehicle: Vehicle, config: TebConfig) -> Terms:
+def teb_parameters(vehicle: Vehicle, config: TebConfig) -> TebParameters:
     """Vehicle and weights for the least squares.
 
-    A truck that crabs has two axles as far from its reference point as its radius says; for one that cannot, the rear
-    "axle" is the reference point, which moves along the heading, and the front one is a turning radius ahead.
+    The axles of a truck that crabs are as far from its reference point as its radius implies; for one that cannot, the
+    rear "axle" is the reference point, which moves along the heading, and the front one is a turning radius ahead.
     """
     if vehicle.crab_angle > 0.0:
         tangent = math.tan(vehicle.crab_angle)
@@ -429,20 +454,21 @@ def terms_of(vehicle: Vehicle, config: TebConfig) -> Terms:
     else:
         l_f, l_r, front, rear = vehicle.radius, 0.0, 1.0, 0.0
         rate = config.steering_rate / math.tan(AXLE_LIMIT)
-    return Terms(
-        l_f, l_r, TAUT * front, TAUT * rear, rate, config.speed, config.reverse_speed, config.acceleration,
+    return TebParameters(
+        l_f, l_r, STEERING_SHARE * front, STEERING_SHARE * rear, rate,
+        config.speed, config.reverse_speed, config.acceleration,
         config.clearance + config.margin, config.obstacle_weight, config.steering_weight, config.rate_weight,
         config.smooth_weight, config.crab_weight, config.time_weight,
     )  # fmt: skip
 
 
-def drivable(vehicle: Vehicle, terms: Terms, band: Array, directions: Array) -> MotionPath:
+def drivable(vehicle: Vehicle, parameters: TebParameters, band: Array, directions: Array) -> MotionPath:
     """Path of one exact motion for each interval, from the first pose, within the steering's limits.
 
     Args:
         vehicle: what is driven.
-        terms: its axles.
-        band: shape (n, 4), see ``settle``.
+        parameters: its axles.
+        band: shape (n, 4), see ``optimise``.
         directions: shape (n,).
     """
     half = 0.5 * np.diff(band[:, 2])
@@ -453,28 +479,32 @@ def drivable(vehicle: Vehicle, terms: Terms, band: Array, directions: Array) -> 
     length = directions[1:] * np.hypot(along, aside) / np.sinc(half / math.pi)
     slip = np.arctan(aside / along)
     turn = 2.0 * half / length / np.cos(slip)
-    reach = terms.l_f + terms.l_r
-    front = np.clip(np.tan(slip) + terms.l_f * turn, -terms.front / TAUT, terms.front / TAUT)
-    rear = np.clip(np.tan(slip) - terms.l_r * turn, -terms.rear / TAUT, terms.rear / TAUT)
-    slip = np.arctan((terms.l_r * front + terms.l_f * rear) / reach)
+    reach = parameters.l_f + parameters.l_r
+    front = np.clip(
+        np.tan(slip) + parameters.l_f * turn, -parameters.front / STEERING_SHARE, parameters.front / STEERING_SHARE
+    )
+    rear = np.clip(
+        np.tan(slip) - parameters.l_r * turn, -parameters.rear / STEERING_SHARE, parameters.rear / STEERING_SHARE
+    )
+    slip = np.arctan((parameters.l_r * front + parameters.l_f * rear) / reach)
     curvature = np.cos(slip) * (front - rear) / reach
     segments = np.column_stack((length, curvature, slip))[np.abs(length) > 1e-4]
-    return MotionPath(band[0, :3], segments, ways(vehicle, segments), vehicle.reference)  # type: ignore[arg-type]
+    return MotionPath(band[0, :3], segments, _steering_modes(vehicle, segments), vehicle.reference)  # type: ignore[arg-type]
 
 
 def turns_soon(path: MotionPath) -> bool:
-    """Whether the path changes direction within the next metres: there it stays as it is."""
+    """Whether the path changes direction soon."""
     signs = np.sign(path.segments[:, 0])
     change = np.flatnonzero(np.diff(signs))
     return bool(len(change)) and float(np.abs(path.segments[: change[0] + 1, 0]).sum()) < BEFORE_CUSP
 
 
-def resampled(guide: Guide, spacing: float) -> Guide:
+def resampled(path: PosePath, spacing: float) -> PosePath:
     """The same line with evenly spaced poses; ends and cusps stay."""
-    poses, directions = [guide.poses[:1]], [guide.directions[:1]]
-    yaw = np.unwrap(guide.poses[:, 2])
-    for begin, end in runs(guide.directions):
-        piece = guide.part(begin, end)
+    poses, directions = [path.poses[:1]], [path.directions[:1]]
+    yaw = np.unwrap(path.poses[:, 2])
+    for begin, end in direction_runs(path.directions):
+        piece = path.part(begin, end)
         travelled = piece.travelled
         if travelled[-1] < 1e-6:
             continue
@@ -482,5 +512,13 @@ def resampled(guide: Guide, spacing: float) -> Guide:
         s = np.linspace(0.0, travelled[-1], count + 1)[1:]
         columns = [np.interp(s, travelled, v) for v in (*piece.poses[:, :2].T, yaw[begin:end])]
         poses.append(np.column_stack(columns))
-        directions.append(np.full(count, guide.directions[end - 1]))
-    return Guide(np.vstack(poses), np.concatenate(directions))
+        directions.append(np.full(count, path.directions[end - 1]))
+    return PosePath(np.vstack(poses), np.concatenate(directions))
+
+
+def _steering_modes(vehicle: Vehicle, segments: Array) -> tuple[str, ...]:
+    """How each segment is steered."""
+    return tuple(
+        vehicle.steering if slip == 0.0 else "hybrid" if curvature else "crab"
+        for _, curvature, slip in segments.tolist()
+    )

@@ -1,4 +1,4 @@
-"""A grid window that moves with the truck and remembers what the lidar saw. Compiled."""
+"""Local obstacle grid: a window that moves with the truck and is filled by the lidar. Loads numba."""
 
 import math
 from typing import Annotated
@@ -16,25 +16,24 @@ from monstertruck_schemas.base import Schema
 
 
 class WindowConfig(Schema):
-    """The window."""
+    """The obstacle window."""
 
     size: Annotated[float, Field(gt=0)] = 4.0
     """Side, m."""
     resolution: Annotated[float, Field(gt=0)] = 0.04
     """Metres per cell."""
     mark: Annotated[float, Field(gt=0)] = 3.0
-    """Returns up to this distance are obstacles, m."""
+    """Returns up to this distance mark obstacles, m."""
     clear: Annotated[float, Field(gt=0)] = 4.0
-    """Beams clear up to this distance, m."""
+    """Beams clear cells up to this distance, m."""
     thickness: Annotated[float, Field(ge=0)] = 0.12
-    """Obstacles are taken to be this thick where nobody has looked behind them, m."""
+    """Depth of obstacles where the cells behind them have never been seen, m."""
 
 
 class Window:
-    """Obstacles round the truck, in a grid whose axes are those of the frame.
+    """Obstacles around the truck, in a grid whose axes are those of the frame.
 
-    Cells nobody has seen are free unless they lie just behind an obstacle; what is out of sight stays as it was seen
-    last.
+    Cells never seen are free unless they lie just behind an obstacle; cells out of sight keep their last state.
 
     Args:
         config: size and resolution.
@@ -50,13 +49,13 @@ class Window:
     def add_scan(
         self, sensor: tuple[float, float], base: tuple[float, float], ends: Array, hit: NDArray[np.bool_]
     ) -> None:
-        """Take in a scan.
+        """Add a scan.
 
         Args:
             sensor: x, y of the lidar, m.
             base: x, y of the truck, the new middle of the window, m.
             ends: shape (n, 2): where each beam ended, m.
-            hit: shape (n,): whether it met something there.
+            hit: shape (n,): whether it hit something there.
 
         Raises:
             InputError: shapes that do not fit.
@@ -79,7 +78,7 @@ class Window:
         """Distances in the window.
 
         Args:
-            known: obstacles of the map, which count beside those seen; its cells outside the map do not.
+            known: obstacles of the map, added to those seen; outside the map nothing is added.
         """
         x, y = self.corner
         res = self.config.resolution
@@ -105,7 +104,7 @@ class Window:
 
 
 def _moved(cells: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool_]:
-    """What a window shows that has moved up by rows and right by columns."""
+    """Cells of a window moved up by rows and right by columns."""
     count = len(cells)
     fresh = np.zeros_like(cells)
     if abs(columns) < count and abs(rows) < count:
@@ -125,7 +124,7 @@ def _mark(
     mark: float,
     clear: float,
 ) -> None:
-    """Clear the cells along all beams, then mark where they met something; all in cells."""
+    """Clear the cells along all beams, then mark those they hit; lengths in cells."""
     rows, columns = cells.shape
     for i in range(len(ends)):
         dx, dy = ends[i, 0] - start[0], ends[i, 1] - start[1]

@@ -1,1 +1,1 @@
-"""Routes: shortest motions of a car, searches over a map, shortening. Modules called compiled load numba: workers."""
+"""Route planners: shortest motions of a car, searches over a map, smoothing. Modules that load numba run in workers."""

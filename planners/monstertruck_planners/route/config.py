@@ -14,37 +14,37 @@ Unknown = Literal["blocked", "dear", "free"]
 
 
 class GoalConfig(Schema):
-    """What all route planners share."""
+    """Shared by all route planners."""
 
     budget: Positive = 1.0
-    """Time for a route and its improvement, s; used when the caller gives a clock."""
+    """Time for a route and its improvement, s, if there is a clock."""
     effort: Annotated[int, Field(gt=0)] = 60_000
-    """Search steps and improvement trials allowed without a clock: equal inputs then give equal routes."""
+    """Nodes expanded and smoothing trials, if there is no clock: equal inputs then give equal routes."""
     position_tolerance: NotNegative = 0.05
-    """If the goal itself is taken, a free pose this near will do, m."""
+    """If the goal itself is not free, a free pose this near is accepted, m."""
     yaw_tolerance: NotNegative = 0.09
     """The same for the heading, rad."""
     margin: NotNegative = 0.0
     """Kept between footprint and obstacles, m."""
     unknown: Unknown = "blocked"
-    """Cells that nobody has seen: obstacles, dear ground, or free."""
+    """Unknown cells are obstacles, free at an extra cost (``dear``), or free."""
     unknown_cost: NotNegative = 1.0
-    """Extra cost of a metre on dear unknown ground, m."""
+    """Extra cost of a metre on unknown cells that are ``dear``, m."""
 
 
 class DriveCosts(GoalConfig):
-    """What a metre costs, for planners of drivable motions. As they stand, routes are the shortest ones, nearly."""
+    """Costs of drivable motions. With the defaults routes are nearly the shortest ones."""
 
     reverse_cost: AtLeastOne = 1.0
-    """Of a metre backward, m; above 1 for a truck that sees better ahead."""
+    """Of a metre backward, m; above 1 for a truck whose sensors look ahead."""
     cusp_cost: NotNegative = 0.1
     """Of a change of direction, m."""
     swing_cost: NotNegative = 0.01
-    """Of a change of curvature, m: few long arcs rather than many short ones."""
+    """Of a change of curvature, m: few long arcs instead of many short ones."""
     crab_cost: AtLeastOne = 1.0
-    """Of a metre beside the heading, m."""
+    """Of a metre of translation, m."""
     clearance: NotNegative = 0.1
-    """Nearer to obstacles than this a metre costs more, m."""
+    """Distance to obstacles below which a metre costs more, m."""
     clearance_cost: NotNegative = 0.1
     """Extra cost of a metre in contact, falling to 0 at ``clearance``, m."""
     tilt_cost: NotNegative = 2.0
@@ -58,15 +58,15 @@ class HybridConfig(DriveCosts):
 
     kind: Literal["hybrid"] = "hybrid"
     greed: AtLeastOne = 2.0
-    """Factor on the heuristics: more finds a first route sooner."""
+    """Heuristic weight: a greater one finds a first route sooner."""
     narrow_margin: NotNegative = 0.03
-    """Kept instead of a greater margin where that leaves no way, m."""
+    """Least margin, used where the configured one leaves no way, m."""
     improve: bool = True
-    """Shorten the route and look for other ways while there is time."""
+    """Smooth the route and try alternatives while there is time."""
 
 
 class LatticeConfig(DriveCosts):
-    """State lattice with moves of exact radius, made for the way of steering; costs as the author's."""
+    """State lattice with motion primitives of exact radius; costs as the author's."""
 
     kind: Literal["lattice"] = "lattice"
     cell: Positive = 0.05
@@ -78,11 +78,11 @@ class LatticeConfig(DriveCosts):
     reverse_turn_factor: AtLeastOne = 5.0
     """On the cost of a turn or translation backward."""
     greed: AtLeastOne = 2.0
-    """Factor on the heuristic of the first search; it falls to 1 while there is time."""
+    """Heuristic weight of the first search; it falls to 1 while there is time."""
 
 
 class GridAstarConfig(GoalConfig):
-    """The author's first planner; its ways are no drivable motions."""
+    """The author's first planner; its paths are no drivable motions."""
 
     kind: Literal["grid_astar"] = "grid_astar"
     neutral: Positive = 50.0
@@ -92,6 +92,6 @@ class GridAstarConfig(GoalConfig):
     lethal: Positive = 200.0
     """From this value on a cell is closed."""
     inflation: NotNegative = 0.3
-    """Reach of the costs round obstacles beyond the inscribed circle, m."""
+    """Distance beyond the inscribed circle at which the costs of obstacles end, m."""
     decay: Positive = 10.0
     """Of the costs with distance, 1/m."""

@@ -1,9 +1,9 @@
-"""Windows, routes and checks for the tests of deformers."""
+"""Windows, routes and checks for the tests of local planners."""
 
 import numpy as np
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import Guide
+from monstertruck_planners.local.api import LocalPlannerState, PosePath
 
 RES = 0.04
 
@@ -20,7 +20,7 @@ def window(*boxes, size=4.0):
 def line(begin=0.8, end=6.0, y=2.0, step=0.08):
     """Straight route along x."""
     x = np.arange(begin, end, step)
-    return Guide(np.column_stack((x, np.full(len(x), y), np.zeros(len(x)))), np.ones(len(x)))
+    return PosePath(np.column_stack((x, np.full(len(x), y), np.zeros(len(x)))), np.ones(len(x)))
 
 
 def drivable(vehicle, path, angle=0.4):
@@ -32,3 +32,15 @@ def drivable(vehicle, path, angle=0.4):
     return bool((np.abs(np.arctan(np.tan(slip) + half)) <= angle + 1e-9).all()) and bool(
         (np.abs(np.arctan(np.tan(slip) - half)) <= angle + 1e-9).all()
     )
+
+
+class Cycles:
+    """A local planner with its state: one call for every scan."""
+
+    def __init__(self, planner):
+        self.planner, self.state = planner, LocalPlannerState()
+
+    def step(self, route, obstacles, pose):
+        result = self.planner.plan(route, obstacles, pose, self.state)
+        self.state = result.state
+        return result
