@@ -6,7 +6,8 @@ The whole daemon runs on the virtual clock, its workers' steps in the loop. A da
 function that is given it as an argument, as itself or inside a message, dataclass, tuple or list. What such a function
 returns or constructs carries it on, and the function it returns to has it, too. Where a service keeps a datum in its
 state, the way goes on with the next message that is made from that state; those messages are named for each way. A
-configuration value is followed by its content instead, because it is parsed on its way, up to the first reader.
+configuration value is followed by its content instead, because it is parsed on its way, then through the calls that
+lead to its first reader.
 
 Counted are the distinct files of this project that it passes in the named services, without the emulated side.
 ``--files`` lists them in the order in which they are entered, with their lines. The last line is JSON.
@@ -18,6 +19,7 @@ import dataclasses
 import json
 import sys
 import tempfile
+import traceback
 from collections.abc import Callable, Collection
 from enum import Enum
 from pathlib import Path
@@ -165,38 +167,26 @@ def _makes(frame: FrameType) -> bool:
 
 
 class ContentTrace(Trace):
-    """Follows a configuration value by what it says: as text, number, or part of a section.
+    """Follows a configuration value by what it says: as text, number, or part of a section."""
 
-    Args:
-        depth: sections within sections that are looked into.
-    """
-
-    def __init__(self, depth: int) -> None:
+    def __init__(self) -> None:
         super().__init__((), ())
-        self._depth = depth
-        self.arrived = False
 
     def _watched(self, frame: FrameType) -> bool:
-        return not self.arrived and source_file(frame.f_code.co_filename) is not None
+        return source_file(frame.f_code.co_filename) is not None
 
     def _is_given(self, frame: FrameType) -> bool:
         code = frame.f_code
         names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-        return any(self._says(frame.f_locals.get(name), self._depth) for name in names if name != "self")
+        return any(self._says(frame.f_locals.get(name)) for name in names if name != "self")
 
     def _begins(self, frame: FrameType, result: Any) -> bool:
-        return self._says(result, self._depth)
+        return self._says(result)
 
     def _return(self, frame: FrameType, result: Any) -> None:
         self._passed.discard(frame)
 
-    def note_reader(self, frame: FrameType) -> None:
-        """The function of ``frame`` uses the value: the way ends there."""
-        if source_file(frame.f_code.co_filename) is not None and not self.arrived:
-            self._note(frame)
-            self.arrived = True
-
-    def _says(self, value: Any, depth: int) -> bool:
+    def _says(self, value: Any, depth: int = 4) -> bool:
         if isinstance(value, str | bytes):
             return str(SPEED) in str(value)
         if isinstance(value, float):
@@ -297,23 +287,23 @@ def configuration_value() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "robot.yaml"
         file.write_text(f"include: {ROOT / 'configs' / 'demo.yaml'}\ngate: {{speed: {SPEED}}}\n", encoding="utf-8")
-        loading, using = ContentTrace(depth=4), ContentTrace(depth=1)
+        trace, readers = ContentTrace(), []
 
         def read(config: GateConfig, name: str) -> Any:
-            if name == "speed" and sys.getprofile() is using:
-                using.note_reader(sys._getframe(1))  # noqa: SLF001  # who reads it
+            if name == "speed":
+                readers.append([frame.f_code.co_filename for frame, _ in traceback.walk_stack(None)])
             return object.__getattribute__(config, name)
 
         async def main(clock: VirtualClock) -> None:
-            sys.setprofile(loading)
+            sys.setprofile(trace)
             config = load_truck(file)[0]
-            sys.setprofile(using)
-            Daemon(config, clock, seed=1)
             sys.setprofile(None)
+            with patch.object(GateConfig, "__getattribute__", read):
+                Daemon(config, clock, seed=1)
 
-        with patch.object(GateConfig, "__getattribute__", read):
-            run_virtual(main)
-        return list(dict.fromkeys(loading.files + using.files))
+        run_virtual(main)
+        stack = [found for name in reversed(readers[0]) if (found := source_file(name)) is not None]
+        return list(dict.fromkeys([*trace.files, *stack[1:]]))  # below the loop that runs this
 
 
 WAYS: Final[dict[str, Callable[[], list[str]]]] = {
