@@ -22,6 +22,7 @@ from monstertruck_drivers.webcam.driver import complete
 from monstertruck_drivers.webcam.emulator import Renderer
 from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser
 from monstertruck_drivers.webcam.source import Mode
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.mailbox import fifo
@@ -38,7 +39,7 @@ PERIOD = 20_000_000
 WARM_UP = 6.0
 
 
-async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) -> tuple[NDArray[np.float64], int]:
+async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) -> tuple[Array, int]:
     """Every tick's lateness, ms, and the number of pictures that came."""
     endpoint = free_endpoint()
     config = write_overlay(FULL, folder, endpoint)
@@ -57,7 +58,7 @@ async def lateness(clock: Clock, folder: Path, *, camera: bool, seconds: float) 
         return behind_grid(np.array([tick.stamp for tick in ticks.drain()])), len(pictures.drain())
 
 
-def behind_grid(stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+def behind_grid(stamps: NDArray[np.int64]) -> Array:
     """Milliseconds behind a grid of ``PERIOD`` that no stamp is ahead of; none is late by half a period usually."""
     phase = (stamps - stamps[0]) % PERIOD
     phase = (phase - int(np.median(phase)) + PERIOD // 2) % PERIOD
@@ -65,7 +66,7 @@ def behind_grid(stamps: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
-    late: dict[bool, list[NDArray[np.float64]]] = {True: [], False: []}
+    late: dict[bool, list[Array]] = {True: [], False: []}
     pictures = 0
     with TemporaryDirectory() as folder:
         for number in range(rounds):

@@ -30,6 +30,7 @@ from numba import njit
 from numpy.typing import NDArray
 from same_python import go_on_in_the_systems_python
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.raycast import cast_rays, clearance
 from monstertruckd.tools.demo.fast import run_fast_demo
 
@@ -41,7 +42,6 @@ QUOTED = {5.6: (9_000.0, 16_000.0), 30.0: (3_000.0, 6_000.0)}
 """Scans per second of f1tenth_gym on a computer of two cores, least and greatest."""
 GOALS = {"wrong_share": 0.0, "over_peer": 1.0, "speed": 15.0}
 NOTHING = np.zeros((0, 3)), np.zeros((0, 4))
-Floats = NDArray[np.float64]
 
 
 def make_map(seed: int = 1) -> NDArray[np.bool_]:
@@ -60,7 +60,7 @@ def make_map(seed: int = 1) -> NDArray[np.bool_]:
     return occupied
 
 
-def free_poses(occupied: NDArray[np.bool_], count: int, seed: int = 2) -> Floats:
+def free_poses(occupied: NDArray[np.bool_], count: int, seed: int = 2) -> Array:
     """(count, 3) of x, y, yaw, at least 20 cm away from everything."""
     rng = np.random.default_rng(seed)
     rows, columns = np.nonzero(clearance(occupied) > 4)
@@ -92,7 +92,7 @@ def exact_walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, re
     return inf
 
 
-def wrong(got: Floats, want: Floats, reach: float) -> float:
+def wrong(got: Array, want: Array, reach: float) -> float:
     """Share of beams that are off by more than a cell; nothing seen counts as ``reach``."""
     return float(np.mean(np.abs(np.minimum(got, reach) - np.minimum(want, reach)) > RESOLUTION))
 
@@ -108,7 +108,7 @@ def load_peer(path: Path) -> ModuleType:
     return module
 
 
-def peer_scanner(module: ModuleType, occupied: NDArray[np.bool_], reach: float) -> Callable[[Floats], Floats]:
+def peer_scanner(module: ModuleType, occupied: NDArray[np.bool_], reach: float) -> Callable[[Array], Array]:
     """Its simulator on our map: set as its ``set_map`` sets it from a file."""
     simulator = module.ScanSimulator2D(BEAMS, FIELD, max_range=reach)
     simulator.map_height, simulator.map_width = occupied.shape
@@ -119,18 +119,18 @@ def peer_scanner(module: ModuleType, occupied: NDArray[np.bool_], reach: float) 
     return lambda pose: simulator.scan(pose, None)
 
 
-def our_scanner(occupied: NDArray[np.bool_], reach: float) -> Callable[[Floats], Floats]:
+def our_scanner(occupied: NDArray[np.bool_], reach: float) -> Callable[[Array], Array]:
     """The world's, from a truck that stands."""
     clear, beams = clearance(occupied), np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
 
-    def scan(pose: Floats) -> Floats:
+    def scan(pose: Array) -> Array:
         xs, ys = np.full(BEAMS, pose[0]), np.full(BEAMS, pose[1])
         return cast_rays(clear, RESOLUTION, 0.0, 0.0, xs, ys, pose[2] + beams, reach, *NOTHING)
 
     return scan
 
 
-def rates(scanners: dict[str, Callable[[Floats], Floats]], poses: Floats, rounds: int = 15) -> dict[str, Floats]:
+def rates(scanners: dict[str, Callable[[Array], Array]], poses: Array, rounds: int = 15) -> dict[str, Array]:
     """Scans per second of processor time, in turn: (rounds,) each."""
     found = {name: np.empty(rounds) for name in scanners}
     for scan in scanners.values():

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
@@ -27,6 +26,7 @@ from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import load, save
 from monstertruck_estimation.slam.worker_io import ScanIncrement, ScanInput, SlamEstimate
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import LocalisationStatus
@@ -34,8 +34,6 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedbac
 from monstertruck_schemas.state import ScanMotion
 from monstertruck_sim.world.config import TruckConfig
 from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
-
-Array = NDArray[np.float64]
 
 SEEDS, QUICK_SEEDS = 10, 2
 LATENCY = 3 * SECOND // 100

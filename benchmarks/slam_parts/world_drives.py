@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
@@ -19,7 +19,6 @@ from monstertruck_sim.world.config import MotorConfig, TruckConfig, WorldConfig
 from monstertruck_sim.world.noise import generator
 from monstertruck_sim.world.world import World
 
-Array = NDArray[np.float64]
 Route = tuple[tuple[float, float], ...]
 
 TICK = SECOND // 100

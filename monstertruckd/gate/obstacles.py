@@ -4,8 +4,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
@@ -22,7 +22,6 @@ SWEEPS = 256
 """Sweeps cached."""
 
 Arcs = tuple[tuple[float, float], ...]
-Array = NDArray[np.float64]
 
 
 class ObstacleGuard:

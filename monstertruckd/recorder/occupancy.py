@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
+
 Bytes = NDArray[np.uint8]
 
 _GROW = 32
@@ -42,7 +43,7 @@ class OccupancyRaster:
         rows, columns = self._hits.shape
         return Area(float(low[0]), float(low[1]), float(low[0] + columns * self.cell), float(low[1] + rows * self.cell))
 
-    def add(self, origin: Floats, points: Floats) -> None:
+    def add(self, origin: Array, points: Array) -> None:
         """Take in one scan.
 
         Args:
@@ -62,13 +63,13 @@ class OccupancyRaster:
         self._hits += hit
         self._passes += through & ~hit
 
-    def occupancy(self) -> Floats:
+    def occupancy(self) -> Array:
         """Share of hits, shape (rows, columns), row 0 at the lowest y; NaN where nothing was seen."""
         total = self._hits.astype(np.float64) + self._passes
         with np.errstate(invalid="ignore"):
             return self._hits / total
 
-    def _cells(self, points: Floats) -> NDArray[np.int64]:
+    def _cells(self, points: Array) -> NDArray[np.int64]:
         return np.floor(points / self.cell).astype(np.int64)
 
     def _cover(self, ends: NDArray[np.int64], origin: NDArray[np.int64]) -> None:
@@ -91,7 +92,7 @@ class OccupancyRaster:
         self._corner = corner
 
 
-def _beams(origin: Floats, points: Floats, step: float) -> Floats:
+def _beams(origin: Array, points: Array, step: float) -> Array:
     """Points every ``step`` along each beam, its last step left out; shape (m, 2)."""
     beams = points - origin
     lengths = np.hypot(beams[:, 0], beams[:, 1])
@@ -99,5 +100,5 @@ def _beams(origin: Floats, points: Floats, step: float) -> Floats:
     beam = np.repeat(np.arange(len(points)), counts)
     nth = np.arange(len(beam)) - np.repeat(np.cumsum(counts) - counts, counts)
     along = nth * step / lengths[beam]
-    sampled: Floats = origin + beams[beam] * along[:, None]
+    sampled: Array = origin + beams[beam] * along[:, None]
     return sampled

@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageDraw, ImageFont
 
+from monstertruck_kinematics.elementary import Array
 from monstertruckd.recorder.occupancy import Area, OccupancyRaster
 
-Floats = NDArray[np.float64]
 Point = tuple[float, float]
 
 
@@ -161,7 +160,7 @@ class _Frame:
         return left + (x - self.area.x0) * self.scale, top + (self.area.y1 - y) * self.scale
 
 
-def _shown(raster: OccupancyRaster, paths: list[Floats]) -> Area:
+def _shown(raster: OccupancyRaster, paths: list[Array]) -> Area:
     """Everything seen and driven, with some room around it."""
     seen = ~np.isnan(raster.occupancy())
     corners = [path[:, :2] for path in paths]
@@ -214,7 +213,7 @@ def _line(pen: ImageDraw.ImageDraw, points: list[Point], style: Style) -> None:
         pen.line([(x, y) for x, y in dash], fill=style.color, width=width, joint="curve")
 
 
-def _dashes(points: Floats, length: float) -> list[Floats]:
+def _dashes(points: Array, length: float) -> list[Array]:
     """Pieces of a polyline, ``length`` long, with gaps of 0.7 ``length`` between them."""
     if len(points) < 2:
         return []
@@ -227,7 +226,7 @@ def _dashes(points: Floats, length: float) -> list[Floats]:
     return pieces
 
 
-def _ends(pen: ImageDraw.ImageDraw, frame: _Frame, poses: Floats, style: Style) -> None:
+def _ends(pen: ImageDraw.ImageDraw, frame: _Frame, poses: Array, style: Style) -> None:
     """A ring where the path begins, an arrow where it ends if it has headings."""
     x, y = frame.pixel(*poses[0, :2])
     radius = 6 * _OVERSAMPLING

@@ -3,12 +3,9 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, inverse
 from monstertruck_estimation.slam.worker_io import Vector
-
-Array = NDArray[np.float64]
 
 
 class SmoothedCorrection:

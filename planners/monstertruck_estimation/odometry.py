@@ -11,12 +11,12 @@ from struct import Struct
 from typing import Annotated, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
@@ -25,7 +25,6 @@ from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 Share = Annotated[float, Field(ge=0)]
@@ -70,7 +69,7 @@ class PlanarCovariance(NamedTuple):
             xx - gain_x * xw, xy - gain_x * yw, yy - gain_y * yw, xw - gain_x * ww, yw - gain_y * ww, ww - gain * ww
         )
 
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """All nine numbers, row-major; read-only."""
         xx, xy, yy, xw, yw, ww = self
         return np.frombuffer(_NINE.pack(xx, xy, xw, xy, yy, yw, xw, yw, ww))

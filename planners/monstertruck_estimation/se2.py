@@ -1,9 +1,8 @@
 """Planar poses (x, y, yaw) as arrays with a last axis of 3; m and rad; vectorised over the leading axes."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 
 def wrap(angle: Array | float) -> Array:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
@@ -105,7 +105,7 @@ def invert(transform: Transform) -> Transform:
     )
 
 
-def transform_points(transform: Transform, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def transform_points(transform: Transform, points: Array) -> Array:
     """Points, shape (n, 3), of the child frame in the parent frame, m."""
     x, y, z, w = transform.rotation
     matrix = np.array(

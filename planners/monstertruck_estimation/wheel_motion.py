@@ -8,13 +8,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 _ANGLE_STEP = 1e-4

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.errors import KinematicsError
 
 Array = NDArray[np.float64]
+"""Floats, of the shape that is stated where it is used."""
 Real = TypeVar("Real", float, Array)
 """A float, or an array of any shape; every argument of one call is of one kind or broadcasts."""
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
 from monstertruck_sim.world.terrain import Profile
 
@@ -146,7 +147,7 @@ BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
 }
 
 
-def lap(spacing: float = 0.05) -> NDArray[np.float64]:
+def lap(spacing: float = 0.05) -> Array:
     """The drawn lap of ``loop``, counter-clockwise from its start pose and back to it.
 
     Args:
@@ -175,9 +176,7 @@ def lap(spacing: float = 0.05) -> NDArray[np.float64]:
     return points
 
 
-def _along(
-    x: float, y: float, yaw: float, s: NDArray[np.float64], curvature: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _along(x: float, y: float, yaw: float, s: Array, curvature: float) -> tuple[Array, Array, Array]:
     half = s * curvature / 2
     chord = s * np.sinc(half / pi)
     return x + chord * np.cos(yaw + half), y + chord * np.sin(yaw + half), yaw + 2 * half

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from math import cos, hypot, sin
 
 import numpy as np
-from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,21 +28,21 @@ class Box:
     width: float
     yaw: float = 0.0
 
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self) -> Array:
         """Corners in the map frame, (4, 2), counter-clockwise, m."""
         c, s = cos(self.yaw), sin(self.yaw)
         local = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (self.length / 2, self.width / 2)
-        corners: NDArray[np.float64] = local @ np.array([(c, s), (-s, c)]) + (self.x, self.y)
+        corners: Array = local @ np.array([(c, s), (-s, c)]) + (self.x, self.y)
         return corners
 
 
 Obstacle = Disc | Box
 
 
-def discs_and_segments(obstacles: Iterable[Obstacle]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def discs_and_segments(obstacles: Iterable[Obstacle]) -> tuple[Array, Array]:
     """What the ray caster eats: discs (n, 3) of x, y, radius and segments (m, 4) of x0, y0, x1, y1."""
     discs: list[tuple[float, float, float]] = []
-    segments: list[NDArray[np.float64]] = []
+    segments: list[Array] = []
     for obstacle in obstacles:
         if isinstance(obstacle, Disc):
             discs.append((obstacle.x, obstacle.y, obstacle.radius))
@@ -67,7 +68,7 @@ def _disc_penetration(box: Box, disc: Disc) -> float:
     return max(0.0, disc.radius - signed_distance)
 
 
-def _box_penetration(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def _box_penetration(a: Array, b: Array) -> float:
     """Least overlap over the four edge normals (separating axis theorem)."""
     edges = np.array([a[1] - a[0], a[2] - a[1], b[1] - b[0], b[2] - b[1]])
     normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
+
 Clearance = NDArray[np.uint8]
 _MOST = 255
 
@@ -95,7 +96,7 @@ def _walk(clear: Clearance, x: float, y: float, dx: float, dy: float, reach: flo
 
 
 @njit(cache=True)
-def _to_disc(x: float, y: float, dx: float, dy: float, disc: FloatArray) -> float:
+def _to_disc(x: float, y: float, dx: float, dy: float, disc: Array) -> float:
     cx, cy = disc[0] - x, disc[1] - y
     along = cx * dx + cy * dy
     root = disc[2] ** 2 - (cx * cx + cy * cy - along * along)
@@ -105,7 +106,7 @@ def _to_disc(x: float, y: float, dx: float, dy: float, disc: FloatArray) -> floa
 
 
 @njit(cache=True)
-def _to_segment(x: float, y: float, dx: float, dy: float, segment: FloatArray) -> float:
+def _to_segment(x: float, y: float, dx: float, dy: float, segment: Array) -> float:
     ex, ey = segment[2] - segment[0], segment[3] - segment[1]
     px, py = segment[0] - x, segment[1] - y
     cross = dx * ey - dy * ex
@@ -122,13 +123,13 @@ def cast_rays(
     resolution: float,
     origin_x: float,
     origin_y: float,
-    xs: FloatArray,
-    ys: FloatArray,
-    angles: FloatArray,
+    xs: Array,
+    ys: Array,
+    angles: Array,
     reach: float,
-    discs: FloatArray,
-    segments: FloatArray,
-) -> FloatArray:
+    discs: Array,
+    segments: Array,
+) -> Array:
     """Distance of the first thing each ray meets, m; inf if nothing is within ``reach``.
 
     Args:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, JointSource, MotorReading, PulseSource
+from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.config import BatteryConfig, CameraConfig, CompassConfig, LidarConfig, MotorConfig
 from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
 from monstertruck_sim.world.truck_plant import TruckPlant
@@ -21,9 +22,9 @@ _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 _LEVEL = 1e-4
 
 Vector = tuple[float, float, float]
-Beams = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
-Caster = Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float], NDArray[np.float64]]
+Caster = Callable[[Array, Array, Array, float], Array]
 """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing."""
 
 
@@ -62,9 +63,7 @@ class SimulatedLidar:
             ranges = self._tilted(xs, ys, yaw, _turned(beams, pitch, roll))
         return self._measure(ranges, time_ns)
 
-    def _tilted(
-        self, xs: NDArray[np.float64], ys: NDArray[np.float64], yaw: NDArray[np.float64], beams: Beams
-    ) -> NDArray[np.float64]:
+    def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams) -> Array:
         """Ranges along beams whose directions are given in the truck's level frame."""
         config = self._config
         forward, left, up = beams
@@ -73,10 +72,10 @@ class SimulatedLidar:
         with np.errstate(divide="ignore", invalid="ignore"):
             ground = np.where(up < 0, config.height / -up, np.inf)
             ranges[config.height + ranges * up > config.wall_height] = np.inf
-        nearest: NDArray[np.float64] = np.minimum(ranges, ground)
+        nearest: Array = np.minimum(ranges, ground)
         return nearest
 
-    def _measure(self, ranges: NDArray[np.float64], time_ns: int) -> NDArray[np.int32]:
+    def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
         config = self._config
         lost = self._lost
         if self._seed is not None:
@@ -99,7 +98,7 @@ class SimulatedView:
     def __init__(self, plant: TruckPlant, cast: Caster, config: CameraConfig) -> None:
         self._plant, self._cast, self._config = plant, cast, config
 
-    def ranges(self, time_ns: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ranges(self, time_ns: int, angles: Array) -> Array:
         """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
         self._plant.advance(time_ns)
         x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
@@ -221,7 +220,7 @@ class SimulatedCompass:
         )
 
 
-def _turned(beams: Beams, pitch: NDArray[np.float64], roll: NDArray[np.float64]) -> Beams:
+def _turned(beams: Beams, pitch: Array, roll: Array) -> Beams:
     """``_to_level`` for many vectors, each turned by angles of its own."""
     x, y, z = beams
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z

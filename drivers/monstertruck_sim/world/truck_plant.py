@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from monstertruck_drivers.emulation import PulseSource
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.dynamics import SingleTrack
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import Battery
@@ -172,7 +173,7 @@ class TruckPlant:
             motor_current=self.current,
         )
 
-    def poses(self, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def poses(self, times_ns: NDArray[np.int64]) -> Array:
         """Poses at instants of the last half second, (5, n): x, y, yaw, pitch, roll.
 
         Instants not yet integrated are extrapolated at the present velocity; none of them binds the future.

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
@@ -162,10 +163,8 @@ class World:
         )
         return depth
 
-    def _cast(
-        self, xs: NDArray[np.float64], ys: NDArray[np.float64], angles: NDArray[np.float64], reach: float
-    ) -> NDArray[np.float64]:
-        ranges: NDArray[np.float64] = cast_rays(
+    def _cast(self, xs: Array, ys: Array, angles: Array, reach: float) -> Array:
+        ranges: Array = cast_rays(
             self._clear, self.map.resolution, *self.map.origin, xs, ys, angles, reach, self._discs, self._segments
         )
         return ranges

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import COMPASS, Estimate, Result
@@ -21,8 +21,6 @@ from monstertruckd.tools.calibrate.guide import CLEAR, Guide
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
 from monstertruckd.tools.calibrate.steps import Move
 from monstertruckd.tools.calibrate.track import Track
-
-Array = NDArray[np.float64]
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 

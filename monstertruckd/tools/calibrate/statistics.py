@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from monstertruck_kinematics.elementary import Array
 
 _T: Final = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
@@ -68,7 +70,7 @@ def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
     return Interval(float(data.mean()), max(spread, NORMAL * least_error) / math.sqrt(count))
 
 
-def correlation_factor(residuals: NDArray[np.float64]) -> float:
+def correlation_factor(residuals: Array) -> float:
     """By how much slow errors inflate the standard error of a fit: root of the integrated autocorrelation, at least 1.
 
     The sum ends at the first correlation below zero (Sokal's window, simplified).

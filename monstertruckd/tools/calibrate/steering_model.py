@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_kinematics.polynomials import AxlePolynomials
 from monstertruck_runtime.errors import InputError
@@ -22,7 +22,6 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
 from monstertruckd.tools.calibrate.track import Track
 
-Array = NDArray[np.float64]
 Axle = Literal["front", "rear"]
 AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
 

@@ -5,14 +5,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
-
-Array = NDArray[np.float64]
 
 CURRENT_VALID: Final = 0.5
 """Seconds for which a motor current counts: not every feedback carries one."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
@@ -30,7 +30,7 @@ class Summary:
     """Figures of one lap."""
 
     lap: Lap
-    truth: NDArray[np.float64]
+    truth: Array
     """Shape (n, 6): time s, x m, y m, yaw rad, speed m/s, stuck."""
     lateness_p99: float
     """Of the control tick, s."""
@@ -46,7 +46,7 @@ class Summary:
     closed: bool = True
     """The path is a lap: its true closing error counts."""
 
-    def _driven(self) -> NDArray[np.float64]:
+    def _driven(self) -> Array:
         times = self.truth[:, 0]
         during = (times >= self.lap.start / SECOND) & (times <= self.lap.end / SECOND + 1.0)
         return self.truth[during]

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from monstertruck_estimation.transforms import quaternion_from_yaw
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics as t
@@ -116,7 +116,7 @@ def _pose(pose: Pose2D) -> Any:
     return _ros("geometry_msgs/msg/Pose", position=position, orientation=rotation)
 
 
-def _covariance(planar: NDArray[np.float64]) -> NDArray[np.float64]:
+def _covariance(planar: Array) -> Array:
     """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
     full = np.zeros((6, 6))
     full[np.ix_(_PLANE, _PLANE)] = planar.reshape(3, 3)

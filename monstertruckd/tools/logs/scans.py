@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
 from monstertruck_estimation.se2 import between, interpolate
 from monstertruck_estimation.slam.worker_io import ScanInput, Vector
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas.sensor import LaserScan
@@ -134,7 +134,7 @@ def _carmen(path: Path) -> Iterator[ScanInput]:
         raise InputError(f"{path}: not a log with scans: {error}") from error
 
 
-def _sick(stamp: int, ranges: NDArray[np.float64], odom: Vector | None, limit: float) -> ScanInput:
+def _sick(stamp: int, ranges: Array, odom: Vector | None, limit: float) -> ScanInput:
     """Half a turn ahead: n beams, or n + 1 with both ends."""
     count = len(ranges)
     return ScanInput(

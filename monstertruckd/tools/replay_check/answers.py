@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import Actor, ActorFactory, LoopActor, Placement
@@ -21,8 +21,6 @@ from monstertruck_schemas.plan import Path, Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.replay_check.goals import DEFORMED, PLANNED, TOGETHER, GoalRecord
 from monstertruckd.tools.replay_check.pace import PacedClock
-
-Array = NDArray[np.float64]
 
 BEFORE: Final = SECOND // 1000
 """A route is there this long before the tick that takes it, ns."""

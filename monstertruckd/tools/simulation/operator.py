@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
@@ -82,7 +82,7 @@ class Lap:
     """Daemon time at which the truck was armed, ns."""
     end: int
     """Daemon time at which the path was done or given up, ns."""
-    cross_track: NDArray[np.float64]
+    cross_track: Array
     """Every reported distance from the path, m."""
     interruptions: tuple[Reason, ...] = ()
     """Why the truck had to be armed again on the way, in order."""

@@ -10,11 +10,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import EmulatedPort, PtyPort
 from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import settle
@@ -48,7 +48,7 @@ class TruthLog:
             due += TRUTH_PERIOD
             await self._clock.sleep_until(due)
 
-    def array(self) -> NDArray[np.float64]:
+    def array(self) -> Array:
         """Shape (n, 6): ``COLUMNS``, s, m, m, rad, m/s, 0 or 1."""
         return np.array(self._rows).reshape(-1, len(self.COLUMNS))
 

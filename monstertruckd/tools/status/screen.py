@@ -13,6 +13,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.stops import story
 from monstertruck_schemas.event import Event, Severity, Stop
@@ -223,20 +224,20 @@ def _with_arrow(line: str, at: int) -> str:
     return f"{line[:at]}▲{line[at + 1 :]}"
 
 
-def _trail_points(state: ScreenState) -> NDArray[np.float64]:
+def _trail_points(state: ScreenState) -> Array:
     if state.odometry is None or not state.trail:
         return np.empty((0, 2))
     pose = state.odometry.pose
     offset = np.array(state.trail) - (pose.x, pose.y)
     cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
-    turned: NDArray[np.float64] = offset @ np.array([[cos, -sin], [sin, cos]])
+    turned: Array = offset @ np.array([[cos, -sin], [sin, cos]])
     return turned
 
 
 _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
 
 
-def _plot(cells: NDArray[np.uint8], points: NDArray[np.float64], scale: float) -> None:
+def _plot(cells: NDArray[np.uint8], points: Array, scale: float) -> None:
     """Set the braille dots of ``points`` (x forward = up, y left = left) around the truck's place in ``cells``."""
     height, width = cells.shape
     column = np.round(width - points[:, 1] * scale).astype(int)

@@ -9,7 +9,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.fusion.config import FusionConfig
@@ -33,6 +32,7 @@ from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import compose, inverse
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
@@ -125,8 +125,6 @@ class MeasurementHistory:
             del self._rows[:kept]
             self._done -= kept
 
-
-Array = NDArray[np.float64]
 
 MARGIN: Final = (0.1, 0.1)
 """Allowance for errors of two scans in the limits of their motion, m and rad."""

@@ -5,16 +5,14 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.fusion.compass_gate import CompassGate, HeadingInnovation, HeadingUse, gate_heading
 from monstertruck_estimation.fusion.config import DEVIATION_SCALE, FusionConfig
 from monstertruck_estimation.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

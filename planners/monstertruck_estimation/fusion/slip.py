@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.fusion.config import DEVIATION_SCALE, SlipConfig
 from monstertruck_estimation.fusion.filter import ScanMeasurement, WheelMeasurement
 from monstertruck_estimation.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
-
-Array = NDArray[np.float64]
 
 SOURCE_TIMEOUT: Final = 3 * SECOND
 """Wheel motion is remembered for this long, ns."""

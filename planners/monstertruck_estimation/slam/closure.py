@@ -26,8 +26,7 @@ from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.registration import measure, register
 from monstertruck_estimation.slam.scan_matcher import degeneracy, deviations
 from monstertruck_estimation.slam.scans import Scan
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 VIEW: Final = 2.5
 """Two keyframes this near see enough of the same, m."""

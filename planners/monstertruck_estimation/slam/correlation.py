@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import rotation
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 RESOLUTION: Final = 0.05
 """Edge of a cell, m."""

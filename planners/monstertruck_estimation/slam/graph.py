@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import splu
 
 from monstertruck_estimation.se2 import between, wrap
+from monstertruck_kinematics.elementary import Array
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SWITCH: Final = 12.0

@@ -17,9 +17,9 @@ from monstertruck_estimation.se2 import between, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch, Vector
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
 TILE: Final = 64

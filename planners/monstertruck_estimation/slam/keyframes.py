@@ -15,8 +15,7 @@ from monstertruck_estimation.slam.graph import Edges, drift, optimise
 from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equations, register
 from monstertruck_estimation.slam.scan_matcher import deviations
 from monstertruck_estimation.slam.scans import Scan
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 INITIAL_ROWS: Final = 64
 """Rows allocated at first."""

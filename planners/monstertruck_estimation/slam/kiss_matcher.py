@@ -10,14 +10,12 @@ import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.mapping import VoxelHashMap
 from kiss_icp.registration import get_registration
-from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scan_matcher import MIN_PAIRS, MatchStatus, ScanMatch, gated, rejected
 from monstertruck_estimation.slam.scans import Scan
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 VOXEL: Final = 0.1
 """Edge of the voxels of its map, m."""

@@ -9,7 +9,6 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
@@ -28,11 +27,10 @@ from monstertruck_estimation.slam.scan_matcher import (
 from monstertruck_estimation.slam.scans import Scan, downsample_indices
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, surface_elements
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate, Vector
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus
-
-Array = NDArray[np.float64]
 
 LEVELS: Final = 7
 QUERY_POINTS: Final = 300

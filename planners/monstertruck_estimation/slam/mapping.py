@@ -29,10 +29,9 @@ from monstertruck_estimation.slam.scan_matcher import (
 from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, saved_graph
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, ScanInput, SlamEstimate, Vector
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus
-
-Array = NDArray[np.float64]
 
 DESKEW_PERIOD: Final = (0.02, 0.5)
 """Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing)."""

@@ -11,9 +11,8 @@ from monstertruck_estimation.se2 import between, rotation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch
 from monstertruck_estimation.slam.worker_io import ScanIncrement
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
-
-Array = NDArray[np.float64]
 
 TRUST_MEMORY: Final = 40
 """Scans over which the robust_weights in odometry is learned."""

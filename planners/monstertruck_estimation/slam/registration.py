@@ -14,8 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.scans import Scan
+from monstertruck_kinematics.elementary import Array
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 CELL: Final = 0.3

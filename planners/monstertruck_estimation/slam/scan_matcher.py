@@ -6,13 +6,11 @@ from enum import StrEnum
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.correlation import Submap, correlate
 from monstertruck_estimation.slam.registration import Fit, register
 from monstertruck_estimation.slam.scans import Scan
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 MIN_PAIRS: Final = 12
 """Fewest corresponding pairs of an accepted match."""

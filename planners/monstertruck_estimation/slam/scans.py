@@ -14,8 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.worker_io import ScanInput, Vector
-
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 RANGE_NOISE: Final = 0.012
 """Standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""

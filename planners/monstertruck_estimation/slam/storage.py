@@ -19,11 +19,10 @@ from scipy.spatial import cKDTree
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.scans import SLIDE, Scan
 from monstertruck_estimation.slam.worker_io import GridPatch
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
 from monstertruck_runtime.small_files import replace_file
-
-Array = NDArray[np.float64]
 
 YAML, GRAPH = "map.yaml", "graph.npz"
 VERSION: Final = 1

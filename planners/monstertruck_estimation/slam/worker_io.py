@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.sensor import LaserScan
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 UNKNOWN: Final = -1

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup, Way
 from monstertruck_planners.goals.parts import level, pose_of
 from monstertruck_runtime.actors.actor import Actor
@@ -18,8 +18,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
-
-Array = NDArray[np.float64]
 
 ONWARD: Final = 0.05
 """Metres along the route that are progress."""

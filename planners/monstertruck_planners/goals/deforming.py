@@ -7,8 +7,8 @@ it until the truck is back on it.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points
 from monstertruck_planners.goals.escape import placed, seen_from
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
@@ -23,8 +23,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-
-Array = NDArray[np.float64]
 
 LOOK_BACK: Final = 0.5
 """Metres of route behind the truck that still count as near."""

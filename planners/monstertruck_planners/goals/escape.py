@@ -10,14 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, first_contact, swept_poses
 from monstertruck_planners.goals.config import EscapeConfig
 from monstertruck_schemas.plan import Steering
-
-Array = NDArray[np.float64]
 
 STEP = 0.02
 """Metres between two poses of the way."""

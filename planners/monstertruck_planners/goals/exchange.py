@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
@@ -14,7 +12,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid
 
-Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
 Place = tuple[float, float, float | None]
 """x, y (m), and yaw (rad) if it matters."""

@@ -3,8 +3,8 @@
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.goals.escape import placed
 from monstertruck_planners.goals.exchange import PlanAnswer
 from monstertruck_planners.goals.lookout import cut
@@ -13,8 +13,6 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-
-Array = NDArray[np.float64]
 
 SOURCE: Final = "goals"
 AT_REST: Final = 0.01

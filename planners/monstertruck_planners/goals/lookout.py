@@ -3,11 +3,9 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import Footprint, first_contact
-
-Array = NDArray[np.float64]
 
 STEP = 0.05
 """Metres between two poses looked at."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from monstertruck_kinematics.elementary import Array
 
 BESIDE: Final = 0.012
 """Beams this near in bearing tell of a place, rad: two steps of a URG-04LX."""

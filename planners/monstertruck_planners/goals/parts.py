@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_planners.goals.mission import Mission
@@ -15,8 +13,6 @@ from monstertruck_schemas.plan import GoalState, Path, TrackerState
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateState, Grid, Odometry
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, rectangle_distance
 from monstertruck_planners.goals.escape import escape, placed, seen_from
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
@@ -24,7 +25,6 @@ from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
 SAMPLE: Final = 0.05

@@ -5,8 +5,8 @@ import math
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
 from monstertruck_planners.goals import mission as machine
 from monstertruck_planners.goals.deform import Deformation, told_of
@@ -29,8 +29,6 @@ from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Reques
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
-
-Array = NDArray[np.float64]
 
 REPORT: Final = SECOND // 2
 """Between two reports without news, ns."""

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_schemas.plan import Steering
-
-Array = NDArray[np.float64]
 
 BASES: Final[dict[Steering, Array]] = {
     "front": np.array([[1.0], [0.0]]),

@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import LqrConfig
 from monstertruck_planners.track.error_model import BASES, discretise, riccati
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_schemas.plan import Steering
-
-Array = NDArray[np.float64]
 
 SPEED_STEP: Final = 0.05
 """Speeds this near to each other (relatively) share their gains."""

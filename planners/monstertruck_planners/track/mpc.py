@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 import osqp
-from numpy.typing import NDArray
 from scipy import sparse
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.error_model import BASES, LEAST_LAG
@@ -24,8 +24,6 @@ from monstertruck_planners.track.lqr import GainTable
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_planners.track.segments import ReferenceStates
 from monstertruck_schemas.plan import Steering
-
-Array = NDArray[np.float64]
 
 MOST_PERIODS: Final = 30
 FINE: Final = 0.05

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.segments import (
@@ -27,8 +27,6 @@ from monstertruck_planners.track.segments import (
 )
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
-
-Array = NDArray[np.float64]
 
 Angles = tuple[float, float]
 Pose = tuple[float, float, float]

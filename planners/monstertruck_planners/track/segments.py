@@ -11,11 +11,10 @@ from typing import Final, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
-
-Array = NDArray[np.float64]
 
 NEAREST: Final = 0.1
 """Vertices this much further than the nearest one count as equally near when a start is chosen, m."""

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from monstertruck_estimation.transforms import FrameTree, yaw_of
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruckd.recorder.occupancy import Area, OccupancyRaster
-
-Poses = NDArray[np.float64]
 
 _MAX_TILT: Final = math.radians(3)
 _STEP, _TURN, _REST = 0.08, 0.1, 20 * SECOND
@@ -108,7 +106,7 @@ def _grid_picture(grid: Grid) -> Picture:
     return _picture(np.where(cells < 0, np.nan, cells / 100.0), area)
 
 
-def _picture(occupancy: Poses, area: Area) -> Picture:
+def _picture(occupancy: Array, area: Area) -> Picture:
     """From shares of hits, row 0 lowest, NaN unknown; cut to what is known."""
     known = np.isfinite(occupancy)
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))

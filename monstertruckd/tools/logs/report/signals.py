@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
@@ -92,7 +93,7 @@ class Trace:
             pieces[-1].append(bucket)
         return pieces
 
-    def middle(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def middle(self) -> tuple[NDArray[np.int64], Array]:
         """Times, ns, and mid values of the intervals, both of shape (n,)."""
         times = np.array([(bucket.first + bucket.last) // 2 for bucket in self.buckets], np.int64)
         return times, np.array([fmean((bucket.low, bucket.high)) for bucket in self.buckets], np.float64)
