@@ -1,4 +1,4 @@
-"""The command that looks a truck's computer over."""
+"""``monstertruckd doctor``."""
 
 import os
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from monstertruckd.tools.cli.options import complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.doctor.finding import Finding
+    from monstertruckd.tools.doctor.context import Finding
 
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
@@ -29,18 +29,17 @@ def doctor(
     root: Annotated[Path, typer.Option("--root", help="Look at the system in this folder instead.")] = Path("/"),
     json_output: JsonOption = False,
 ) -> None:
-    """Look the computer over: software, service, rights, cables, devices, clock, disk, network.
+    """Check the computer: software, service, rights, cables, devices, clock, disk, network.
 
-    Every finding comes with the command that mends it. Ends with the code of the first failure; warnings end with 0.
+    Every finding comes with the command that fixes it. Ends with the code of the first failure; warnings end with 0.
     """
     from monstertruck_runtime.clock import run_wall
-    from monstertruckd.tools.doctor.examination import examine
-    from monstertruckd.tools.doctor.finding import verdict
-    from monstertruckd.tools.doctor.patient import admit
+    from monstertruckd.tools.doctor.checks import run_checks
+    from monstertruckd.tools.doctor.context import first_failure, inspect
     from monstertruckd.tools.install.unit import Program
 
-    findings = run_wall(lambda clock: examine(admit(root, Program.present(), config, os.getuid(), clock)))
-    reason = verdict(findings)
+    findings = run_wall(lambda clock: run_checks(inspect(root, Program.present(), config, os.getuid(), clock)))
+    reason = first_failure(findings)
     if json_output:
         print_json({"reason": reason, "findings": findings})
     else:
@@ -56,7 +55,7 @@ def _print(findings: "Sequence[Finding]") -> None:
     for finding in findings:
         level = finding.level.value
         out.print(Text(f"{level:5}", style=STYLES[level]) + Text(f"{finding.check:{width}}  {finding.seen}", style=""))
-        if finding.mend is not None and level != "ok":
-            out.print(Text(f"{'':5}{'':{width}}  > {finding.mend}", style="dim"))
+        if finding.fix is not None and level != "ok":
+            out.print(Text(f"{'':5}{'':{width}}  > {finding.fix}", style="dim"))
     counts = {level: sum(finding.level.value == level for finding in findings) for level in STYLES}
     out.print(f"{counts['ok']} fine, {counts['warn']} warnings, {counts['fail']} failures")

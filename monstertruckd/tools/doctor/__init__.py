@@ -1,1 +1,1 @@
-"""Looks a truck's computer over before it drives: what is fine, what is not, and the command that mends it."""
+"""Checks of a truck's computer before it drives: what works, what does not, and the command that fixes it."""

@@ -1,24 +1,27 @@
-"""Python, packages, and the configuration."""
+"""Checks of Python, packages, configuration, the installed service and its rights."""
 
 import platform
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from importlib import metadata
+from pathlib import Path
 
+from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.doctor.finding import Finding, fail, fine, warn
-from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
+from monstertruckd.tools.install.apply import Change, install
+from monstertruckd.tools.install.plan import RULES, SERVICE, UNIT, USER, plan
 
 MACHINES = ("x86_64", "aarch64")
 NEEDED = "robot"
 """Extra without which no device can be used."""
 
 
-def python(patient: Patient, machine: str = platform.machine()) -> Iterator[Finding]:
+def python(context: HostContext, machine: str = platform.machine()) -> Iterator[Finding]:
     """The interpreter and the processor."""
     version = ".".join(map(str, sys.version_info[:3]))
-    seen = f"{version} on {machine}, {patient.program.python}"
+    seen = f"{version} on {machine}, {context.program.python}"
     if machine in MACHINES:
         yield fine("python", seen)
     else:
@@ -26,14 +29,14 @@ def python(patient: Patient, machine: str = platform.machine()) -> Iterator[Find
         yield warn("python", Reason.NOT_SUPPORTED, text, "uname -m")
 
 
-def packages(patient: Patient, requirements: list[str] | None = None) -> Iterator[Finding]:
-    """Packages of every extra; those a robot needs must be there."""
+def packages(context: HostContext, requirements: list[str] | None = None) -> Iterator[Finding]:
+    """Packages of every extra; those that a robot needs must be installed."""
     if requirements is None:
         requirements = metadata.requires("monstertruckd") or []
-    missing = _missing(patient, requirements)
+    missing = _missing(context, requirements)
     if lacking := [*missing.pop("", []), *missing.pop(NEEDED, [])]:
         seen = f"missing: {', '.join(lacking)}"
-        yield fail("packages", Reason.NOT_INSTALLED, seen, _install_command(patient))
+        yield fail("packages", Reason.NOT_INSTALLED, seen, _install_command(context))
     else:
         yield fine("packages", f"all for a {NEEDED}")
     whole = sorted(extra for extra, names in missing.items() if not names)
@@ -42,19 +45,19 @@ def packages(patient: Patient, requirements: list[str] | None = None) -> Iterato
     yield fine("extras", f"{seen}; incomplete: {'; '.join(rest)}" if rest else seen)
 
 
-def configuration(patient: Patient) -> Iterator[Finding]:
+def configuration(context: HostContext) -> Iterator[Finding]:
     """Whether there is one, and it is accepted."""
-    file = patient.config_file
+    file = context.config_file
     if file is None:
-        seen = "none named and none installed: devices were not looked at"
-        yield warn("config", Reason.NOT_FOUND, seen, patient.command("doctor", "--config", "FILE"))
-    elif patient.complaint is not None:
-        yield fail("config", Reason.BAD_CONFIG, patient.complaint, patient.command("config", "show", str(file)))
+        seen = "none named and none installed: devices were not checked"
+        yield warn("config", Reason.NOT_FOUND, seen, context.command("doctor", "--config", "FILE"))
+    elif context.refusal is not None:
+        yield fail("config", Reason.BAD_CONFIG, context.refusal, context.command("config", "show", str(file)))
     else:
         yield fine("config", str(file))
 
 
-def _missing(patient: Patient, requirements: list[str]) -> dict[str, list[str]]:
+def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:
     """Absent distributions by extra; "" = needed always."""
     missing: dict[str, list[str]] = {}
     for requirement in requirements:
@@ -63,13 +66,108 @@ def _missing(patient: Patient, requirements: list[str]) -> dict[str, list[str]]:
         if name is None or name[0] == "monstertruckd":
             continue
         absent = missing.setdefault(extra[1] if extra is not None else "", [])
-        if patient.versions(name[0]) is None:
+        if context.versions(name[0]) is None:
             absent.append(name[0])
     return missing
 
 
-def _install_command(patient: Patient) -> str:
-    checkout = patient.program.neutral.parents[1]
+def _install_command(context: HostContext) -> str:
+    checkout = context.program.neutral.parents[1]
     if (checkout / "pyproject.toml").is_file():
         return f"cd {checkout} && python3 -m monstertruckd.bootstrap sync"
-    return f"{patient.program.python} -m pip install 'monstertruckd[{NEEDED}]'"
+    return f"{context.program.python} -m pip install 'monstertruckd[{NEEDED}]'"
+
+
+async def service(context: HostContext) -> AsyncIterator[Finding]:
+    """Whether the service is installed, up to date and running."""
+    if not context.at(UNIT).is_file():
+        seen = "not installed: nothing starts the daemon, and nothing stops the truck when it dies"
+        yield warn("service", Reason.NOT_INSTALLED, seen, context.install_command())
+        return
+    if stale := _stale(context):
+        seen = f"installed, but differs from a new installation: {', '.join(path.name for path in stale)}"
+        yield warn("service", Reason.NOT_INSTALLED, seen, context.install_command())
+    else:
+        yield fine("service", f"installed, {UNIT}")
+    state = await _state(context)
+    restarts = state.get("NRestarts", "0")
+    journal = f"journalctl -u {SERVICE} -e"
+    if state.get("ActiveState") == "failed":
+        yield fail("service runs", Reason.SERVICE_FAILED, f"failed, {restarts} restarts", journal)
+    elif restarts != "0":
+        yield warn("service runs", Reason.SERVICE_FAILED, f"{state.get('ActiveState')}, {restarts} restarts", journal)
+    elif state:
+        yield fine("service runs", state.get("ActiveState", "unknown"))
+
+
+def rules(context: HostContext) -> Iterator[Finding]:
+    """The udev rules, and ModemManager, which sends AT commands to serial ports that no rule excludes."""
+    installed = context.at(RULES).is_file()
+    if not installed:
+        seen = f"{RULES} is missing: no /dev/truck, no low latency, no rights"
+        yield warn("udev rules", Reason.NOT_INSTALLED, seen, context.install_command())
+    elif RULES in _stale(context):
+        yield warn("udev rules", Reason.NOT_INSTALLED, f"{RULES} is older than the config", context.install_command())
+    else:
+        yield fine("udev rules", f"{RULES}")
+    if not context.runs("ModemManager"):
+        yield fine("ModemManager", "does not run")
+    elif installed:
+        yield fine("ModemManager", "runs, and ignores the truck's ports")
+    else:
+        seen = "runs, and sends commands to serial ports that it takes for modems"
+        yield warn("ModemManager", Reason.NOT_INSTALLED, seen, context.install_command())
+
+
+def rights(context: HostContext) -> Iterator[Finding]:
+    """Rights of the daemon's user: groups, device nodes, the folder of the logs."""
+    account = context.account
+    if account is None:
+        seen = "the service's user does not exist"
+        yield fail("user", Reason.NOT_PERMITTED, seen, context.install_command())
+        return
+    lacking = [group for group in ("dialout", "video") if account.uid and group not in account.groups]
+    usermod = f"sudo usermod -aG {','.join(lacking)} {account.name}"
+    if lacking:
+        seen = f"{account.name} is not in {' and '.join(lacking)} (takes effect at the next login)"
+        yield fail("user", Reason.NOT_PERMITTED, seen, usermod)
+    else:
+        yield fine("user", f"{account.name}, groups {', '.join(account.groups) or 'all as root'}")
+    for role, device in context.config.devices.present().items() if context.config is not None else ():
+        node = context.node(device.port, camera=device.kind.opens == "video")
+        if node is not None and node.exists() and not account.may_use(node):
+            fix = usermod if lacking else f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
+            yield fail(f"{role} rights", Reason.NOT_PERMITTED, f"{account.name} may not use {node}", fix)
+    if context.config is not None and context.config.recorder is not None:
+        folder = _existing(context.logs())
+        if account.may_use(folder):
+            yield fine("logs", f"{context.logs()}")
+        else:
+            fix = f"sudo chown {account.name} {folder}"
+            yield fail("logs", Reason.RECORDING_FAILED, f"{account.name} may not write into {folder}", fix)
+
+
+def _stale(context: HostContext) -> list[Path]:
+    """Installed files that differ from what would be installed now; none without a usable configuration."""
+    user = context.account.name if context.account is not None else USER
+    try:
+        planned = plan(context.config_file, user, context.program, context.system)
+    except TruckError:
+        return []
+    changes = install(planned, context.system, dry=True).changes
+    return [path for path, change in changes.items() if change is not Change.SAME]
+
+
+async def _state(context: HostContext) -> dict[str, str]:
+    """State of the service by systemd; empty where there is no systemd."""
+    try:
+        code, said = await context.computer.machine.run(["systemctl", "show", "-p", "ActiveState,NRestarts", SERVICE])
+    except OSError:
+        return {}
+    return dict(line.split("=", 1) for line in said.splitlines() if "=" in line) if code == 0 else {}
+
+
+def _existing(folder: Path) -> Path:
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder

@@ -14,9 +14,7 @@ from monstertruck_drivers.usb.tree import DEVICES
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruckd.config.load import load_truck
-from monstertruckd.tools.doctor.accounts import Account
-from monstertruckd.tools.doctor.finding import Finding, Level
-from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.doctor.context import Account, Finding, HostContext, Level
 from monstertruckd.tools.install.apply import install
 from monstertruckd.tools.install.plan import plan
 from tests.unit.tools.install.kit import PROGRAM, TRUCK
@@ -27,7 +25,7 @@ NOW = 1.8e9
 
 
 @dataclass
-class Ward:
+class EmulatedHost:
     """The folder, what emulates it, and whom the doctor sees."""
 
     folder: Path
@@ -35,7 +33,7 @@ class Ward:
     computer: EmulatedComputer
     host: HostEmulator
     network: NetworkEmulator
-    patient: Patient
+    context: HostContext
 
     def put(self, path: str, text: str = "") -> Path:
         file = self.folder / path
@@ -45,9 +43,9 @@ class Ward:
 
     def change(self, **values: Any) -> None:
         """Another configuration, named as in the YAML."""
-        assert self.patient.config is not None
-        config = type(self.patient.config).model_validate(self.patient.config.model_dump() | values)
-        self.patient = replace(self.patient, config=config)
+        assert self.context.config is not None
+        config = type(self.context.config).model_validate(self.context.config.model_dump() | values)
+        self.context = replace(self.context, config=config)
 
     def runs(self, **answers: tuple[int, str]) -> None:
         """Programs that are there, and what they answer."""
@@ -57,8 +55,8 @@ class Ward:
                 raise FileNotFoundError(arguments[0])
             return answers[arguments[0]]
 
-        computer = replace(self.patient.computer, machine=replace(self.patient.computer.machine, run=run))
-        self.patient = replace(self.patient, computer=computer)
+        computer = replace(self.context.computer, machine=replace(self.context.computer.machine, run=run))
+        self.context = replace(self.context, computer=computer)
 
     def process(self, pid: int, *words: str) -> None:
         self.put(f"proc/{pid}/cmdline", "\0".join(words) + "\0")
@@ -69,7 +67,7 @@ class Ward:
         return sorted((self.folder / "sys" / DEVICES).glob("*/ttyUSB*/latency_timer"))
 
 
-def ward(folder: Path, clock: VirtualClock) -> Ward:
+def emulated(folder: Path, clock: VirtualClock) -> EmulatedHost:
     """Everything installed, plugged in, permitted, synchronized."""
     config = load_truck(TRUCK)[0]
     cables = {role: MemoryPort(role) for role in config.devices.present()}
@@ -79,8 +77,8 @@ def ward(folder: Path, clock: VirtualClock) -> Ward:
         (folder / "dev" / node).chmod(0o660)
     groups = {"dialout": os.getgid(), "video": os.getgid()}
     account = Account("monstertruckd", 64_999, groups)
-    patient = Patient(folder, computer.computer(), PROGRAM, TRUCK, config, None, account)
-    made = Ward(folder, clock, computer, HostEmulator(folder, clock), NetworkEmulator(folder, clock), patient)
+    context = HostContext(folder, computer.computer(), PROGRAM, TRUCK, config, None, account)
+    made = EmulatedHost(folder, clock, computer, HostEmulator(folder, clock), NetworkEmulator(folder, clock), context)
     install(plan(TRUCK, "monstertruckd", PROGRAM, folder), folder)
     made.put("run/systemd/timesync/synchronized")
     made.put("sys/class/rtc/rtc0/name", "rtc")
@@ -94,18 +92,18 @@ def ward(folder: Path, clock: VirtualClock) -> Ward:
 
 def see(
     folder: Path,
-    check: Callable[[Patient], Any],
-    spoil: Callable[[Ward], Coroutine[Any, Any, None] | None] = lambda _: None,
+    check: Callable[[HostContext], Any],
+    change: Callable[[EmulatedHost], Coroutine[Any, Any, None] | None] = lambda _: None,
 ) -> dict[str, Finding]:
-    """Findings of one check by their name, after ``spoil`` had its way with the ward."""
+    """Findings of one check by their name, after ``change`` had its way with the emulated."""
 
     async def main(clock: VirtualClock) -> dict[str, Finding]:
         clock.step_real(NOW)
-        made = ward(folder, clock)
-        spoiling = spoil(made)
-        if asyncio.iscoroutine(spoiling):
-            await spoiling
-        found = check(made.patient)
+        made = emulated(folder, clock)
+        changing = change(made)
+        if asyncio.iscoroutine(changing):
+            await changing
+        found = check(made.context)
         findings = [one async for one in found] if hasattr(found, "__aiter__") else list(found)
         return {finding.check: finding for finding in findings}
 

@@ -15,12 +15,11 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.doctor import handshakes as module
-from monstertruckd.tools.doctor.finding import Finding, Level
-from monstertruckd.tools.doctor.handshakes import handshakes
-from monstertruckd.tools.doctor.patient import Patient
+from monstertruckd.tools.doctor import devices as module
+from monstertruckd.tools.doctor.context import Finding, HostContext, Level
+from monstertruckd.tools.doctor.devices import handshakes
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from tests.unit.tools.doctor.kit import Ward, see
+from tests.unit.tools.doctor.kit import EmulatedHost, see
 from tests.unit.tools.install.kit import PROGRAM, ROOT
 
 FULL = ROOT / "configs" / "full.yaml"
@@ -44,17 +43,17 @@ class Truck:
         )
 
 
-def shake(folder: Path, spoil: Callable[[Truck], None] = lambda _: None) -> dict[str, Finding]:
+def shake(folder: Path, change: Callable[[Truck], None] = lambda _: None) -> dict[str, Finding]:
     """Ask all devices but the camera, whose node only a kernel could open."""
 
     async def main(clock: VirtualClock) -> dict[str, Finding]:
         truck = Truck(folder, clock)
         around = asyncio.create_task(truck.robot.run())
         await clock.sleep(1.0)
-        spoil(truck)
+        change(truck)
         blind = truck.config.model_copy(update={"devices": truck.config.devices.model_copy(update={"camera": None})})
-        patient = Patient(folder, truck.computer.computer(), PROGRAM, FULL, blind, None, None)
-        found = {finding.check: finding async for finding in handshakes(patient)}
+        context = HostContext(folder, truck.computer.computer(), PROGRAM, FULL, blind, None, None)
+        found = {finding.check: finding async for finding in handshakes(context)}
         around.cancel()
         await asyncio.wait([around])
         return found
@@ -70,14 +69,14 @@ def test_every_device_answers(tmp_path: Path):
 
 
 def test_silence_and_absence(tmp_path: Path):
-    def spoil(truck: Truck) -> None:
+    def change(truck: Truck) -> None:
         truck.ports["drive"].device.faults.deaf = True
         truck.computer.usb.unplug("1-2.1")
 
-    found = shake(tmp_path, spoil)
+    found = shake(tmp_path, change)
     assert found["drive handshake"].reason is Reason.DEVICE_TIMEOUT
-    assert found["drive handshake"].mend is not None
-    assert " -m monstertruckd probe drive --port " in found["drive handshake"].mend
+    assert found["drive handshake"].fix is not None
+    assert " -m monstertruckd probe drive --port " in found["drive handshake"].fix
     assert "lidar handshake" not in found, "the wiring tells of it"
 
 
@@ -92,21 +91,21 @@ def test_nothing_is_asked_while_a_daemon_runs(words: tuple[str, ...], tmp_path: 
     async def never(*_: object) -> Finding:
         raise AssertionError("a port of the daemon was touched")
 
-    monkeypatch.setattr(module, "_shake", never)
-    (found,) = see(tmp_path, handshakes, lambda ward: ward.process(4711, *words)).values()
+    monkeypatch.setattr(module, "_handshake", never)
+    (found,) = see(tmp_path, handshakes, lambda emulated: emulated.process(4711, *words)).values()
     assert found.level is Level.OK
     assert found.seen == "not tried: the running daemon (process 4711) has the ports"
-    assert found.mend == "/opt/monstertruckd/.venv/bin/python -m monstertruckd status --once"
+    assert found.fix == "/opt/monstertruckd/.venv/bin/python -m monstertruckd status --once"
 
 
 def test_other_processes_are_no_daemon(tmp_path: Path):
-    def others(ward: Ward) -> None:
-        ward.process(1, "/sbin/init")
-        ward.process(2, "python", "-m", "monstertruckd", "doctor")
-        ward.put("proc/3/cmdline")
+    def others(emulated: EmulatedHost) -> None:
+        emulated.process(1, "/sbin/init")
+        emulated.process(2, "python", "-m", "monstertruckd", "doctor")
+        emulated.put("proc/3/cmdline")
 
-    def check(patient: Patient) -> list[Finding]:
-        assert patient.daemon() is None
+    def check(context: HostContext) -> list[Finding]:
+        assert context.daemon() is None
         return []
 
     see(tmp_path, check, others)
@@ -119,16 +118,16 @@ def test_a_port_that_another_program_holds(tmp_path: Path):
         async def open(self) -> None:
             raise PortBusyError("held: held by another process")
 
-    def held(ward: Ward) -> None:
-        machine = replace(ward.patient.computer.machine, serial=lambda *_: Held())
-        assert ward.patient.config is not None
-        devices = ward.patient.config.devices
+    def held(emulated: EmulatedHost) -> None:
+        machine = replace(emulated.context.computer.machine, serial=lambda *_: Held())
+        assert emulated.context.config is not None
+        devices = emulated.context.config.devices
         only = devices.model_copy(update=dict.fromkeys(set(devices.present()) - {"steering"}))
-        config = ward.patient.config.model_copy(update={"devices": only})
-        computer = replace(ward.patient.computer, machine=machine)
-        ward.patient = replace(ward.patient, config=config, computer=computer)
+        config = emulated.context.config.model_copy(update={"devices": only})
+        computer = replace(emulated.context.computer, machine=machine)
+        emulated.context = replace(emulated.context, config=config, computer=computer)
 
     (found,) = see(tmp_path, handshakes, held).values()
     assert found.reason is Reason.DEVICE_BUSY
-    assert found.mend is not None
-    assert found.mend.startswith("sudo fuser -v ")
+    assert found.fix is not None
+    assert found.fix.startswith("sudo fuser -v ")

@@ -4,13 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.doctor.accounts import Account, account_of
-from monstertruckd.tools.doctor.finding import Level
-from monstertruckd.tools.doctor.patient import Patient, admit
-from monstertruckd.tools.doctor.service import rights, rules, service
-from monstertruckd.tools.doctor.software import configuration, packages, python
+from monstertruckd.tools.doctor.context import Account, HostContext, Level, account_of, inspect
+from monstertruckd.tools.doctor.software import configuration, packages, python, rights, rules, service
 from monstertruckd.tools.install.plan import RULES, UNIT
-from tests.unit.tools.doctor.kit import Ward, bad, see
+from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
 
 REQUIRES = [
@@ -23,21 +20,21 @@ INSTALL = f"sudo /opt/monstertruckd/.venv/bin/python -m monstertruckd install-se
 
 
 def without(*absent: str):
-    def spoil(ward: Ward) -> None:
-        ward.patient = replace(ward.patient, versions=lambda name: None if name in absent else "1.0")
+    def change(emulated: EmulatedHost) -> None:
+        emulated.context = replace(emulated.context, versions=lambda name: None if name in absent else "1.0")
 
-    return spoil
+    return change
 
 
 def test_a_processor_without_wheels_is_told(tmp_path: Path):
-    assert bad(see(tmp_path / "a", lambda patient: python(patient, "x86_64"))) == {}
-    found = see(tmp_path / "b", lambda patient: python(patient, "armv7l"))["python"]
+    assert bad(see(tmp_path / "a", lambda context: python(context, "x86_64"))) == {}
+    found = see(tmp_path / "b", lambda context: python(context, "armv7l"))["python"]
     assert (found.level, found.reason) == (Level.WARN, Reason.NOT_SUPPORTED)
 
 
 def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
-    def check(patient: Patient):
-        return packages(patient, REQUIRES)
+    def check(context: HostContext):
+        return packages(context, REQUIRES)
 
     found = see(tmp_path / "a", check, without("rerun-sdk"))
     assert bad(found) == {}
@@ -45,37 +42,37 @@ def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
     lacking = see(tmp_path / "b", check, without("mcap", "numpy"))["packages"]
     assert lacking.reason is Reason.NOT_INSTALLED
     assert lacking.seen == "missing: numpy, mcap"
-    assert lacking.mend == "/opt/monstertruckd/.venv/bin/python -m pip install 'monstertruckd[robot]'"
+    assert lacking.fix == "/opt/monstertruckd/.venv/bin/python -m pip install 'monstertruckd[robot]'"
 
-    def in_a_checkout(ward: Ward) -> None:
-        without("mcap")(ward)
-        program = replace(ward.patient.program, neutral=ROOT / "systemd" / "neutral.py")
-        ward.patient = replace(ward.patient, program=program)
+    def in_a_checkout(emulated: EmulatedHost) -> None:
+        without("mcap")(emulated)
+        program = replace(emulated.context.program, neutral=ROOT / "systemd" / "neutral.py")
+        emulated.context = replace(emulated.context, program=program)
 
-    mend = see(tmp_path / "c", check, in_a_checkout)["packages"].mend
-    assert mend == f"cd {ROOT} && python3 -m monstertruckd.bootstrap sync"
+    fix = see(tmp_path / "c", check, in_a_checkout)["packages"].fix
+    assert fix == f"cd {ROOT} && python3 -m monstertruckd.bootstrap sync"
 
 
 def test_the_configuration_is_the_named_one_else_the_services(tmp_path: Path):
-    def admitted(ward: Ward) -> None:
-        ward.patient = admit(ward.folder, PROGRAM, None, 0, ward.clock)
+    def admitted(emulated: EmulatedHost) -> None:
+        emulated.context = inspect(emulated.folder, PROGRAM, None, 0, emulated.clock)
 
     found = see(tmp_path / "a", configuration, admitted)["config"]
     assert found.level is Level.OK
     assert found.seen == str(tmp_path / "a/etc/monstertruckd/truck.yaml")
 
-    def refused(ward: Ward) -> None:
-        ward.put("etc/monstertruckd/truck.yaml", "version: 1\ndevices: {}\nspeed: 9\n")
-        admitted(ward)
+    def refused(emulated: EmulatedHost) -> None:
+        emulated.put("etc/monstertruckd/truck.yaml", "version: 1\ndevices: {}\nspeed: 9\n")
+        admitted(emulated)
 
     found = see(tmp_path / "b", configuration, refused)["config"]
     assert found.reason is Reason.BAD_CONFIG
     assert "truck.yaml:3: speed: unknown key" in found.seen
-    assert found.mend is not None
-    assert " config show " in found.mend
+    assert found.fix is not None
+    assert " config show " in found.fix
 
-    def nothing(ward: Ward) -> None:
-        ward.patient = admit(ward.folder / "nowhere", PROGRAM, None, 0, ward.clock)
+    def nothing(emulated: EmulatedHost) -> None:
+        emulated.context = inspect(emulated.folder / "nowhere", PROGRAM, None, 0, emulated.clock)
 
     found = see(tmp_path / "c", configuration, nothing)["config"]
     assert (found.level, found.reason) == (Level.WARN, Reason.NOT_FOUND)
@@ -84,75 +81,75 @@ def test_the_configuration_is_the_named_one_else_the_services(tmp_path: Path):
 def test_the_service_as_installed_now(tmp_path: Path):
     assert bad(see(tmp_path / "a", service)) == {}
 
-    def gone(ward: Ward) -> None:
-        (ward.folder / UNIT.relative_to("/")).unlink()
+    def gone(emulated: EmulatedHost) -> None:
+        (emulated.folder / UNIT.relative_to("/")).unlink()
 
     found = see(tmp_path / "b", service, gone)["service"]
-    assert (found.level, found.reason, found.mend) == (Level.WARN, Reason.NOT_INSTALLED, INSTALL)
+    assert (found.level, found.reason, found.fix) == (Level.WARN, Reason.NOT_INSTALLED, INSTALL)
 
-    def old(ward: Ward) -> None:
-        ward.put(str(UNIT.relative_to("/")), "[Service]\nUser=monstertruckd\n")
+    def old(emulated: EmulatedHost) -> None:
+        emulated.put(str(UNIT.relative_to("/")), "[Service]\nUser=monstertruckd\n")
 
     found = see(tmp_path / "c", service, old)["service"]
-    assert found.seen == "installed, but other than it would be now: monstertruckd.service"
-    assert found.mend == INSTALL
+    assert found.seen == "installed, but differs from a new installation: monstertruckd.service"
+    assert found.fix == INSTALL
 
 
 def test_what_systemd_says_of_it(tmp_path: Path):
     def saying(said: str):
-        return lambda ward: ward.runs(systemctl=(0, said))
+        return lambda emulated: emulated.runs(systemctl=(0, said))
 
     assert see(tmp_path / "a", service, saying("ActiveState=active\nNRestarts=0"))["service runs"].seen == "active"
     found = see(tmp_path / "b", service, saying("ActiveState=active\nNRestarts=7"))["service runs"]
     assert (found.level, found.seen) == (Level.WARN, "active, 7 restarts")
     found = see(tmp_path / "c", service, saying("ActiveState=failed\nNRestarts=2"))["service runs"]
     assert (found.level, found.reason) == (Level.FAIL, Reason.SERVICE_FAILED)
-    assert found.mend == "journalctl -u monstertruckd.service -e"
+    assert found.fix == "journalctl -u monstertruckd.service -e"
 
 
 def test_rules_that_are_missing_or_old(tmp_path: Path):
     place = str(RULES.relative_to("/"))
     assert bad(see(tmp_path / "a", rules)) == {}
-    missing = see(tmp_path / "b", rules, lambda ward: (ward.folder / place).unlink())["udev rules"]
-    assert (missing.reason, missing.mend) == (Reason.NOT_INSTALLED, INSTALL)
-    old = see(tmp_path / "c", rules, lambda ward: (ward.put(place, "# of yesterday\n"), None)[1])["udev rules"]
+    missing = see(tmp_path / "b", rules, lambda emulated: (emulated.folder / place).unlink())["udev rules"]
+    assert (missing.reason, missing.fix) == (Reason.NOT_INSTALLED, INSTALL)
+    old = see(tmp_path / "c", rules, lambda emulated: (emulated.put(place, "# of yesterday\n"), None)[1])["udev rules"]
     assert old.seen.endswith("is older than the config")
 
 
-def test_modem_manager_is_harmless_once_told(tmp_path: Path):
-    def running(ward: Ward) -> None:
-        ward.process(77, "/usr/sbin/ModemManager")
+def test_modem_manager_is_harmless_with_the_rules(tmp_path: Path):
+    def running(emulated: EmulatedHost) -> None:
+        emulated.process(77, "/usr/sbin/ModemManager")
 
-    def untold(ward: Ward) -> None:
-        running(ward)
-        (ward.folder / RULES.relative_to("/")).unlink()
+    def without_rules(emulated: EmulatedHost) -> None:
+        running(emulated)
+        (emulated.folder / RULES.relative_to("/")).unlink()
 
     assert see(tmp_path / "a", rules)["ModemManager"].seen == "does not run"
-    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and is told to keep off"
-    assert see(tmp_path / "c", rules, untold)["ModemManager"].level is Level.WARN
+    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and ignores the truck's ports"
+    assert see(tmp_path / "c", rules, without_rules)["ModemManager"].level is Level.WARN
 
 
 def test_rights_of_the_services_user(tmp_path: Path):
     assert bad(see(tmp_path / "a", rights)) == {}
 
-    def outsider(ward: Ward) -> None:
-        ward.patient = replace(ward.patient, account=Account("pi", 64_998, {"pi": 64_998}))
+    def outsider(emulated: EmulatedHost) -> None:
+        emulated.context = replace(emulated.context, account=Account("pi", 64_998, {"pi": 64_998}))
 
     found = bad(see(tmp_path / "b", rights, outsider))
-    assert found["user"].mend == "sudo usermod -aG dialout,video pi"
+    assert found["user"].fix == "sudo usermod -aG dialout,video pi"
     assert found["lidar rights"].reason is Reason.NOT_PERMITTED
-    assert found["lidar rights"].mend == "sudo usermod -aG dialout,video pi"
+    assert found["lidar rights"].fix == "sudo usermod -aG dialout,video pi"
     assert found["logs"].reason is Reason.RECORDING_FAILED
 
-    def locked(ward: Ward) -> None:
-        (ward.folder / "dev" / "ttyUSB0").chmod(0o600)
+    def locked(emulated: EmulatedHost) -> None:
+        (emulated.folder / "dev" / "ttyUSB0").chmod(0o600)
 
     (found,) = bad(see(tmp_path / "c", rights, locked)).values()
     node = tmp_path / "c/dev/ttyUSB0"
-    assert found.mend == f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
+    assert found.fix == f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
 
-    def nobody(ward: Ward) -> None:
-        ward.patient = replace(ward.patient, account=None)
+    def nobody(emulated: EmulatedHost) -> None:
+        emulated.context = replace(emulated.context, account=None)
 
     assert see(tmp_path / "d", rights, nobody)["user"].seen == "the service's user does not exist"
 

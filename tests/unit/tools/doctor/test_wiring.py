@@ -6,9 +6,9 @@ import pytest
 
 from monstertruck_drivers.config import PortConfig
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.doctor.finding import Level
-from monstertruckd.tools.doctor.wiring import wiring
-from tests.unit.tools.doctor.kit import Ward, bad, see
+from monstertruckd.tools.doctor.context import Level
+from monstertruckd.tools.doctor.devices import wiring
+from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import TRUCK
 
 FIND_LIDAR = f"/opt/monstertruckd/.venv/bin/python -m monstertruckd find-port lidar --write {TRUCK}"
@@ -21,25 +21,25 @@ def test_everything_in_its_place(tmp_path: Path):
     assert sorted(found) == ["camera", "compass", "drive", "lidar", "stabiliser", "steering"]
 
 
-def unplug(ward: Ward) -> None:
-    ward.computer.usb.unplug("1-2.1")
+def unplug(emulated: EmulatedHost) -> None:
+    emulated.computer.usb.unplug("1-2.1")
 
 
-def move(ward: Ward) -> None:
-    ward.computer.usb.move("1-2.1", "1-2.4")
+def move(emulated: EmulatedHost) -> None:
+    emulated.computer.usb.move("1-2.1", "1-2.4")
 
 
-def swap(ward: Ward) -> None:
-    ward.computer.usb.unplug("1-2.1")
-    ward.computer.usb.add_device("1-2.1", "1d50:6018", "Black Magic", node="ttyACM")
+def swap(emulated: EmulatedHost) -> None:
+    emulated.computer.usb.unplug("1-2.1")
+    emulated.computer.usb.add_device("1-2.1", "1d50:6018", "Black Magic", node="ttyACM")
 
 
-def lose(ward: Ward) -> None:
-    ward.computer.usb.lose_hub("1-2")
+def lose(emulated: EmulatedHost) -> None:
+    emulated.computer.usb.lose_hub("1-2")
 
 
 @pytest.mark.parametrize(
-    ("spoil", "reason", "seen", "mend"),
+    ("change", "reason", "seen", "fix"),
     [
         (unplug, Reason.DEVICE_LOST, "hub 1-2 port 1: not plugged in", FIND_LIDAR),
         (
@@ -52,11 +52,11 @@ def lose(ward: Ward) -> None:
         (lose, Reason.HUB_LOST, "hub 1-2 port 1: hub 1-2 is not there", None),
     ],
 )
-def test_a_device_that_is_not_where_it_should_be(spoil, reason: Reason, seen: str, mend: str | None, tmp_path: Path):
-    found = see(tmp_path, wiring, spoil)["lidar"]
+def test_a_device_that_is_not_where_it_should_be(change, reason: Reason, seen: str, fix: str | None, tmp_path: Path):
+    found = see(tmp_path, wiring, change)["lidar"]
     assert (found.level, found.reason, found.seen) == (Level.FAIL, reason, seen)
-    assert mend in (None, found.mend)
-    assert found.mend is not None
+    assert fix in (None, found.fix)
+    assert found.fix is not None
 
 
 @pytest.mark.parametrize(
@@ -68,20 +68,20 @@ def test_a_device_that_is_not_where_it_should_be(spoil, reason: Reason, seen: st
     ],
 )
 def test_a_device_without_its_kernel_module(role: str, place: str, usb_id: str, module: str, tmp_path: Path):
-    def spoil(ward: Ward) -> None:
-        ward.computer.usb.unplug(place)
-        ward.computer.usb.add_device(place, usb_id)
+    def change(emulated: EmulatedHost) -> None:
+        emulated.computer.usb.unplug(place)
+        emulated.computer.usb.add_device(place, usb_id)
 
-    assert see(tmp_path, wiring, spoil)[role].mend == f"sudo modprobe {module}"
+    assert see(tmp_path, wiring, change)[role].fix == f"sudo modprobe {module}"
 
 
 def test_slow_sleepy_and_greedy_ports(tmp_path: Path):
-    def spoil(ward: Ward) -> None:
-        ward.latencies[0].write_text("16")
-        ward.computer.usb.suspend_when_idle("1-1.2")
-        ward.computer.usb.over_current("1-2.1")
+    def change(emulated: EmulatedHost) -> None:
+        emulated.latencies[0].write_text("16")
+        emulated.computer.usb.suspend_when_idle("1-1.2")
+        emulated.computer.usb.over_current("1-2.1")
 
-    found = bad(see(tmp_path, wiring, spoil))
+    found = bad(see(tmp_path, wiring, change))
     assert {name: finding.reason for name, finding in found.items()} == {
         "drive latency": Reason.SLOW_LINK,
         "steering power": Reason.AUTOSUSPEND,
@@ -89,23 +89,23 @@ def test_slow_sleepy_and_greedy_ports(tmp_path: Path):
     }
     assert all(finding.level is Level.WARN for finding in found.values())
     assert found["drive latency"].seen == "ttyUSB0 answers after 16 ms instead of 1 ms"
-    assert found["drive latency"].mend == "echo 1 | sudo tee /sys/bus/usb/devices/1-1.1:1.0/ttyUSB0/latency_timer"
-    assert found["steering power"].mend == "echo on | sudo tee /sys/bus/usb/devices/1-1.2/power/control"
+    assert found["drive latency"].fix == "echo 1 | sudo tee /sys/bus/usb/devices/1-1.1:1.0/ttyUSB0/latency_timer"
+    assert found["steering power"].fix == "echo on | sudo tee /sys/bus/usb/devices/1-1.2/power/control"
 
 
 def test_a_device_by_its_path(tmp_path: Path):
-    def by_path(ward: Ward) -> None:
-        assert ward.patient.config is not None
-        lidar = ward.patient.config.devices.lidar
+    def by_path(emulated: EmulatedHost) -> None:
+        assert emulated.context.config is not None
+        lidar = emulated.context.config.devices.lidar
         assert lidar is not None
         port = PortConfig(path=Path("/dev/truck/lidar"))
-        devices = ward.patient.config.devices.model_copy(update={"lidar": lidar.model_copy(update={"port": port})})
-        ward.change(devices=devices.model_dump())
+        devices = emulated.context.config.devices.model_copy(update={"lidar": lidar.model_copy(update={"port": port})})
+        emulated.change(devices=devices.model_dump())
 
-    def linked(ward: Ward) -> None:
-        by_path(ward)
-        ward.put("dev/truck/lidar")
+    def linked(emulated: EmulatedHost) -> None:
+        by_path(emulated)
+        emulated.put("dev/truck/lidar")
 
     missing = see(tmp_path / "a", wiring, by_path)["lidar"]
-    assert (missing.seen, missing.mend) == ("/dev/truck/lidar: no such node", FIND_LIDAR)
+    assert (missing.seen, missing.fix) == ("/dev/truck/lidar: no such node", FIND_LIDAR)
     assert see(tmp_path / "b", wiring, linked)["lidar"].level is Level.OK

@@ -1,9 +1,12 @@
-"""The computer that is looked over, and what is known of it beforehand."""
+"""What a check of the doctor gets, the computer and its configuration, and what it gives: findings."""
 
+import os
 import re
 import shlex
+import stat
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
@@ -15,14 +18,104 @@ from monstertruck_drivers.usb.tree import read_device
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.small_files import text_of
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.doctor.accounts import Account, account_of
 from monstertruckd.tools.install.plan import UNIT, below, installed_config
 from monstertruckd.tools.install.unit import Program
 
 STATE = Path("/var/lib/monstertruckd")
 """Working folder of the service."""
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """A user and all groups of that user."""
+
+    name: str
+    uid: int
+    groups: dict[str, int]
+    """Names and numbers."""
+
+    def may_use(self, file: Path) -> bool:
+        """Whether it may read and write the file; for a folder, whether it may put files into it."""
+        try:
+            status = file.stat()
+        except OSError:
+            return False
+        needed = 0o7 if stat.S_ISDIR(status.st_mode) else 0o6
+        return self.uid == 0 or self._allowed(status) & needed == needed
+
+    def may_read(self, file: Path) -> bool:
+        """Whether it may read the file; the folders above are not checked."""
+        try:
+            return self.uid == 0 or bool(self._allowed(file.stat()) & 0o4)
+        except OSError:
+            return False
+
+    def _allowed(self, status: os.stat_result) -> int:
+        if status.st_uid == self.uid:
+            return status.st_mode >> 6 & 0o7
+        if status.st_gid in self.groups.values():
+            return status.st_mode >> 3 & 0o7
+        return status.st_mode & 0o7
+
+
+def account_of(root: Path, who: str | int) -> Account | None:
+    """The user of that name or number in ``root/etc``; None if there is none."""
+    users = [line.split(":") for line in (text_of(root / "etc/passwd") or "").splitlines()]
+    user = next((u for u in users if len(u) > 3 and who in (u[0], int(u[2]))), None)
+    if user is None:
+        return None
+    name, uid, gid = user[0], int(user[2]), int(user[3])
+    groups = {}
+    for line in (text_of(root / "etc/group") or "").splitlines():
+        group, _, number, members = (*line.split(":"), "", "", "")[:4]
+        if number.isdigit() and (int(number) == gid or name in members.split(",")):
+            groups[group] = int(number)
+    return Account(name, uid, groups)
+
+
+class Level(StrEnum):
+    """Severity of a finding."""
+
+    OK = "ok"
+    WARN = "warn"
+    """The truck drives, but worse than it could, or not for long."""
+    FAIL = "fail"
+    """The truck does not drive, or is not safe."""
+
+
+class Finding(Schema):
+    """Result of one check, and the command that fixes it."""
+
+    check: str
+    level: Level
+    reason: Reason = Reason.OK
+    seen: str
+    fix: str | None = None
+    """Command to type; None if nothing is to be fixed, or no command can."""
+
+
+def fine(check: str, seen: str, fix: str | None = None) -> Finding:
+    """A check that passed; ``fix`` may be a command that shows more."""
+    return Finding(check=check, level=Level.OK, seen=seen, fix=fix)
+
+
+def warn(check: str, reason: Reason, seen: str, fix: str | None = None) -> Finding:
+    """A check that passed with a remark."""
+    return Finding(check=check, level=Level.WARN, reason=reason, seen=seen, fix=fix)
+
+
+def fail(check: str, reason: Reason, seen: str, fix: str | None = None) -> Finding:
+    """A check that failed."""
+    return Finding(check=check, level=Level.FAIL, reason=reason, seen=seen, fix=fix)
+
+
+def first_failure(findings: list[Finding]) -> Reason:
+    """Reason of the first failure; OK if there is none."""
+    return next((finding.reason for finding in findings if finding.level is Level.FAIL), Reason.OK)
 
 
 def version_of(package: str) -> str | None:
@@ -34,10 +127,10 @@ def version_of(package: str) -> str | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Patient:
-    """A computer, real or emulated, in a system below a root.
+class HostContext:
+    """A computer, real or emulated, with its files below a root.
 
-    Everything the checks ask of it goes through here, so that a folder can stand for it.
+    All checks read through it, so that a folder can replace the computer.
     """
 
     system: Path
@@ -49,18 +142,18 @@ class Patient:
     """Configuration that was named, else the installed one, else None."""
     config: TruckConfig | None
     """None where there is none, or a refused one."""
-    complaint: str | None
+    refusal: str | None
     """Why it was refused."""
     account: Account | None
-    """Whom the daemon runs as: the service's user, else whoever asks."""
+    """User of the daemon: the service's, else the caller."""
     versions: Callable[[str], str | None] = version_of
 
     def at(self, path: Path) -> Path:
-        """Where an absolute path of it is."""
+        """Where an absolute path of that computer is."""
         return below(self.system, path)
 
     def logs(self) -> Path:
-        """Folder of the logs; relative ones are below where the service works, once it is installed."""
+        """Folder of the logs; a relative one is below the service's working folder, once it is installed."""
         recorder = self.config.recorder if self.config is not None else None
         directory = Path(recorder.directory if recorder is not None else "")
         if directory.is_absolute():
@@ -81,12 +174,12 @@ class Patient:
         return shlex.join([*(["sudo"] if sudo else []), str(self.program.python), "-m", "monstertruckd", *arguments])
 
     def install_command(self) -> str:
-        """What installs the service anew."""
+        """Command that installs the service again."""
         named = ["--config", str(self.config_file)] if self.config_file is not None else ["--config", "FILE"]
         return self.command("install-service", *named, sudo=True)
 
     def find_port_command(self, role: str) -> str:
-        """What finds the port of a cable and writes it down."""
+        """Command that finds the port of a cable and writes it into the configuration."""
         return self.command("find-port", role, "--write", str(self.config_file))
 
     def daemon(self) -> int | None:
@@ -102,28 +195,28 @@ class Patient:
             yield int(file.parent.name), (text_of(file) or "").split("\0")
 
 
-def admit(system: Path, program: Program, config_file: Path | None, uid: int, clock: Clock) -> Patient:
-    """Take a computer in.
+def inspect(system: Path, program: Program, config_file: Path | None, uid: int, clock: Clock) -> HostContext:
+    """The context of a computer.
 
     Args:
         system: folder with its files; "/" is the real one.
         program: this one.
         config_file: named by the user; None = the one the service is started with.
-        uid: of whoever asks.
+        uid: of the caller.
         clock: time.
     """
     unit = text_of(below(system, UNIT)) or ""
     file = config_file or installed_config(system)
-    config, complaint = None, None
+    config, refusal = None, None
     if file is not None:
         try:
             config = load_truck(file)[0]
         except ConfigError as error:
-            complaint = str(error)
+            refusal = str(error)
     user = re.search(r"^User=(.+)$", unit, re.MULTILINE)
     account = account_of(system, user[1] if user is not None else uid)
     machine = system if config is None or config.machine == ROOT else config.machine
-    return Patient(system, Computer.at(machine, clock), program, file, config, complaint, account)
+    return HostContext(system, Computer.at(machine, clock), program, file, config, refusal, account)
 
 
 def _runs_daemon(words: list[str]) -> bool:

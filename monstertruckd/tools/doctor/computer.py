@@ -1,0 +1,165 @@
+"""Checks of the computer: clock, disk, temperature, memory, network, and who may reach the daemon."""
+
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.link_quality.driver import LinkJudge
+
+from monstertruck_drivers.host_health.config import HostHealthConfig
+from monstertruck_drivers.host_health.readings import disk_of, read_host
+from monstertruck_drivers.link_quality.config import LinkQualityConfig
+from monstertruck_drivers.link_quality.interfaces import choose, read_interfaces
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import DeviceError
+from monstertruck_runtime.small_files import text_of
+from monstertruck_schemas.health import LinkLevel
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.bus.zenoh_config import TlsConfig
+from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
+
+SYNCHRONIZED: Final = Path("/run/systemd/timesync/synchronized")
+"""Made by systemd-timesyncd once the clock is synchronized."""
+DAEMONS: Final = ("chronyd", "ntpd", "ntpsec")
+YEAR_2024: Final = 1_704_067_200 * SECOND
+"""ns since 1970: a clock before it was never set."""
+GIGABYTE: Final = 1e9
+MONTH: Final = 30 * 24 * 3600
+LOOPBACK: Final = ("127.", "localhost", "[::1]")
+LISTEN: Final = "0A"
+"""State of a listening socket in /proc/net/tcp."""
+
+
+def calendar(context: HostContext) -> Iterator[Finding]:
+    """Whether logs will carry the right date."""
+    clock = context.computer.machine.clock
+    keeper = next((name for name in DAEMONS if context.runs(name)), None)
+    set_ntp = "sudo timedatectl set-ntp true"
+    if clock.now() + clock.real_offset() < YEAR_2024:
+        yield fail("clock", Reason.CLOCK_UNSET, "is before 2024", set_ntp)
+    elif context.at(SYNCHRONIZED).exists():
+        yield fine("clock", "synchronized by systemd-timesyncd")
+    elif keeper is not None:
+        yield fine("clock", f"kept by {keeper}")
+    else:
+        yield warn("clock", Reason.CLOCK_UNSET, "nothing synchronizes it: logs may carry a wrong date", set_ntp)
+    if any((context.computer.root / "sys/class/rtc").glob("rtc*")):
+        yield fine("clock chip", "there")
+    else:
+        seen = "none: after a start without network the date is that of the last shutdown, until NTP steps it"
+        yield fine("clock chip", seen)
+
+
+def condition(context: HostContext) -> Iterator[Finding]:
+    """Disk, heat and memory, by the limits of the host monitor."""
+    config = context.config
+    limits = (config.monitors.host if config is not None else None) or HostHealthConfig()
+    folder = context.logs()
+    try:
+        host = read_host(context.computer.root, disk_of(folder))
+    except DeviceError as error:
+        yield warn("host", error.reason, str(error))
+        return
+    free = f"{host.disk.free / GIGABYTE:.1f} GB free for {folder}"
+    if host.disk.free < limits.disk:
+        yield fail("disk", Reason.DISK_LOW, free, f"du -xh {folder} | sort -h | tail")
+    else:
+        yield fine("disk", free)
+    share = host.memory_available / host.memory_total
+    memory = f"{share:.0%} of {host.memory_total / GIGABYTE:.1f} GB available"
+    if share < limits.memory:
+        yield warn("memory", Reason.MEMORY_LOW, memory, "ps -eo rss,comm --sort=-rss | head")
+    else:
+        yield fine("memory", memory)
+    heat = "not measured" if host.temperature is None else f"{host.temperature:.0f} degrees"
+    slow = host.frequency_share is not None and host.frequency_share < limits.slow
+    if host.temperature is not None and host.temperature > limits.hot:
+        yield warn("heat", Reason.HOST_HOT, heat)
+    elif host.firmware_throttled or slow:
+        seen = f"{heat}, but the processor is throttled: temperature or supply voltage"
+        yield warn("heat", Reason.HOST_THROTTLED, seen, "grep . /sys/devices/system/cpu/cpu*/cpufreq/scaling_max_freq")
+    else:
+        yield fine("heat", heat)
+
+
+def link(context: HostContext) -> Iterator[Finding]:
+    """The network, chosen and rated as by the link monitor."""
+    config = context.config
+    wanted = (config.monitors.link if config is not None else None) or LinkQualityConfig()
+    chosen = choose(read_interfaces(context.computer.root), wanted.interface)
+    level = LinkJudge(wanted).update(0, chosen)
+    seen = level.value if chosen is None else f"{chosen.name} ({chosen.medium.value}): {level.value}"
+    if chosen is not None and chosen.signal is not None and chosen.signal.level is not None:
+        seen += f", {chosen.signal.level:.0f} dBm"
+    if level is LinkLevel.DOWN:
+        yield warn("link", Reason.LINK_DOWN, seen, "ip -brief link")
+    elif level in (LinkLevel.POOR, LinkLevel.UNUSABLE):
+        yield warn("link", Reason.LINK_WEAK, seen, "iw dev | grep -A9 Interface")
+    else:
+        yield fine("link", seen)
+
+
+async def access(context: HostContext) -> AsyncIterator[Finding]:
+    """Endpoints, certificates, and whether another process has the port."""
+    if context.config is None:
+        return
+    zenoh = context.config.zenoh
+    outside = [endpoint for endpoint in zenoh.listen if not _address(endpoint).startswith(LOOPBACK)]
+    opened = [endpoint for endpoint in outside if not endpoint.startswith("tls/")]
+    if opened:
+        seen = f"zenoh.listen {', '.join(opened)}: whoever reaches it may drive the truck; use tls/... with zenoh.tls"
+        yield fail("access", Reason.LINK_OPEN, seen)
+    elif outside:
+        yield fine("access", f"{', '.join(outside)}, by certificate")
+    else:
+        yield fine("access", "from this computer only")
+    if zenoh.tls is not None:
+        for finding in _files(context, zenoh.tls):
+            yield finding
+        async for finding in _expiry(context, zenoh.tls.certificate):
+            yield finding
+    for endpoint in zenoh.listen if context.daemon() is None else ():
+        port = _address(endpoint).rpartition(":")[2]
+        if port.isdigit() and int(port) in _listening(context):
+            yield fail("port", Reason.BUSY, f"{endpoint} is taken", f"sudo ss -ltnp 'sport = :{port}'")
+
+
+def _address(endpoint: str) -> str:
+    return endpoint.partition("/")[2]
+
+
+def _files(context: HostContext, tls: TlsConfig) -> Iterator[Finding]:
+    for file in (tls.ca, tls.certificate, tls.key):
+        place = context.at(file) if file.is_absolute() else file
+        if not place.is_file():
+            yield fail("tls", Reason.NOT_FOUND, f"{file}: no such file")
+        elif context.account is not None and not context.account.may_read(place):
+            fix = f"sudo chown {context.account.name} {file}"
+            yield fail("tls", Reason.NOT_PERMITTED, f"{context.account.name} may not read {file}", fix)
+        elif file == tls.key and place.stat().st_mode & 0o077:
+            yield warn("tls", Reason.LINK_OPEN, f"{file}: others may read the private key", f"sudo chmod 600 {file}")
+
+
+async def _expiry(context: HostContext, certificate: Path) -> AsyncIterator[Finding]:
+    file = context.at(certificate) if certificate.is_absolute() else certificate
+    try:
+        code, _ = await context.computer.machine.run(
+            ["openssl", "x509", "-noout", "-checkend", str(MONTH), "-in", str(file)]
+        )
+    except OSError:  # no openssl here
+        return
+    if code == 0:
+        yield fine("certificate", "good for a month at least")
+    elif file.is_file():
+        fix = f"openssl x509 -noout -dates -in {certificate}"
+        yield warn("certificate", Reason.LINK_OPEN, f"{certificate} runs out within a month, or is none", fix)
+
+
+def _listening(context: HostContext) -> set[int]:
+    """Local TCP ports on which somebody listens."""
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in (text_of(context.system / "proc/net" / name) or "").splitlines()[1:]
+    ]
+    return {int(row[1].rpartition(":")[2], 16) for row in rows if len(row) > 3 and row[3] == LISTEN}

@@ -1,0 +1,142 @@
+"""Checks of the devices: plugged in where the configuration says, and answering."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from monstertruck_drivers.catalog import DeviceKind
+from monstertruck_drivers.config import AnyPort, Device
+from monstertruck_drivers.link import BAUD
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.port import HubPort
+from monstertruck_drivers.usb.tree import DEVICES, Node, Snapshot, UsbDevice, ancestors, place, read_tree
+from monstertruck_runtime.errors import DeviceError, PortBusyError, WrongDeviceError
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
+
+MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
+"""Kernel modules by vendor; all others are USB-CDC."""
+PATIENCE: Final = 15.0
+"""Seconds for one device's whole answer; a scanner that measures has to be stopped first."""
+
+
+def wiring(context: HostContext) -> Iterator[Finding]:
+    """Every configured device: its port, latency and power saving."""
+    if context.config is None:
+        return
+    tree = read_tree(context.computer.machine.sysfs)
+    devices = context.config.devices.present()
+    taken = {device.port.device for device in devices.values() if isinstance(device.port, UsbPortConfig)}
+    for role, device in devices.items():
+        if isinstance(device.port, UsbPortConfig):
+            yield from _by_hub(context, tree, role, device, taken)
+        else:
+            yield _by_path(context, role, device.port)
+    for name, count in tree.over_current.items():
+        if count and name in taken:
+            yield warn("over-current", Reason.OVER_CURRENT, f"{place(name)}: {count} times since its hub came")
+
+
+def _by_path(context: HostContext, role: str, port: AnyPort) -> Finding:
+    node = context.node(port)
+    if node is None:
+        seen = f"{vars(port)['path']}: no such node"
+        return fail(role, Reason.DEVICE_LOST, seen, context.find_port_command(role))
+    return fine(role, str(node))
+
+
+def _by_hub(context: HostContext, tree: Snapshot, role: str, device: Device[Any], taken: set[str]) -> Iterator[Finding]:
+    port, video = device.port, device.kind.opens == "video"
+    assert isinstance(port, UsbPortConfig)
+    where = place(port.device)
+    found = tree.devices.get(port.device)
+    if found is None:
+        yield _absent(context, tree, role, port, taken)
+    elif port.usb_id is not None and found.usb_id != port.usb_id:
+        seen = f"{where}: expected {port.usb_id}, found {found.usb_id} {found.title}"
+        yield fail(role, Reason.DEVICE_WRONG, seen, context.find_port_command(role))
+    elif (node := found.find("video4linux" if video else "tty", port.interface)) is None:
+        module = "uvcvideo" if video else MODULES.get(found.usb_id[:4], "cdc_acm")
+        seen = f"{where}: {found.usb_id} {found.title} has no node at interface {port.interface}"
+        yield fail(role, Reason.DEVICE_LOST, seen, f"sudo modprobe {module}")
+    else:
+        yield fine(role, f"{where}: {found.usb_id} {found.title} as {node.name}")
+        yield from _settings(role, port, found, node)
+
+
+def _absent(context: HostContext, tree: Snapshot, role: str, port: UsbPortConfig, taken: set[str]) -> Finding:
+    where = place(port.device)
+    gone = next((hub for hub in [*ancestors(port.device)][::-1] if hub not in tree.devices), None)
+    if gone is not None:
+        seen = f"{where}: hub {gone} is not there"
+        return fail(role, Reason.HUB_LOST, seen, context.command("usb", "--local"))
+    alike = (name for name, device in tree.devices.items() if device.usb_id == port.usb_id and name not in taken)
+    elsewhere = next(alike, None)
+    if elsewhere is not None:
+        seen = f"{where}: not plugged in, but {port.usb_id} is at {place(elsewhere)}"
+        return fail(role, Reason.PORT_MOVED, seen, context.find_port_command(role))
+    return fail(role, Reason.DEVICE_LOST, f"{where}: not plugged in", context.find_port_command(role))
+
+
+def _settings(role: str, port: UsbPortConfig, device: UsbDevice, node: Node) -> Iterator[Finding]:
+    if node.latency_ms is not None and node.latency_ms > port.latency_ms:
+        seen = f"{node.name} answers after {node.latency_ms} ms instead of {port.latency_ms} ms"
+        fix = f"echo {port.latency_ms} | sudo tee /sys/{node.path}/latency_timer"
+        yield warn(f"{role} latency", Reason.SLOW_LINK, seen, fix)
+    if device.autosuspend:
+        seen = f"the kernel may suspend {place(device.name)}"
+        fix = f"echo on | sudo tee /sys/{DEVICES}/{device.name}/power/control"
+        yield warn(f"{role} power", Reason.AUTOSUSPEND, seen, fix)
+
+
+async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
+    """One finding per device that is plugged in; all are asked at once."""
+    if context.config is None:
+        return
+    daemon = context.daemon()
+    if daemon is not None:
+        seen = f"not tried: the running daemon (process {daemon}) has the ports"
+        yield fine("handshakes", seen, context.command("status", "--once"))
+        return
+    plugged = {
+        role: (device, node)
+        for role, device in context.config.devices.present().items()
+        if (node := context.node(device.port, camera=device.kind.opens == "video")) is not None
+    }
+    for found in await asyncio.gather(*(_handshake(context, role, *ends) for role, ends in plugged.items())):
+        yield found
+
+
+async def _handshake(context: HostContext, role: str, device: Device[Schema], node: Path) -> Finding:
+    check, kind = f"{role} handshake", device.kind
+    again = context.command("probe", role, "--port", str(node))
+    try:
+        async with context.computer.machine.clock.deadline(PATIENCE):
+            answer = await _probe(context, role, device, kind, node)
+    except TimeoutError:
+        return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {PATIENCE:g} s", again)
+    except PortBusyError as error:
+        return fail(check, error.reason, str(error), f"sudo fuser -v {node}")
+    except WrongDeviceError as error:
+        return fail(check, error.reason, str(error), context.find_port_command(role))
+    except DeviceError as error:
+        return fail(check, error.reason, str(error), again)
+    if kind.opens == "video" and not any(one.get("mjpg_modes") for one in answer["nodes"]):
+        return warn(check, Reason.DEVICE_WRONG, f"{node} offers no motion JPEG", again)
+    return fine(check, f"{kind.doc} answers")
+
+
+async def _probe(
+    context: HostContext, role: str, device: Device[Schema], kind: DeviceKind, node: Path
+) -> dict[str, Any]:
+    port, machine = device.port, context.computer.machine
+    if kind.opens == "video":
+        return await kind.probe_function()(str(node), machine.clock, device.driver)
+    line = (
+        HubPort(port, machine, lambda *_, **__: None, role=role)
+        if isinstance(port, UsbPortConfig)
+        else machine.serial(node, port.baud or BAUD)
+    )
+    return await kind.probe_function()(line, machine.clock, device.driver)
