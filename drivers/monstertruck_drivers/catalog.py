@@ -56,7 +56,7 @@ class Role:
 def _shaft(index: int) -> Role:
     ordinal = ("first", "second", "third", "fourth")[index]
     return Role(
-        name=SHAFTS[index],
+        name=SHAFTS[index].value,
         duty=Duty.ACTUATOR,
         doc=f"Controller of the body's {ordinal} driven shaft{', if it has one' if index else ''}",
         writes={"out": DRIVES[index]},
@@ -66,7 +66,7 @@ def _shaft(index: int) -> Role:
 
 
 LIDAR: Final = Role(
-    name=DeviceRole.LIDAR,
+    name=DeviceRole.LIDAR.value,
     duty=Duty.SENSOR,
     doc="Laser scanner",
     writes={"out": topics.SCAN},
@@ -75,7 +75,7 @@ LIDAR: Final = Role(
 )
 DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
 STEERING: Final = Role(
-    name=DeviceRole.STEERING,
+    name=DeviceRole.STEERING.value,
     duty=Duty.ACTUATOR,
     doc="Servo controller of the axles, which may measure the battery as well",
     writes={"out": topics.STEERING, "battery": topics.BATTERY},
@@ -83,7 +83,7 @@ STEERING: Final = Role(
     start=10,
 )
 COMPASS: Final = Role(
-    name=DeviceRole.COMPASS,
+    name=DeviceRole.COMPASS.value,
     duty=Duty.SENSOR,
     doc="Heading and tilt",
     writes={"out": topics.COMPASS},
@@ -91,7 +91,7 @@ COMPASS: Final = Role(
     start=11,
 )
 STABILISER: Final = Role(
-    name=DeviceRole.STABILISER,
+    name=DeviceRole.STABILISER.value,
     duty=Duty.SENSOR,
     doc=(
         "Mount of the lidar; its own mount is the point both joints turn about, the lidar's is that with level joints"
@@ -102,7 +102,7 @@ STABILISER: Final = Role(
     start=13,
 )
 CAMERA: Final = Role(
-    name=DeviceRole.CAMERA,
+    name=DeviceRole.CAMERA.value,
     duty=Duty.SENSOR,
     doc="Supervision camera",
     writes={"out": topics.CAMERA},
@@ -110,17 +110,17 @@ CAMERA: Final = Role(
     start=14,
 )
 BATTERY: Final = Role(
-    name=DeviceRole.BATTERY,
+    name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
     doc="Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input",
     writes={"out": topics.BATTERY},
     reads={"drive": topics.DRIVE},
 )
 LINK: Final = Role(
-    name=DeviceRole.LINK, duty=Duty.MONITOR, doc="Wi-Fi or Ethernet of the computer", writes={"out": topics.LINK}
+    name=DeviceRole.LINK.value, duty=Duty.MONITOR, doc="Wi-Fi or Ethernet of the computer", writes={"out": topics.LINK}
 )
 HOST: Final = Role(
-    name=DeviceRole.HOST, duty=Duty.MONITOR, doc="Load and heat of the computer", writes={"out": topics.HOST}
+    name=DeviceRole.HOST.value, duty=Duty.MONITOR, doc="Load and heat of the computer", writes={"out": topics.HOST}
 )
 OUR_ROLES: Final = (
     LIDAR,
