@@ -22,9 +22,10 @@ import numpy as np
 
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
-from monstertruckd.tools.calibrate.drive import DriveWizard
-from monstertruckd.tools.calibrate.steering import SteeringWizard
+from monstertruckd.tools.calibrate.battery import battery_wizard
+from monstertruckd.tools.calibrate.compass import compass_wizard
+from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
+from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import Verdict, hidden, run_session, verdicts
 

@@ -19,10 +19,11 @@ from monstertruck_schemas.state import GateMode
 from monstertruck_sim.world.obstacles import Box
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.calibrate.catalog import battery_wizard, compass_wizard, drive_wizard, steering_wizard
-from monstertruckd.tools.calibrate.drive import DriveWizard
+from monstertruckd.tools.calibrate.battery import battery_wizard
+from monstertruckd.tools.calibrate.compass import compass_wizard
+from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
 from monstertruckd.tools.calibrate.guide import calibrate
-from monstertruckd.tools.calibrate.steering import SteeringWizard
+from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig

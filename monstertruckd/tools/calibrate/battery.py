@@ -16,7 +16,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.guide import Guide
+from monstertruckd.tools.calibrate.guide import Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
 
@@ -148,3 +148,9 @@ class BatteryWizard:
         low, high = inside.min(axis=0), inside.max(axis=0)
         middle, half = (low + high) / 2, (high - low) / 2
         return Interval(float(middle[0]), float(half[0])), Interval(float(middle[1]), float(half[1]))
+
+
+def battery_wizard(settings: BatteryWizard | None = None) -> Wizard:
+    """Voltage scale."""
+    doc = "scale of the battery voltage from a multimeter, and its offset from two readings apart"
+    return Wizard("battery", doc, "", settings or BatteryWizard())

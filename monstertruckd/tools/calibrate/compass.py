@@ -17,10 +17,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import COMPASS, Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
-from monstertruckd.tools.calibrate.steps import Move
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Move, Track
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
@@ -104,6 +103,12 @@ class CompassWizard:
             for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
         ]
         return guide.fit("ellipse", lambda: result_of(Circle.of(tracks)))
+
+
+def compass_wizard(settings: CompassWizard | None = None) -> Wizard:
+    """Hard and soft iron."""
+    doc = "the truck's own magnetism, from a driven circle"
+    return Wizard("compass", doc, ROOM, settings or CompassWizard())
 
 
 def result_of(circle: Circle) -> Result:

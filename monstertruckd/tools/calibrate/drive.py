@@ -12,10 +12,9 @@ import numpy as np
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
-from monstertruckd.tools.calibrate.steps import Confirm, Move, Number
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Confirm, Move, Number, Track
 
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
@@ -121,6 +120,12 @@ class DriveWizard:
             estimates=tuple(estimates),
             unobserved=("gear ratio and wheel radius apart from each other", "slip on slopes and in curves"),
         )
+
+
+def drive_wizard(settings: DriveWizard | None = None) -> Wizard:
+    """Sign and ratio."""
+    doc = "which way is forward, and how far a turn of the motor goes, from taped distances"
+    return Wizard("drive", doc, ROOM, settings or DriveWizard())
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,7 @@ from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.motion import Mover, Truck
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, Move, Number, Panel
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Move, Number, Panel, Track
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")

@@ -15,8 +15,7 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
-from monstertruckd.tools.calibrate.steps import Move
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Move, Track
 
 M = TypeVar("M", bound=Message)
 

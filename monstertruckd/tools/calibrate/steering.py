@@ -15,7 +15,7 @@ from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide
+from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Leg, Maps, SteeringModel, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, Move, Number
@@ -204,6 +204,12 @@ class SteeringWizard:
                 *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
             ),
         )
+
+
+def steering_wizard(settings: SteeringWizard | None = None) -> Wizard:
+    """Centre, direction, travel, pulse map."""
+    doc = "centre, direction, travel and pulse map of both axles, from the truck's own turns and a string"
+    return Wizard("steering", doc, ROOM, settings or SteeringWizard())
 
 
 @dataclass(frozen=True, slots=True)

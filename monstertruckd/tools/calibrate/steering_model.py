@@ -20,7 +20,7 @@ from monstertruck_kinematics.polynomials import AxlePolynomials
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Track
 
 Axle = Literal["front", "rear"]
 AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")

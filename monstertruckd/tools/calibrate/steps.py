@@ -1,14 +1,93 @@
-"""What a wizard may ask for: typed steps, and the faces that answer them."""
+"""Steps of a wizard: what it may ask of the operator and the truck, and what the sensors measured during a move."""
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, Protocol, TypeVar
 
+import numpy as np
+from monstertruck_kinematics.elementary import Array
+
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.topics import Topic
-from monstertruckd.tools.calibrate.track import Track
 
+
+CURRENT_VALID: Final = 0.5
+"""Seconds for which a motor current counts: not every feedback carries one."""
 M = TypeVar("M", bound=Message)
+
+
+@dataclass(slots=True)
+class Track:
+    """Readings of one move, rests at both ends included."""
+
+    drive: list[DriveFeedback] = field(default_factory=list)
+    steering: list[SteeringFeedback] = field(default_factory=list)
+    attitude: list[Attitude] = field(default_factory=list)
+    left: int = 0
+    """When it was told to set off, ns"""
+    arrived: int = 0
+    """When it was at rest again, ns"""
+
+    # Time series
+
+    def way(self, drivetrain: DriveTrain) -> float:
+        """Way rolled by the wheels, m, by the drive's count; negative backwards."""
+        if len(self.drive) < 2:
+            return 0.0
+        return float(drivetrain.distance(self.drive[-1].position - self.drive[0].position))
+
+    @property
+    def turns(self) -> float:
+        """Turns of the motor between the two rests, forward positive."""
+        return (self.drive[-1].position - self.drive[0].position) / (2 * math.pi)
+
+    def headings(self) -> Array:
+        """Headings, clockwise, rad, unwrapped; (n,)."""
+        return np.unwrap([reading.heading for reading in self.attitude])
+
+    def turned(self) -> float:
+        """How far the heading has turned since the first reading, rad, left positive."""
+        return float(-(self.headings()[[0, -1]] @ (-1, 1))) if len(self.attitude) > 1 else 0.0
+
+    def turn(self) -> tuple[float, float]:
+        """Turn between the rests, rad, left positive, and its standard error by the noise alone.
+
+        Raises:
+            InputError: too few headings at rest.
+        """
+        headings = self.headings()
+        stamps = np.array([reading.stamp for reading in self.attitude])
+        before, after = headings[stamps < self.left], headings[stamps > self.arrived]
+        if min(before.size, after.size) < 5:
+            raise InputError(f"only {before.size} and {after.size} headings at rest: expected 5 at each end")
+        noise = math.hypot(*(float(rest.std(ddof=1)) / math.sqrt(rest.size) for rest in (before, after)))
+        return float(before.mean() - after.mean()), noise
+
+    def currents_at(self, stamps: Array) -> Array:
+        """Motor current, A, at instants in ns; 0 where none was read for half a second; (n,)."""
+        known = [(reading.stamp, reading.current) for reading in self.drive if reading.current is not None]
+        if not known:
+            return np.zeros(stamps.shape)
+        times, values = np.array(known, dtype=np.float64).T
+        nearest = np.abs(times[:, None] - stamps[None, :]).min(axis=0)
+        return np.where(nearest < CURRENT_VALID * SECOND, np.interp(stamps, times, values), 0.0)
+
+    def steps(self) -> tuple[Array, Array, Array]:
+        """Motor turned between readings, rad, and both servo angles then, rad: (n,) each."""
+        stamps = np.array([reading.stamp for reading in self.drive], dtype=np.float64)
+        motor = np.diff([reading.position for reading in self.drive])
+        middle = (stamps[1:] + stamps[:-1]) / 2
+        times = np.array([reading.stamp for reading in self.steering], dtype=np.float64)
+        front, rear = (
+            np.interp(middle, times, [getattr(reading, axle) for reading in self.steering])
+            for axle in ("front", "rear")
+        )
+        return motor, front, rear
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,8 +87,7 @@ def drive(
 
     Asks `clear`, `forward` and, for each run, `mark` and `distance` (m).
     """
-    from monstertruckd.tools.calibrate.catalog import drive_wizard
-    from monstertruckd.tools.calibrate.drive import DriveWizard
+    from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
 
     return drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
 
@@ -107,8 +106,7 @@ def steering(
 
     Asks `clear` and, for each string, `string` and `offset` (cm).
     """
-    from monstertruckd.tools.calibrate.catalog import steering_wizard
-    from monstertruckd.tools.calibrate.steering import SteeringWizard
+    from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
 
     return steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
 
@@ -116,7 +114,7 @@ def steering(
 @_wizard
 def compass() -> "Wizard":
     """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
-    from monstertruckd.tools.calibrate.catalog import compass_wizard
+    from monstertruckd.tools.calibrate.compass import compass_wizard
 
     return compass_wizard()
 
@@ -131,8 +129,7 @@ def battery(
 
     Asks `meter` (V) and `another` (yes or no), until that is no.
     """
-    from monstertruckd.tools.calibrate.battery import BatteryWizard
-    from monstertruckd.tools.calibrate.catalog import battery_wizard
+    from monstertruckd.tools.calibrate.battery import BatteryWizard, battery_wizard
 
     return battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
 

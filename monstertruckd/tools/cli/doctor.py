@@ -36,7 +36,7 @@ def doctor(
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.doctor.checks import run_checks
     from monstertruckd.tools.doctor.context import first_failure, inspect
-    from monstertruckd.tools.install.unit import Program
+    from monstertruckd.tools.install.files import Program
 
     findings = run_wall(lambda clock: run_checks(inspect(root, Program.present(), config, os.getuid(), clock)))
     reason = first_failure(findings)

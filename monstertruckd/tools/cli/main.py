@@ -18,7 +18,6 @@ from monstertruckd.tools.cli import (
     maps,
     orders,
     plan,
-    plan_server,
     replay,
     robot,
     service,
@@ -67,7 +66,7 @@ app.command("reset")(orders.reset)
 app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
-app.command("plan-server")(plan_server.plan_server)
+app.command("plan-server")(robot.plan_server)
 app.command("replay")(replay.replay)
 app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)

@@ -197,7 +197,7 @@ def _draw(path: Path, saved: Any, way: Any = ()) -> None:
     """The grid with the poses of its keyframes, or with another way."""
     import numpy as np
 
-    from monstertruckd.tools.cli.kinematics_output import figure
+    from monstertruckd.tools.cli.kinematics import figure
 
     grid = saved.grid
     shades = np.choose(grid.cells.astype(int) // 100 + 1, (0.8, 1.0, 0.0))

@@ -1,11 +1,13 @@
-"""Commands of the robot itself: run the daemon, print its tables of topics and reasons."""
+"""Commands of the robot: run the daemon or its remote planner, print the tables of topics and reasons."""
 
+from functools import partial
 from typing import Annotated
 
 import typer
 
-from monstertruckd.tools.cli.options import ConfigOption
-from monstertruckd.tools.cli.output import JsonOption, print_json, print_table
+from monstertruck_runtime.clock import Clock
+from monstertruckd.tools.cli.options import ENDPOINT, ConfigOption, EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, until_stopped
 
 
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
@@ -72,3 +74,19 @@ def reasons(
         return
     rows = [(reason.value, str(reason.exit_code), reason.text) for reason in Reason]
     print_table(("reason", "exit code", "what"), rows, right=("exit code",))
+
+
+def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT) -> None:
+    """Plan and track for a robot whose configuration says `placement: remote`, until Ctrl-C.
+
+    It dials the robot, and again whenever the robot restarts; what it knows comes from there.
+    """
+    from monstertruck_planners.steps import CODEC, STEPS
+    from monstertruck_runtime.actors.remote import POLL, serve
+    from monstertruck_runtime.client import TruckClient
+
+    async def main(clock: Clock) -> None:
+        connect = partial(TruckClient, robot, endpoint, clock=clock, timeout=2 * POLL)
+        await serve(clock, connect, STEPS, CODEC)
+
+    until_stopped(main)

@@ -49,8 +49,8 @@ def install_service(
     Needs root, and no network. The service starts with the computer from then on.
     """
     from monstertruckd.tools.install.apply import install, run_command, runs_here
+    from monstertruckd.tools.install.files import Program
     from monstertruckd.tools.install.plan import RESTART, plan
-    from monstertruckd.tools.install.unit import Program
 
     planned = plan(config, user, Program.present(), root)
     report = _as_root(lambda: install(planned, root, dry=dry_run))

@@ -22,8 +22,8 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.install.files import Program
 from monstertruckd.tools.install.plan import UNIT, below, installed_config
-from monstertruckd.tools.install.unit import Program
 
 STATE = Path("/var/lib/monstertruckd")
 """Working folder of the service."""

@@ -12,9 +12,7 @@ from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_runtime.small_files import text_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.install.rules import rules_text
-from monstertruckd.tools.install.shipped import filled
-from monstertruckd.tools.install.unit import LINKS, Program, temporary, unit_text, user_name
+from monstertruckd.tools.install.files import LINKS, Program, filled, rules_text, temporary, unit_text, user_name
 
 FOLDER: Final = Path("/etc/monstertruckd")
 USER: Final = "monstertruckd"

@@ -8,7 +8,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
 from monstertruckd.tools.calibrate.drive import Run, arc
-from monstertruckd.tools.calibrate.track import Track
+from monstertruckd.tools.calibrate.steps import Track
 
 
 def track(turns: float, turn: float = 0.0) -> Track:

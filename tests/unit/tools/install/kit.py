@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from monstertruckd.tools.install.files import Program
 from monstertruckd.tools.install.plan import Plan, plan
-from monstertruckd.tools.install.unit import Program
 
 ROOT = Path(__file__).resolve().parents[4]
 TRUCK = ROOT / "configs" / "truck.yaml"

@@ -9,7 +9,7 @@ import pytest
 
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.config.load import load_truck
-from monstertruckd.tools.install.rules import rules_text
+from monstertruckd.tools.install.files import rules_text
 from tests.unit.tools.install.kit import TRUCK
 
 UDEVADM = shutil.which("udevadm")

@@ -11,9 +11,8 @@ import pytest
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.config.load import load_truck
+from monstertruckd.tools.install.files import Program, filled, unit_text
 from monstertruckd.tools.install.plan import plan
-from monstertruckd.tools.install.shipped import filled
-from monstertruckd.tools.install.unit import Program, unit_text
 from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK, settings, text_of, truck_plan
 
 ANALYZE = shutil.which("systemd-analyze")

@@ -1,17 +1,20 @@
-"""The unit of the service, from the configuration and from where the program is."""
+"""Texts of the installed files: systemd unit and udev rules, from the templates in the folder ``systemd``."""
 
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
 from monstertruck_drivers.config import AnyPort
-from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_runtime.errors import InputError
+from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
+from monstertruck_drivers.usb.tree import place, port_directory
+from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.install.shipped import filled, shipped
 
+_PACKAGE: Final = Path(__file__).resolve().parents[2]
+PLACES: Final = (_PACKAGE / "systemd", _PACKAGE.parent / "systemd")
 HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 """Hidden from the service but for the program itself."""
 HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the service must not be run from
@@ -19,6 +22,33 @@ LINKS: Final = Path("/dev/truck")
 """Folder of the links that the udev rules make."""
 _PLAIN: Final = re.compile(r"/[A-Za-z0-9/._+=,:~-]*")
 _USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,31}")
+GROUP = "dialout"
+"""Owns what the daemon may write below /sys."""
+
+
+def shipped(name: str) -> Path:
+    """Where a file of the folder is.
+
+    Raises:
+        NotFoundError: the installation is not whole.
+    """
+    for folder in PLACES:
+        if (folder / name).is_file():
+            return folder / name
+    raise NotFoundError(f"{name} is missing from the installation; looked in {' and '.join(map(str, PLACES))}")
+
+
+def filled(name: str, values: dict[str, str]) -> str:
+    """Text of a shipped file, its ``@names@`` replaced; a line of its own vanishes if its value is empty."""
+
+    def value(match: re.Match[str]) -> str:
+        return values[match["name"]]
+
+    text = shipped(name).read_text(encoding="utf-8")
+    empty = [key for key, replacement in values.items() if not replacement]
+    for key in empty:
+        text = text.replace(f"@{key}@\n", "")
+    return re.sub(r"@(?P<name>[a-z]+)@", value, text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,3 +150,46 @@ def _plain(path: Path, without: str = "") -> str:
     if not _PLAIN.fullmatch(str(path)):
         raise InputError(f"{path}: expected an absolute path of letters, digits and / . _ + = , : ~ - for systemd")
     return str(path)
+
+
+def rules_text(config: TruckConfig) -> str:
+    """The whole file."""
+    return filled("udev.rules", {"devices": "\n".join(_devices(config))})
+
+
+def _devices(config: TruckConfig) -> Iterator[str]:
+    method = config.usb.power.method
+    for role, device in config.devices.present().items():
+        if isinstance(device.port, UsbPortConfig):
+            yield ""
+            yield f"# {role}: {place(device.port.device)}"
+            yield from _device(role, device.port, method, camera=device.kind.opens == "video")
+
+
+def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camera: bool) -> Iterator[str]:
+    """Rules of one device; by its interface's name, as a hub in its port must not pass for it."""
+    whole = f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", KERNEL=="{port.device}"'
+    interface = f'KERNELS=="{port.device}:*.{port.interface}"'
+    identity = ""
+    if port.usb_id is not None:
+        vendor, product = port.usb_id.split(":")
+        identity = f', ENV{{ID_VENDOR_ID}}=="{vendor}", ENV{{ID_MODEL_ID}}=="{product}"'
+    yield f'{whole}, ENV{{ID_MM_DEVICE_IGNORE}}="1", ATTR{{power/control}}="on"'
+    if camera:
+        # A camera has several nodes; the first one gives the pictures.
+        yield f'SUBSYSTEM=="video4linux", {interface}, ATTR{{index}}=="0"{identity}, SYMLINK+="truck/{role}"'
+    else:
+        yield f'SUBSYSTEM=="tty", KERNELS=="{port.device}:*", ENV{{ID_MM_PORT_IGNORE}}="1"'
+        yield f'SUBSYSTEM=="tty", {interface}{identity}, SYMLINK+="truck/{role}"'
+        latency = f'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", {interface}'
+        yield f'{latency}, ATTR{{latency_timer}}="{port.latency_ms}", {_writable("latency_timer")}'
+    if method is CycleMethod.AUTHORIZED:
+        yield f"{whole}, {_writable('authorized')}"
+    elif method is CycleMethod.PORT:
+        *_, hub, switch = port_directory(port.device).split("/")
+        yield f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_interface", KERNEL=="{hub}", {_writable(f"{switch}/disable")}'
+
+
+def _writable(attribute: str) -> str:
+    file = f"/sys%p/{attribute}"
+    return f'RUN+="/bin/chgrp {GROUP} {file}", RUN+="/bin/chmod g+w {file}"'
