@@ -16,16 +16,16 @@ from time import perf_counter
 import numpy as np
 
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "drill.json"
 
 
-def table(report: Report) -> None:
+def table(report: DrillReport) -> None:
     """One row for every kind of fault; seconds and metres are the greatest."""
-    kinds: dict[str, list[Outcome]] = defaultdict(list)
+    kinds: dict[str, list[FaultOutcome]] = defaultdict(list)
     for outcome in report.outcomes:
         kinds[outcome.kind.value].append(outcome)
     print("| fault | times | stopped | standstill s, p50 | greatest | metres, greatest | back s, greatest | unsafe |")

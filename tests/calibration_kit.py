@@ -14,8 +14,8 @@ from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
-from monstertruckd.tools.calibrate.guide import Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.calibrate.wizard import Wizard, calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig

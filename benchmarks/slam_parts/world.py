@@ -32,7 +32,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
-from monstertruck_sim.world.config import TruckConfig
+from monstertruck_sim.world.config import SimTruckConfig
 from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 
 SEEDS, QUICK_SEEDS = 10, 2
@@ -132,7 +132,7 @@ def _motion(
 
 def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path | None = None) -> Run:
     """One robot with a subset of the sensors on one drive; it localises in ``saved``, or maps, and keeps the map."""
-    sensors, chassis = SUBSETS[subset], TruckConfig().chassis()
+    sensors, chassis = SUBSETS[subset], SimTruckConfig().chassis()
     x, y, yaw = drive.start
     start = Pose2D(x=x, y=y, yaw=yaw)
     fusion = Fusion(FusionConfig(kind="fusion", start=start), chassis)

@@ -15,7 +15,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback, Vector3
-from monstertruck_sim.world.config import MotorConfig, TruckConfig, WorldConfig
+from monstertruck_sim.world.config import MotorConfig, SimTruckConfig, WorldConfig
 from monstertruck_sim.world.noise import generator
 from monstertruck_sim.world.world import World
 
@@ -85,7 +85,7 @@ class Drive:
 class Pilot:
     """Pulses and motor speed by pure pursuit of the truth, both axles alike."""
 
-    def __init__(self, config: TruckConfig) -> None:
+    def __init__(self, config: SimTruckConfig) -> None:
         self.config = config
         self.chassis = config.chassis()
         self.servos = (0.0, 0.0)
@@ -136,7 +136,7 @@ def _leg(
     """Drive ``way`` (start and route) over a span of seconds; ``turns`` of the motor before, and those after."""
     (x, y, yaw), route = way
     place = str(folder / "corridor.yaml") if scenario.map == "corridor" else scenario.map
-    truck = TruckConfig(motor=MotorConfig(inverted=False))
+    truck = SimTruckConfig(motor=MotorConfig(inverted=False))
     world = World(WorldConfig(map=place, start=Pose2D(x=x, y=y, yaw=yaw), truck=truck), seed)
     pilot, line = Pilot(truck), _dense(route)
     world.servos.attach(pilot)

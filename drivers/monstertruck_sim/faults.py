@@ -57,7 +57,7 @@ class FaultKind(StrEnum):
     OBSTACLE = "obstacle"
 
 
-class Disk(Protocol):
+class RecorderDisk(Protocol):
     """A recorder whose disk can fail."""
 
     def refuse(self, error: OSError) -> None:
@@ -83,7 +83,7 @@ class SimContext:
     robot: SimulatedRobot
     computer: EmulatedComputer
     clock: Clock
-    disk: Disk | None = None
+    disk: RecorderDisk | None = None
 
     def device(self, role: str) -> Emulated:
         """Emulator and cable of a device."""

@@ -61,7 +61,7 @@ class Geometry(Schema):
         return self
 
 
-class PathSource(Schema):
+class PathConfig(Schema):
     """A path drawn beforehand, to be tracked as soon as the truck is armed."""
 
     file: Path
@@ -106,7 +106,7 @@ class TruckConfig(Schema):
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
     placement: PlacementConfig = PlacementConfig()
-    path: PathSource | None = None
+    path: PathConfig | None = None
     map: MapRender | None = None
     slam: SlamConfig | None = None
     """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""

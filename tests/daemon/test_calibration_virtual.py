@@ -22,8 +22,8 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate.battery import battery_wizard
 from monstertruckd.tools.calibrate.compass import compass_wizard
 from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
-from monstertruckd.tools.calibrate.guide import calibrate
 from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
+from monstertruckd.tools.calibrate.wizard import calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -266,7 +266,7 @@ def test_what_stops_the_truck_ends_the_wizard(disturb: Any, reason: Reason, said
 def test_an_obstacle_ends_the_wizard(tmp_path: Path):
     error = disturbed(tmp_path, put_something_before_it)
     assert isinstance(error, TruckError)
-    assert "no way made for 3 s (obstacle within the stopping distance" in str(error)
+    assert "no progress for 3 s (obstacle within the stopping distance" in str(error)
 
 
 def test_a_wizard_that_falls_silent_is_stopped_by_its_lease(tmp_path: Path):

@@ -22,7 +22,7 @@ from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.observer import Observer, Violation
-from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
@@ -177,12 +177,12 @@ def test_a_truck_before_something_is_told_from_one_in_the_open():
 
 
 def test_the_score_counts_motion_first():
-    safe = Outcome("a", FaultKind.STALL, True, recovered_s=0.5)
-    late = Outcome("b", FaultKind.STALL, True, recovered_s=6.0)
-    stuck = Outcome("c", FaultKind.STALL, True, stuck=("lidar",))
-    unsafe = Outcome("d", FaultKind.STALL, True, recovered_s=0.5, violations=(Violation(0.7, "stop", ""),))
+    safe = FaultOutcome("a", FaultKind.STALL, True, recovered_s=0.5)
+    late = FaultOutcome("b", FaultKind.STALL, True, recovered_s=6.0)
+    stuck = FaultOutcome("c", FaultKind.STALL, True, stuck=("lidar",))
+    unsafe = FaultOutcome("d", FaultKind.STALL, True, recovered_s=0.5, violations=(Violation(0.7, "stop", ""),))
     assert [o.score for o in (safe, late, stuck, unsafe)] == [100, 80, 50, 0]
-    report = Report(1, (safe, late, stuck, unsafe))
+    report = DrillReport(1, (safe, late, stuck, unsafe))
     assert (report.unsafe, report.stuck, report.score) == (1, 1, 57.5)
     assert report.recovery(50) == 0.5
     assert report.as_json()["outcomes"][3]["reaction"] == "UNSAFE"

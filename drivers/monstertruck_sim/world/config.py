@@ -68,7 +68,7 @@ class MotorConfig(Schema):
     """Standard deviation of the measured current, A."""
 
 
-class TruckConfig(Schema):
+class SimTruckConfig(Schema):
     """Body, wheels and tyres.
 
     Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (gravity on a
@@ -273,7 +273,7 @@ class WorldConfig(Schema):
     start: Pose2D | None = None
     """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
     noise: bool = True
-    truck: TruckConfig = TruckConfig()
+    truck: SimTruckConfig = SimTruckConfig()
     battery: BatteryConfig = BatteryConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()

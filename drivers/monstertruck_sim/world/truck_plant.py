@@ -20,7 +20,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import Battery
-from monstertruck_sim.world.config import BatteryConfig, TruckConfig
+from monstertruck_sim.world.config import BatteryConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
 
 STEP_NS = 5_000_000
@@ -81,7 +81,7 @@ class TruckPlant:
 
     def __init__(
         self,
-        config: TruckConfig,
+        config: SimTruckConfig,
         battery: BatteryConfig,
         start: Pose,
         contact: Contact,
@@ -293,7 +293,7 @@ class _Steering:
             self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, self.front, self.rear))
 
 
-def _tyres(config: TruckConfig, chassis: Chassis) -> SingleTrack | None:
+def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
     if config.dynamics == "kinematic":
         return None
     return SingleTrack(chassis.bicycle, config.mass, config.yaw_inertia, config.front_stiffness, config.rear_stiffness)

@@ -16,9 +16,9 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.guide import Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
+from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
 
 METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
 ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
@@ -29,7 +29,7 @@ ROUNDING: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class MeterReading:
     """The same pack by input and by meter."""
 
     raw: float
@@ -50,24 +50,24 @@ class BatteryWizard:
     fresh: bool = False
     """Forget the readings of earlier runs"""
 
-    async def __call__(self, guide: Guide) -> Result:
+    async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
-        keys = self._keys(guide)
-        gain, offset = (float(guide.value(key)) for key in keys)
-        earlier = guide.known.get("battery")
-        readings = [] if self.fresh or earlier is None else [Reading(*row) for row in earlier.readings]
-        guide.say("Measure at rest, with everything switched on that is always on; the truck does not move.")
+        keys = self._keys(context)
+        gain, offset = (float(context.value(key)) for key in keys)
+        earlier = context.known.get("battery")
+        readings = [] if self.fresh or earlier is None else [MeterReading(*row) for row in earlier.readings]
+        context.say("Measure at rest, with everything switched on that is always on; the truck does not move.")
         while True:
-            volts = await guide.ask(METER)
-            taken = await guide.collect(Collect("battery voltage", topics.BATTERY, self.samples, 30.0))
-            readings.append(self._reading(taken, volts, gain, offset, self._step(guide)))
-            if not await guide.confirm(ANOTHER):
+            volts = await context.ask(METER)
+            taken = await context.collect(Collect("battery voltage", topics.BATTERY, self.samples, 30.0))
+            readings.append(self._reading(taken, volts, gain, offset, self._step(context)))
+            if not await context.confirm(ANOTHER):
                 break
-        return guide.fit("scale", lambda: self._result(readings, keys))
+        return context.fit("scale", lambda: self._result(readings, keys))
 
     @staticmethod
-    def _keys(guide: Guide) -> tuple[str, str]:
-        config = guide.config
+    def _keys(context: WizardContext) -> tuple[str, str]:
+        config = context.config
         if config.monitors.battery is not None:
             return "monitors.battery.divider", "monitors.battery.offset"
         if config.devices.steering is not None and config.devices.steering.driver.battery is not None:
@@ -75,21 +75,23 @@ class BatteryWizard:
         raise RequestRefusedError(Reason.NOT_SUPPORTED, "this truck measures no battery voltage")
 
     @staticmethod
-    def _step(guide: Guide) -> float:
+    def _step(context: WizardContext) -> float:
         """Rounding of one raw reading, V; 0 where the converter is fine enough."""
-        steering = guide.config.devices.steering
-        coarse = guide.config.monitors.battery is None and steering is not None and steering.driver.battery is not None
-        return float(guide.value(f"{STEERING}.battery.volts_per_count")) if coarse else 0.0
+        steering = context.config.devices.steering
+        coarse = (
+            context.config.monitors.battery is None and steering is not None and steering.driver.battery is not None
+        )
+        return float(context.value(f"{STEERING}.battery.volts_per_count")) if coarse else 0.0
 
     @staticmethod
-    def _reading(taken: list[Battery], volts: float, gain: float, offset: float, step: float) -> Reading:
+    def _reading(taken: list[Battery], volts: float, gain: float, offset: float, step: float) -> MeterReading:
         raw = (np.array([message.raw_voltage for message in taken]) - offset) / gain
         if raw.min() <= 0 or raw.std() > 0.02 * raw.mean():
             raise InputError(f"the input reads {raw.min():.2f} to {raw.max():.2f} V: no steady voltage to compare with")
         rounding = ROUNDING * step / math.sqrt(12)
-        return Reading(float(raw.mean()), volts, math.hypot(float(raw.std()) / math.sqrt(raw.size), rounding))
+        return MeterReading(float(raw.mean()), volts, math.hypot(float(raw.std()) / math.sqrt(raw.size), rounding))
 
-    def _result(self, readings: list[Reading], keys: tuple[str, str]) -> Result:
+    def _result(self, readings: list[MeterReading], keys: tuple[str, str]) -> Result:
         volts = [reading.volts for reading in readings]
         gain, offset = self.bounds(readings)
         told = offset.half < 0.9 * GROUND
@@ -121,7 +123,7 @@ class BatteryWizard:
             readings=tuple((reading.raw, reading.volts, reading.error) for reading in readings),
         )
 
-    def bounds(self, readings: list[Reading]) -> tuple[Interval, Interval]:
+    def bounds(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
         """Gain and offset: the middle and half the extent of all lines that pass every reading within its bounds.
 
         Raises:

@@ -17,9 +17,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import Fit, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import COMPASS, Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
-from monstertruckd.tools.calibrate.steps import Move, Track
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
@@ -38,7 +38,7 @@ _NAMES: Final = ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")
 
 
 @dataclass(frozen=True, slots=True)
-class Circle:
+class FieldCircle:
     """Readings of the driven circles, (n,) each: field in microtesla, tilt in rad, motor current in A."""
 
     x: Array
@@ -51,7 +51,7 @@ class Circle:
     """As the unit, or the calibration before, computed it; rad, clockwise."""
 
     @classmethod
-    def of(cls, tracks: list[Track]) -> "Circle":
+    def of(cls, tracks: list[MoveRecord]) -> "FieldCircle":
         """What was read while the truck moved.
 
         Raises:
@@ -82,16 +82,18 @@ class CompassWizard:
     """m/s: slowly, for a compass with much iron runs ahead and falls behind by turns, which the gate takes for
     wheels that do not steer"""
 
-    async def __call__(self, guide: Guide) -> Result:
+    async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
-        guide.value("devices.compass.driver.rate")
-        guide.say("Motor and computer on, everything mounted as it will drive; phones and keys away from the compass.")
-        await guide.confirm(CLEAR)
-        length = 2 * math.pi / guide.chassis.bicycle.curvature(ANGLE, -ANGLE)
+        context.value("devices.compass.driver.rate")
+        context.say(
+            "Motor and computer on, everything mounted as it will drive; phones and keys away from the compass."
+        )
+        await context.confirm(CLEAR)
+        length = 2 * math.pi / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
         full = 2 * math.pi * OVERLAP
         tracks = [
-            await guide.move(
-                Move(
+            await context.move(
+                MoveStep(
                     name,
                     speed,
                     ANGLE,
@@ -102,7 +104,7 @@ class CompassWizard:
             )
             for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
         ]
-        return guide.fit("ellipse", lambda: result_of(Circle.of(tracks)))
+        return context.fit("ellipse", lambda: result_of(FieldCircle.of(tracks)))
 
 
 def compass_wizard(settings: CompassWizard | None = None) -> Wizard:
@@ -111,7 +113,7 @@ def compass_wizard(settings: CompassWizard | None = None) -> Wizard:
     return Wizard("compass", doc, ROOM, settings or CompassWizard())
 
 
-def result_of(circle: Circle) -> Result:
+def result_of(circle: FieldCircle) -> Result:
     """Fit and judge.
 
     Raises:
@@ -167,7 +169,7 @@ def result_of(circle: Circle) -> Result:
     )
 
 
-def fit_ellipse(circle: Circle) -> Fit:
+def fit_ellipse(circle: FieldCircle) -> Fit:
     """Least squares of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
 
     ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is what the motor's
@@ -206,7 +208,7 @@ def _iron_errors(fit: Fit) -> Array:
     return np.asarray(np.sqrt((slopes**2).T @ errors**2))
 
 
-def _angles(circle: Circle, iron: IronConfig) -> Array:
+def _angles(circle: FieldCircle, iron: IronConfig) -> Array:
     """Headings by the field with ``iron`` taken out, rad."""
     forward, left = level_field((circle.x, circle.y, circle.z), circle.pitch, circle.roll, iron)
     return np.asarray(np.arctan2(left, forward))

@@ -12,9 +12,9 @@ import numpy as np
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
-from monstertruckd.tools.calibrate.steps import Confirm, Move, Number, Track
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
@@ -51,12 +51,12 @@ class DriveWizard:
     sign_only: bool = False
     """End once it is clear where forward is"""
 
-    async def __call__(self, guide: Guide) -> Result:
+    async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
-        inverted = bool(guide.value(INVERTED))
-        await guide.confirm(CLEAR)
-        await guide.move(Move("a hand's breadth, to see where forward is", 0.06, metres=0.15))
-        if not await guide.confirm(_FORWARD):
+        inverted = bool(context.value(INVERTED))
+        await context.confirm(CLEAR)
+        await context.move(MoveStep("a hand's breadth, to see where forward is", 0.06, metres=0.15))
+        if not await context.confirm(_FORWARD):
             return self._reversed(inverted)
         if self.sign_only:
             return Result(
@@ -67,12 +67,12 @@ class DriveWizard:
             )
         runs = []
         for run in range(self.runs):
-            await guide.confirm(_MARK)
+            await context.confirm(_MARK)
             speed = self.speed if run % 2 == 0 else -min(self.speed, 0.12)
             name = f"run {run + 1} of {self.runs}, {'forward' if speed > 0 else 'back'}"
-            track = await guide.move(Move(name, speed, metres=self.metres))
-            runs.append(Run.of(track, await guide.ask(_DISTANCE)))
-        return guide.fit("turns per metre", lambda: self._result(guide, inverted, runs))
+            track = await context.move(MoveStep(name, speed, metres=self.metres))
+            runs.append(TapedRun.of(track, await context.ask(_DISTANCE)))
+        return context.fit("turns per metre", lambda: self._result(context, inverted, runs))
 
     @staticmethod
     def _reversed(inverted: bool) -> Result:
@@ -85,7 +85,7 @@ class DriveWizard:
             again="restart the daemon, so that forward is forward, and calibrate the ratio",
         )
 
-    def _result(self, guide: Guide, inverted: bool, runs: list["Run"]) -> Result:
+    def _result(self, context: WizardContext, inverted: bool, runs: list["TapedRun"]) -> Result:
         values = [run.turns / run.way for run in runs]
         middle = float(np.median(values))
         for number, value in enumerate(values, start=1):
@@ -94,9 +94,9 @@ class DriveWizard:
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
         tape = math.sqrt(2) * self.tape_error / self.metres
         # A compass with iron tells no more of a bend than that there is one.
-        bend = 0.0 if "compass" in guide.known else max(run.bend for run in runs)
+        bend = 0.0 if "compass" in context.known else max(run.bend for run in runs)
         turns = mean_interval(values, middle * tape).widened(middle * (TAPE_SCALE + bend))
-        radius = float(guide.value("geometry.wheel_radius"))
+        radius = float(context.value("geometry.wheel_radius"))
         ratio = turns.times(2 * math.pi * radius)
         floor = (
             f"on this floor; 95 % of the runs' spread and of {1000 * self.tape_error:g} mm in each reading, "
@@ -109,7 +109,7 @@ class DriveWizard:
             _estimate("drive_ratio", ratio.widened(ratio.value * SLIP), count, wheels, key=RATIO),
             _estimate("turns_per_metre", turns, count, f"turns of the motor per metre {floor}", "1/m"),
         ]
-        drive = guide.config.devices.drive
+        drive = context.config.devices.drive
         pulses = None if drive is None else drive.driver.encoder_pulses_per_turn
         if pulses is not None:
             ticks = turns.times(4 * pulses)
@@ -129,7 +129,7 @@ def drive_wizard(settings: DriveWizard | None = None) -> Wizard:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class TapedRun:
     """One taped run."""
 
     turns: float
@@ -140,7 +140,7 @@ class Run:
     """Share by which the arc is longer than the tape."""
 
     @classmethod
-    def of(cls, track: Track, distance: float) -> "Run":
+    def of(cls, track: MoveRecord, distance: float) -> "TapedRun":
         """From the taped chord, m.
 
         Raises:

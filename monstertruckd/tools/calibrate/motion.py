@@ -1,4 +1,4 @@
-"""Moves through the safety gate: a wizard drives by the ordinary requests of an operator, and by nothing else."""
+"""Moves of a wizard: drive requests of an ordinary operator, through the safety gate."""
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -15,35 +15,35 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
-from monstertruckd.tools.calibrate.steps import Move, Track
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 M = TypeVar("M", bound=Message)
 
 PERIOD: Final = 0.05
 """Seconds between two requests."""
 LEASE: Final = 0.5
-"""Asked for, s; the gate grants what it thinks right."""
+"""Requested, s; the gate may grant less."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
-TAKING: Final = 3
-"""Requests for rest that go before the order to arm."""
+REST_REQUESTS: Final = 3
+"""Requests for standstill before the order to arm."""
 STEERING: Final = 1.0
-"""Seconds the wheels get for turning while the truck stands."""
+"""Seconds for turning the wheels while the truck stands."""
 STUCK: Final = 3.0
-"""Seconds without way after which a move is given up."""
+"""Seconds without progress after which a move is cancelled."""
 PROGRESS: Final = 0.01
-"""Way, m, that counts as some."""
+"""Distance, m, that counts as progress."""
 STILL: Final = 0.1
-"""Turn of the motor, rad, that is none: an encoder at rest may hover between two counts."""
+"""Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
 AT_REST: Final = 0.5
-"""Seconds of an unchanged drive position that are rest."""
+"""Seconds of an unchanged drive position that count as rest."""
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
 
 
 class Truck(Protocol):
-    """What a wizard needs of ``TruckClient``, or of its likeness beside the bus."""
+    """What a wizard needs of ``TruckClient``, or of an equivalent in the daemon's process."""
 
     source: str
 
@@ -52,7 +52,7 @@ class Truck(Protocol):
         ...
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
-        """Ask for a motion."""
+        """Request a motion."""
         ...
 
     async def order(self, order: Order, lease: float = 1.0) -> None:
@@ -60,12 +60,12 @@ class Truck(Protocol):
         ...
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Ask the daemon."""
+        """Call a service of the daemon."""
         ...
 
 
 class Mover:
-    """Carries out moves.
+    """Drives moves.
 
     Args:
         truck: link to it.
@@ -78,14 +78,14 @@ class Mover:
         self._clock = clock
         self._drivetrain = chassis.drivetrain
 
-    async def move(self, move: Move, tell: Callable[[float], None]) -> Track:
-        """Drive ``move`` and return what was read meanwhile; ``tell`` gets the metres driven.
+    async def move(self, move: MoveStep, report: Callable[[float], None]) -> MoveRecord:
+        """Drive ``move`` and return what was measured; ``report`` is called with the metres driven.
 
-        However it ends, the truck is told to stop and disarmed.
+        However it ends, the truck is stopped and disarmed.
 
         Raises:
-            RequestRefusedError: the gate would not, or stopped the truck; carries its reason.
-            NoAnswerError: the truck does not move, or does not say so.
+            RequestRefusedError: the gate refused, or stopped the truck; with its reason.
+            NoAnswerError: the truck does not move, or sends no feedback.
         """
         with (
             self._truck.subscribe(topics.DRIVE, fifo(DEPTH)) as drive,
@@ -100,25 +100,25 @@ class Mover:
                 await run.hold(0.0, move.front, move.rear, STEERING)
                 run.begin()
                 await run.hold(0.0, move.front, move.rear, move.rest)
-                await self._drive(run, move, tell)
+                await self._drive(run, move, report)
                 await run.rest(move.front, move.rear)
                 await run.hold(0.0, move.front, move.rear, move.rest)
             return run.track
 
-    async def _drive(self, run: "_Run", move: Move, tell: Callable[[float], None]) -> None:
+    async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
         run.track.left = self._clock.now()
         way, since = 0.0, self._clock.now()
         while True:
             await run.hold(move.speed, move.front, move.rear, PERIOD)
             new = abs(run.track.way(self._drivetrain))
-            tell(new)
+            report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
                 return
             if new - way > PROGRESS:
                 way, since = new, self._clock.now()
             elif self._clock.now() - since > STUCK * SECOND:
                 why = ", ".join(reason.text for reason in run.state.reasons) if run.state else ""
-                raise NoAnswerError(f"{move.name}: no way made for {STUCK:g} s ({why or 'no reason given'})")
+                raise NoAnswerError(f"{move.name}: no progress for {STUCK:g} s ({why or 'no reason given'})")
 
     @asynccontextmanager
     async def _armed(self, run: "_Run") -> AsyncIterator[None]:
@@ -128,7 +128,7 @@ class Mover:
             await run.arm()
             yield
         finally:
-            # A lost link needs no order: without requests the gate's lease ends.
+            # If the link is lost, the gate's lease ends without requests.
             for order in (Order.STOP, Order.DISARM):
                 with suppress(TruckError):
                     await self._truck.order(order)
@@ -136,7 +136,7 @@ class Mover:
 
 
 class _Run:
-    """One move: keeps the lease, collects, watches the gate."""
+    """One move: renews the lease, collects feedback, follows the gate's state."""
 
     def __init__(
         self,
@@ -144,27 +144,27 @@ class _Run:
         clock: Clock,
         feeds: tuple[Mailbox[DriveFeedback], Mailbox[SteeringFeedback], Mailbox[Attitude], Mailbox[GateState]],
     ) -> None:
-        self.track = Track()
+        self.track = MoveRecord()
         self.state: GateState | None = None
         self._truck = truck
         self._clock = clock
         self._feeds = feeds
 
     def begin(self) -> None:
-        """Forget what was read so far."""
-        self.track = Track()
+        """Discard what was read so far."""
+        self.track = MoveRecord()
 
     async def free(self) -> None:
-        """Make sure that nobody uses the truck.
+        """Make sure that no other operator uses the truck.
 
         Raises:
-            RequestRefusedError: somebody has armed it.
-            NoAnswerError: the gate does not tell.
+            RequestRefusedError: it is armed.
+            NoAnswerError: the gate publishes no state.
         """
         end = self._clock.now() + round(ARMING * SECOND)
         while self.state is None:
             if self._clock.now() > end:
-                raise NoAnswerError(f"the gate does not tell its state within {ARMING:g} s")
+                raise NoAnswerError(f"no state of the gate within {ARMING:g} s")
             await self._clock.sleep(PERIOD)
             self._take()
         if self.state.mode.active:
@@ -172,13 +172,13 @@ class _Run:
             raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
 
     async def arm(self) -> None:
-        """Show a stick at rest for a moment, so that nobody of a lower role drives off, and arm.
+        """Request standstill for a moment, so that no operator of a lower role drives, and arm.
 
         Raises:
-            RequestRefusedError: the gate would not.
+            RequestRefusedError: the gate refused.
         """
         end = self._clock.now() + round(ARMING * SECOND)
-        taken = 0
+        sent = 0
         while self.state is None or self.state.mode is not GateMode.DRIVING or self.state.holder != self._truck.source:
             if self._clock.now() > end:
                 reasons = self.state.reasons if self.state is not None else ()
@@ -186,26 +186,26 @@ class _Run:
                 refusal = next((r for r in reasons if r is not Reason.DISARMED), Reason.DISARMED)
                 raise RequestRefusedError(refusal, f"the truck could not be armed: {why or 'no reason given'}")
             await self._truck.drive(0.0, 0.0, 0.0, LEASE)
-            taken += 1
-            if taken >= TAKING and self.state is not None and self.state.mode is GateMode.DISARMED:
+            sent += 1
+            if sent >= REST_REQUESTS and self.state is not None and self.state.mode is GateMode.DISARMED:
                 await self._truck.order(Order.ARM)
             await self._clock.sleep(PERIOD)
             self._take()
 
     async def disarmed(self) -> None:
-        """Wait until the gate has done so: the state that says DRIVING shall not be taken for the next move's."""
+        """Wait until the gate has disarmed, so that the next move does not see the state of this one."""
         end = self._clock.now() + round(ARMING * SECOND)
         while self.state is None or self.state.mode.active:
             if self._clock.now() > end:
-                raise NoAnswerError(f"the gate does not tell within {ARMING:g} s that it disarmed the truck")
+                raise NoAnswerError(f"the gate did not disarm the truck within {ARMING:g} s")
             await self._clock.sleep(PERIOD)
             self._take()
 
     async def hold(self, speed: float, front: float, rear: float, seconds: float) -> None:
-        """Ask for one motion for so long.
+        """Request one motion for ``seconds``.
 
         Raises:
-            RequestRefusedError: the gate has taken the truck away.
+            RequestRefusedError: the gate stopped the truck, or another operator drives.
         """
         end = self._clock.now() + round(seconds * SECOND)
         while self._clock.now() < end:
@@ -244,6 +244,6 @@ class _Run:
             return
         reasons = [reason for reason in state.reasons if reason is not Reason.DISARMED]
         if not reasons and state.mode is GateMode.DRIVING:
-            raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck now")
+            raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck")
         text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}")

@@ -15,10 +15,10 @@ from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.guide import CLEAR, Guide, Wizard
 from monstertruckd.tools.calibrate.statistics import NORMAL
-from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Leg, Maps, SteeringModel, half_widths
-from monstertruckd.tools.calibrate.steps import Confirm, Move, Number
+from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
+from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
 ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
 
@@ -73,102 +73,104 @@ class SteeringWizard:
     string_error: float = 0.0035
     """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
 
-    async def __call__(self, guide: Guide) -> Result:
+    async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
-        chassis = guide.chassis
+        chassis = context.chassis
         if not isinstance(chassis, TruckChassis):
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "only the truck's two steered axles are calibrated so far")
-        maps, model = Maps.of(guide.config), SteeringModel(chassis)
-        await guide.confirm(CLEAR)
-        arcs = await self._arcs(guide, maps, ROUGH)
-        directions = guide.fit("directions", lambda: _directions(arcs))
+        maps, model = Maps.of(context.config), SteeringModel(chassis)
+        await context.confirm(CLEAR)
+        arcs = await self._arcs(context, maps, ROUGH)
+        directions = context.fit("directions", lambda: _directions(arcs))
         start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]))
         wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
         if self.rough or wrong:
             again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
-            return guide.fit("centres", lambda: _rough(arcs, model, start, None if self.rough else again))
-        legs = [leg for axle in await self._arcs(guide, maps, ARC) for leg in axle]
+            return context.fit("centres", lambda: _rough(arcs, model, start, None if self.rough else again))
+        legs = [leg for axle in await self._arcs(context, maps, ARC) for leg in axle]
         first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
-        travel = await self._travel(guide, maps, model, first)
-        legs += await self._straights(guide, maps)
-        legs += await self._circles(guide, maps, travel)
-        return guide.fit("pulse maps", lambda: self._result(guide, model, legs, first, travel))
+        travel = await self._travel(context, maps, model, first)
+        legs += await self._straights(context, maps)
+        legs += await self._circles(context, maps, travel)
+        return context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
 
     # Driving
 
     @staticmethod
-    async def _arcs(guide: Guide, maps: Maps, arc: tuple[float, float, float]) -> tuple[list[Leg], list[Leg]]:
+    async def _arcs(
+        context: WizardContext, maps: Maps, arc: tuple[float, float, float]
+    ) -> tuple[list[SteeringRun], list[SteeringRun]]:
         """Arcs to both sides, forward and back, with the front axle and with the rear one."""
         speed, angle, metres = arc
-        found: tuple[list[Leg], list[Leg]] = ([], [])
+        found: tuple[list[SteeringRun], list[SteeringRun]] = ([], [])
         for axle, name in enumerate(AXLES):
             for sign, side in ((1, "left"), (-1, "right")):
                 for direction in (1, -1):
                     what = f"{name} wheels {side}, {'forward' if direction > 0 else 'back'}"
                     front, rear = _steered(axle, sign * angle)
-                    track = await guide.move(Move(what, direction * speed, front, rear, metres))
-                    found[axle].append(Leg.of(track, maps))
+                    track = await context.move(MoveStep(what, direction * speed, front, rear, metres))
+                    found[axle].append(SteeringRun.of(track, maps))
         return found
 
     @staticmethod
-    async def _travel(guide: Guide, maps: Maps, model: SteeringModel, first: Maps) -> "list[Reach]":
+    async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[Reach]":
         """How far each axle follows to each side."""
         speed, metres = TRAVEL
-        limit = guide.config.gate.angle
+        limit = context.config.gate.angle
         reached = []
         for axle, name in enumerate(AXLES):
             for sign, side in ((1, "left"), (-1, "right")):
                 front, rear = _steered(axle, sign * limit)
                 legs = []
                 for direction in (1, -1):
-                    move = Move(f"{name} wheels far {side}", direction * speed, front, rear, metres)
-                    legs.append(Leg.of(await guide.move(move), maps))
+                    move = MoveStep(f"{name} wheels far {side}", direction * speed, front, rear, metres)
+                    legs.append(SteeringRun.of(await context.move(move), maps))
                 reached.append(Reach.of(axle, sign, legs, model, first))
         return reached
 
-    async def _straights(self, guide: Guide, maps: Maps) -> list[Leg]:
+    async def _straights(self, context: WizardContext, maps: Maps) -> list[SteeringRun]:
         """Straight ahead and back, the wheels set from one side and from the other."""
         speed, metres = STRAIGHT
         legs = []
         for run in range(max(self.strings, 2)):
             side = APPROACH if run % 2 == 0 else -APPROACH
             if self.strings:
-                await guide.confirm(_STRING)
-            track = await guide.move(Move("straight ahead", speed, metres=metres, approach=side))
-            offset = await guide.ask(_OFFSET) / 100 if self.strings else None
+                await context.confirm(_STRING)
+            track = await context.move(MoveStep("straight ahead", speed, metres=metres, approach=side))
+            offset = await context.ask(_OFFSET) / 100 if self.strings else None
             sigma = math.hypot(self.string_error * metres, 0.003)
-            legs.append(Leg.of(track, maps, offset, sigma))
-            back = await guide.move(Move("straight back", -speed, metres=metres, approach=-side))
-            legs.append(Leg.of(back, maps))
+            legs.append(SteeringRun.of(track, maps, offset, sigma))
+            back = await context.move(MoveStep("straight back", -speed, metres=metres, approach=-side))
+            legs.append(SteeringRun.of(back, maps))
         return legs
 
     @staticmethod
-    async def _circles(guide: Guide, maps: Maps, travel: "list[Reach]") -> list[Leg]:
+    async def _circles(context: WizardContext, maps: Maps, travel: "list[Reach]") -> list[SteeringRun]:
         """A full turn to each side with each axle, which no slow error of the compass can falsify."""
         speed, angle = FULL
         legs = []
         for reach in travel:
             front, rear = _steered(reach.axle, reach.sign * min(angle, 0.95 * abs(reach.axle_angle)))
-            move = Move(
+            move = MoveStep(
                 f"a full circle by the {AXLES[reach.axle]} wheels, {'left' if reach.sign > 0 else 'right'}",
                 speed,
                 front,
                 rear,
-                2.6 * math.pi / abs(guide.chassis.bicycle.curvature(front, rear)),
+                2.6 * math.pi / abs(context.chassis.bicycle.curvature(front, rear)),
                 done=lambda track: abs(track.turned()) > 2 * math.pi,
             )
-            legs.append(Leg.of(await guide.move(move), maps))
+            legs.append(SteeringRun.of(await context.move(move), maps))
         return legs
 
     # Judging
 
     def _result(
-        self, guide: Guide, model: SteeringModel, legs: list[Leg], first: Maps, travel: "list[Reach]"
+        self, context: WizardContext, model: SteeringModel, legs: list[SteeringRun], first: Maps, travel: "list[Reach]"
     ) -> Result:
         fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
         travel = [Reach.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
-        halves, share = half_widths(fit), _way_error(guide) + WHEELBASE
+        halves, share = half_widths(fit), _way_error(context) + WHEELBASE
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
         estimates: list[Estimate] = []
@@ -189,7 +191,7 @@ class SteeringWizard:
                     key=f"{STEERING}.{name}.scale_us_per_deg",
                 ),
             ]
-            before = guide.known.get("steering")
+            before = context.known.get("steering")
             for reach in travel:
                 if reach.axle == axle:
                     estimates += reach.estimates(name, centre, scale, before)
@@ -228,11 +230,11 @@ class Reach:
 
     half: float
     """Half the 95 % interval of that, rad."""
-    legs: tuple[Leg, ...]
+    legs: tuple[SteeringRun, ...]
     """Arcs with the wheels far over."""
 
     @classmethod
-    def of(cls, axle: int, sign: int, legs: Sequence[Leg], model: SteeringModel, maps: Maps) -> "Reach":
+    def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "Reach":
         """From arcs with the wheels far over, as far as ``maps`` tell where the other axle stood."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
@@ -279,7 +281,7 @@ def _steered(axle: int, angle: float) -> tuple[float, float]:
     return (angle, 0.0) if axle == 0 else (0.0, angle)
 
 
-def _directions(arcs: tuple[list[Leg], list[Leg]]) -> tuple[int, int]:
+def _directions(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
     """+1 where an axle steers as it is told, -1 where it steers the other way.
 
     Raises:
@@ -300,7 +302,9 @@ def _directions(arcs: tuple[list[Leg], list[Leg]]) -> tuple[int, int]:
     return signs[0], signs[1]
 
 
-def _rough(arcs: tuple[list[Leg], list[Leg]], model: SteeringModel, start: Maps, again: str | None) -> Result:
+def _rough(
+    arcs: tuple[list[SteeringRun], list[SteeringRun]], model: SteeringModel, start: Maps, again: str | None
+) -> Result:
     """Directions, and centres as far as they show before compass and drive are calibrated.
 
     Args:
@@ -351,9 +355,9 @@ def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -
     )
 
 
-def _way_error(guide: Guide) -> float:
+def _way_error(context: WizardContext) -> float:
     """Share by which the counted way may be wrong."""
-    drive = guide.known.get("drive")
+    drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:
         return WAY

@@ -20,7 +20,7 @@ from monstertruck_kinematics.polynomials import AxlePolynomials
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
-from monstertruckd.tools.calibrate.steps import Track
+from monstertruckd.tools.calibrate.steps import MoveRecord
 
 Axle = Literal["front", "rear"]
 AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
@@ -90,7 +90,7 @@ class Maps:
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class SteeringRun:
     """One move, ready for the fit."""
 
     motor: Array
@@ -106,7 +106,9 @@ class Leg:
     offset_sigma: float = 0.01
 
     @classmethod
-    def of(cls, track: Track, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01) -> "Leg":
+    def of(
+        cls, track: MoveRecord, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01
+    ) -> "SteeringRun":
         """From a move, driven with the maps the daemon runs on."""
         motor, *servos = track.steps()
         turn, noise = track.turn()
@@ -128,29 +130,29 @@ class SteeringModel:
         self.chassis = chassis
         self.linkages: tuple[AxlePolynomials, AxlePolynomials] = (chassis.linkage.front, chassis.linkage.rear)
 
-    def angles(self, leg: Leg, maps: Maps) -> tuple[Array, Array]:
+    def angles(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array]:
         """Axle angles, rad, that the pulses of a leg mean; (n,) each."""
         front, rear = (self.linkages[i].axle_from_servo(maps.servo(i, leg.pulses[i])) for i in (0, 1))
         return front, rear
 
-    def moves(self, leg: Leg, maps: Maps) -> tuple[Array, Array, Array]:
+    def moves(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array, Array]:
         """Forward, sideways (m) and turn (rad) between readings of a leg, in the body's frame; (n,) each."""
         front, rear = self.angles(leg, maps)
         bicycle = self.chassis.bicycle
         ways = self.chassis.drivetrain.distance(leg.motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
         return bicycle.body_twist(ways, front, rear)
 
-    def predict(self, leg: Leg, maps: Maps) -> tuple[float, float]:
+    def predict(self, leg: SteeringRun, maps: Maps) -> tuple[float, float]:
         """Turn, rad, and sideways offset, m, left positive, of a leg."""
         forward, sideways, turned = self.moves(leg, maps)
         heading = np.cumsum(turned) - turned / 2
         return float(turned.sum()), float(np.sum(forward * np.sin(heading) + sideways * np.cos(heading)))
 
-    def way(self, leg: Leg) -> float:
+    def way(self, leg: SteeringRun) -> float:
         """Way rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
-    def fit(self, legs: Sequence[Leg], start: Maps, gain: float = GAIN) -> Fit:
+    def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = GAIN) -> Fit:
         """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
 
         Args:
@@ -177,7 +179,7 @@ class SteeringModel:
         spread = np.array((150.0, 0.5 * abs(guess[1]), 150.0, 0.5 * abs(guess[3])))
         return least_squares(residual, guess, guess - spread, guess + spread)
 
-    def reached(self, leg: Leg, maps: Maps, axle: int) -> tuple[float, float]:
+    def reached(self, leg: SteeringRun, maps: Maps, axle: int) -> tuple[float, float]:
         """Servo angle, rad, that an axle really had on a leg by the turn, and the one its pulses mean.
 
         The other axle is taken as the maps have it. Valid for a leg with steady steering.

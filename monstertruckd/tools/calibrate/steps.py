@@ -22,7 +22,7 @@ M = TypeVar("M", bound=Message)
 
 
 @dataclass(slots=True)
-class Track:
+class MoveRecord:
     """Readings of one move, rests at both ends included."""
 
     drive: list[DriveFeedback] = field(default_factory=list)
@@ -114,7 +114,7 @@ class Confirm:
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class MoveStep:
     """The truck drives with fixed steering, from rest to rest; it is disarmed before and after.
 
     The wheels are turned while it stands, and it rests for a moment at both ends so that what is measured there can be
@@ -134,7 +134,7 @@ class Move:
     """Seconds of standing still at each end"""
     approach: float = 0.0
     """Axle angle from which straight wheels are turned to where they shall be, rad: servos stop short of their goal"""
-    done: Callable[[Track], bool] | None = None
+    done: Callable[[MoveRecord], bool] | None = None
     """Ends the way earlier"""
 
 
@@ -149,7 +149,7 @@ class Collect(Generic[M]):
     """Seconds in which they must have come"""
 
 
-Step = Number | Confirm | Move | Collect[Any]
+Step = Number | Confirm | MoveStep | Collect[Any]
 
 
 class Panel(Protocol):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruckd.config.calibration import Estimate, Result, WizardName
-    from monstertruckd.tools.calibrate.guide import Wizard
+    from monstertruckd.tools.calibrate.wizard import Wizard
 
 app = command_group(
     "Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C."
@@ -178,7 +178,7 @@ def _run(wizard: "Wizard", call: _Call) -> None:
     if call.undo:
         _undo(wizard.name, call)
         return
-    result, file = run_wall(lambda clock: _guide(wizard, call, clock))
+    result, file = run_wall(lambda clock: _run_wizard(wizard, call, clock))
     if call.json_output:
         print_json({"result": result, "file": file})
     else:
@@ -188,11 +188,11 @@ def _run(wizard: "Wizard", call: _Call) -> None:
         remark(f"not complete: {result.again}")
 
 
-async def _guide(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
+async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
     from monstertruckd.config.calibration import CalibrationFile
     from monstertruckd.config.calibration_rpc import SHOW
     from monstertruckd.config.truck import TruckConfig
-    from monstertruckd.tools.calibrate.guide import calibrate
+    from monstertruckd.tools.calibrate.wizard import calibrate
     from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
     async with _client(call.robot, call.endpoint, clock) as client:

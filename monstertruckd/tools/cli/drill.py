@@ -11,7 +11,7 @@ from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
+    from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 
 FULL_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "full.yaml"
 
@@ -40,11 +40,11 @@ def drill(
         raise typer.Exit(1)
 
 
-def _run(drill: "Drill", jobs: int) -> "Report":
+def _run(drill: "Drill", jobs: int) -> "DrillReport":
     finished = 0
     with progress("faults", drill.count) as done:
 
-        def show(outcomes: "Sequence[Outcome]") -> None:
+        def show(outcomes: "Sequence[FaultOutcome]") -> None:
             nonlocal finished
             finished += len(outcomes)
             done(finished)
@@ -52,7 +52,7 @@ def _run(drill: "Drill", jobs: int) -> "Report":
         return drill.run(jobs=jobs, report=show)
 
 
-def _print(report: "Report") -> None:
+def _print(report: "DrillReport") -> None:
     numbers = ("stop bytes s", "standstill s", "metres", "recovered s", "score")
     rows = [_cells(outcome) for outcome in report.outcomes]
     print_table(("fault", "reaction", "reason", *numbers), rows, right=numbers)
@@ -71,7 +71,7 @@ def _print(report: "Report") -> None:
     )
 
 
-def _cells(outcome: "Outcome") -> tuple[str, ...]:
+def _cells(outcome: "FaultOutcome") -> tuple[str, ...]:
     return (
         outcome.fault,
         outcome.reaction,

@@ -13,7 +13,7 @@ from monstertruckd.tools.cli.options import complete_config
 from monstertruckd.tools.cli.output import JsonOption, print_json, remark
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.install.apply import Report
+    from monstertruckd.tools.install.apply import InstallReport
 
 T = TypeVar("T")
 
@@ -82,7 +82,7 @@ def _as_root(action: Callable[[], T]) -> T:
         raise NotPermittedError(f"{error}; needs root: {again}") from error
 
 
-def _print(report: "Report", notes: tuple[str, ...], *, dry: bool, json_output: bool) -> None:
+def _print(report: "InstallReport", notes: tuple[str, ...], *, dry: bool, json_output: bool) -> None:
     if json_output:
         value = {"dry_run": dry, "changed": report.changed, "notes": notes}
         files = {str(path): change for path, change in report.changes.items()}

@@ -41,7 +41,7 @@ DEADMAN: Final[dict[str, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FaultOutcome:
     """What one fault led to. Seconds count from the fault, ``recovered_s`` from its end; None: it did not happen."""
 
     fault: str
@@ -83,11 +83,11 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class DrillReport:
     """A whole drill."""
 
     seed: int
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[FaultOutcome, ...]
 
     @property
     def unsafe(self) -> int:
@@ -136,7 +136,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class DrillLeg:
     """One truck's share of a drill; can be sent to another process."""
 
     config: dict[str, Any]
@@ -162,28 +162,28 @@ class Drill:
         self._config = config
         self._leg = leg
 
-    def legs(self) -> list[Leg]:
+    def legs(self) -> list[DrillLeg]:
         """The parts that can run in parallel."""
         starts = range(0, self.count, self._leg)
         return [
-            Leg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start))
+            DrillLeg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start))
             for number, start in enumerate(starts)
         ]
 
-    def run(self, *, jobs: int = 1, report: Callable[[list[Outcome]], None] = lambda _: None) -> Report:
+    def run(self, *, jobs: int = 1, report: Callable[[list[FaultOutcome]], None] = lambda _: None) -> DrillReport:
         """Run all of it.
 
         Args:
             jobs: processes; 1 = this one alone.
             report: called with the outcomes of each finished leg.
         """
-        outcomes: list[Outcome] = []
+        outcomes: list[FaultOutcome] = []
         for part in self._parts(jobs):
             report(part)
             outcomes += part
-        return Report(self.seed, tuple(outcomes))
+        return DrillReport(self.seed, tuple(outcomes))
 
-    def _parts(self, jobs: int) -> Iterator[list[Outcome]]:
+    def _parts(self, jobs: int) -> Iterator[list[FaultOutcome]]:
         legs = self.legs()
         if jobs == 1:
             yield from map(run_leg, legs)
@@ -192,7 +192,7 @@ class Drill:
             yield from pool.map(run_leg, legs)
 
 
-def run_leg(leg: Leg) -> list[Outcome]:
+def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
     """All faults of one leg, on the virtual clock."""
     quiet = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
@@ -206,7 +206,7 @@ def run_leg(leg: Leg) -> list[Outcome]:
 class _LegRun:
     """Drives, starts a fault, ends it and drives again, fault by fault."""
 
-    def __init__(self, leg: Leg, clock: VirtualClock, folder: str) -> None:
+    def __init__(self, leg: DrillLeg, clock: VirtualClock, folder: str) -> None:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number])
         base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
@@ -217,9 +217,9 @@ class _LegRun:
         self._config = base.model_copy(
             update={"recorder": recorder, "sim": base.sim.model_copy(update={"seed": seed, "drill": None})}
         )
-        self._outcomes: list[Outcome] = []
+        self._outcomes: list[FaultOutcome] = []
 
-    async def run(self) -> list[Outcome]:
+    async def run(self) -> list[FaultOutcome]:
         """All faults; a truck that is stuck is replaced by a new one."""
         left = self._faults
         while left:
@@ -235,7 +235,7 @@ class _LegRun:
                         break
             done = len(self._outcomes) - before
             if not done:  # a new truck cannot be driven either
-                self._outcomes.append(Outcome(left[0].name, left[0].kind, left[0].must_stop, stuck=("drive",)))
+                self._outcomes.append(FaultOutcome(left[0].name, left[0].kind, left[0].must_stop, stuck=("drive",)))
                 done = 1
             left = left[done:]
         return self._outcomes
@@ -252,7 +252,7 @@ def _draw(catalog: FaultCatalog, count: int, rng: np.random.Generator) -> list[C
     return faults
 
 
-async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Outcome | None:
+async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> FaultOutcome | None:
     """Drive for ``cruise`` seconds, have the fault, end it, recover. None: the truck could not be driven before it."""
     clock, observer, context = truck.clock, truck.observer, truck.rig.context
     if not await _drive(truck):
@@ -280,7 +280,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Outco
     if blocked:
         blockers = ()
     drove_on = standstill is not None and standstill > fault.hold  # it stood only because it was disarmed
-    return Outcome(
+    return FaultOutcome(
         fault.name,
         fault.kind,
         fault.must_stop,

@@ -27,7 +27,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import Fault, SimContext, apply
 from monstertruckd.bus.local import Bus
 from monstertruckd.tools.drill.observer import AT_REST, Violation, stop_bytes, written
-from monstertruckd.tools.drill.truck import DrillTruck, Report
+from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
 SENSORS: Final[Mapping[str, Topic[Any]]] = {
@@ -374,7 +374,7 @@ class _ScenarioRun:
     def _since(self, instant: int | None) -> float | None:
         return None if instant is None else (instant - self.started) / SECOND
 
-    def _gate_stop(self, reports: Iterable[Report]) -> tuple[int, Reason | None] | None:
+    def _gate_stop(self, reports: Iterable[DaemonReport]) -> tuple[int, Reason | None] | None:
         """When the gate stopped, and why; a limit of 0 is a stop too."""
         for state in reports:
             if isinstance(state, GateState) and (state.mode is not GateMode.DRIVING or state.speed_limit == 0):
@@ -395,7 +395,7 @@ def _unready(table: HealthTable) -> list[ServiceHealth]:
     return [service for service in table.services if service.state is not ServiceState.READY]
 
 
-def _down(reports: Iterable[Report]) -> dict[str, tuple[Reason, ...]]:
+def _down(reports: Iterable[DaemonReport]) -> dict[str, tuple[Reason, ...]]:
     """Services that were lost, and why."""
     down: dict[str, dict[Reason, None]] = {}
     for table in reports:
@@ -405,7 +405,7 @@ def _down(reports: Iterable[Report]) -> dict[str, tuple[Reason, ...]]:
     return {name: tuple(reasons) for name, reasons in down.items()}
 
 
-def _named(report: Report) -> tuple[Reason, ...]:
+def _named(report: DaemonReport) -> tuple[Reason, ...]:
     match report:
         case Event():
             return (report.reason,)

@@ -23,7 +23,7 @@ CRUISE: Final = 0.1
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run: driving goes on without."""
 
-Report = Event | GateState | HealthTable
+DaemonReport = Event | GateState | HealthTable
 
 
 class DrillTruck:
@@ -96,10 +96,10 @@ class DrillTruck:
         """Whether it moves at a speed worth stopping."""
         return abs(self.observer.speed) > CRUISE
 
-    def reports(self) -> list[Report]:
+    def reports(self) -> list[DaemonReport]:
         """Events, gate states and health tables since the last call, by time."""
         return sorted(self._drained(), key=lambda report: report.stamp)
 
-    def _drained(self) -> Iterator[Report]:
+    def _drained(self) -> Iterator[DaemonReport]:
         for queue in self._reports:
             yield from queue.drain()

@@ -25,8 +25,8 @@ from monstertruckd.tools.install.plan import (
     TMPFILES,
     UNIT,
     Command,
-    Plan,
-    Planned,
+    InstallPlan,
+    PlannedFile,
     below,
 )
 
@@ -50,7 +50,7 @@ class Change(StrEnum):
 
 
 @dataclass(slots=True)
-class Report:
+class InstallReport:
     """What was done, or would be."""
 
     changes: dict[Path, Change] = field(default_factory=dict)
@@ -88,7 +88,7 @@ def runs_here(root: Path) -> bool:
     return root == Path("/") and below(root, BOOTED).is_dir()
 
 
-def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command) -> Report:
+def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
     """Write what differs, then tell the running system; one that does not run is only written.
 
     Raises:
@@ -96,7 +96,7 @@ def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command
         NotPermittedError: not allowed to write there.
         NotFoundError, CommandFailedError: see ``run_command``; running it again goes on from there.
     """
-    report = Report({file.path: _change(root, file) for file in plan.files})
+    report = InstallReport({file.path: _change(root, file) for file in plan.files})
     unfinished = below(root, UNFINISHED)
     here = runs_here(root)
     if here and (unfinished.exists() or report.changed):
@@ -117,7 +117,7 @@ def install(plan: Plan, root: Path, *, dry: bool = False, run: Run = run_command
     return report
 
 
-def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Report:
+def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
     """Stop the service and take its files away.
 
     Raises:
@@ -125,7 +125,7 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Repor
         NotPermittedError: not allowed to.
         NotFoundError, CommandFailedError: see ``run_command``.
     """
-    report = Report({path: Change.REMOVED for path in FILES if os.path.lexists(_place(root, path))})
+    report = InstallReport({path: Change.REMOVED for path in FILES if os.path.lexists(_place(root, path))})
     here = runs_here(root) and report.changed
     before = BEFORE_REMOVAL if here and UNIT in report.changes else ()
     after = AFTER_REMOVAL if here else ()
@@ -155,7 +155,7 @@ def _place(root: Path, path: Path) -> Path:
     return place
 
 
-def _change(root: Path, file: Planned) -> Change:
+def _change(root: Path, file: PlannedFile) -> Change:
     place = _place(root, file.path)
     if not os.path.lexists(place):
         return Change.NEW
@@ -168,7 +168,7 @@ def _change(root: Path, file: Planned) -> Change:
     return Change.SAME if not place.is_symlink() and place.read_text(errors="replace") == file.text else Change.CHANGED
 
 
-def _refuse_masked(root: Path, report: Report) -> None:
+def _refuse_masked(root: Path, report: InstallReport) -> None:
     for path, change in report.changes.items():
         if change is Change.MASKED:
             elsewhere = [] if root == Path("/") else [f"--root={root}"]
@@ -177,7 +177,7 @@ def _refuse_masked(root: Path, report: Report) -> None:
             raise InputError(f"{path}: is masked by a link to {os.devnull}; to have it again: {shlex.join(mend)}")
 
 
-def _write(root: Path, file: Planned, report: Report) -> None:
+def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:
     place = _place(root, file.path)
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.target is not None:

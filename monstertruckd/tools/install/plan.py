@@ -45,7 +45,7 @@ RESTART: Final[Command] = ("systemctl", "restart", SERVICE)
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedFile:
     """One file, or a link where ``target`` is given."""
 
     path: Path
@@ -56,15 +56,15 @@ class Planned:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class InstallPlan:
     """A whole installation."""
 
-    files: tuple[Planned, ...]
+    files: tuple[PlannedFile, ...]
     notes: tuple[str, ...]
     """What will not work, and why."""
 
 
-def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> Plan:
+def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> InstallPlan:
     """What belongs to the service of a configuration.
 
     Args:
@@ -90,15 +90,15 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
     if "sim" in tree.data:
         raise ConfigError(f"{source}: sim: is a simulated truck; a service drives a real one")
     installed, copies = _placed(tree.files, below(root, FOLDER))
-    return Plan(
+    return InstallPlan(
         (
             *copies,
-            Planned(SYSUSERS, filled("sysusers.conf", {"user": user})),
-            Planned(TMPFILES, filled("tmpfiles.conf", {"user": user})),
-            Planned(MODULES, filled("modules-load.conf", {})),
-            Planned(RULES, rules_text(config)),
-            Planned(UNIT, unit_text(config, installed, user, program)),
-            Planned(ENABLED, target=UNIT),
+            PlannedFile(SYSUSERS, filled("sysusers.conf", {"user": user})),
+            PlannedFile(TMPFILES, filled("tmpfiles.conf", {"user": user})),
+            PlannedFile(MODULES, filled("modules-load.conf", {})),
+            PlannedFile(RULES, rules_text(config)),
+            PlannedFile(UNIT, unit_text(config, installed, user, program)),
+            PlannedFile(ENABLED, target=UNIT),
         ),
         (*_notes(config), *([hidden] if hidden is not None else ())),
     )
@@ -126,7 +126,7 @@ def below(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-def _placed(files: Sequence[Path], folder: Path) -> tuple[Path, tuple[Planned, ...]]:
+def _placed(files: Sequence[Path], folder: Path) -> tuple[Path, tuple[PlannedFile, ...]]:
     """Where the configuration will be, and what must be copied for that; all files keep their place to each other.
 
     Args:
@@ -138,7 +138,7 @@ def _placed(files: Sequence[Path], folder: Path) -> tuple[Path, tuple[Planned, .
         return FOLDER / source.relative_to(folder.resolve()), ()
     common = Path(os.path.commonpath([file.parent for file in files]))
     copies = [
-        Planned(FOLDER / file.relative_to(common), file.read_text(encoding="utf-8"), keep_previous=True)
+        PlannedFile(FOLDER / file.relative_to(common), file.read_text(encoding="utf-8"), keep_previous=True)
         for file in dict.fromkeys(files)
     ]
     return copies[0].path, tuple(copies)

@@ -14,7 +14,7 @@ from monstertruck_schemas.body import (
     SynchroBody,
     TricycleBody,
 )
-from monstertruck_sim.world.config import ServoConfig, TruckConfig
+from monstertruck_sim.world.config import ServoConfig, SimTruckConfig
 
 EXACT = ServoConfig(channel=1, dead_band_us=0, resolution_us=0.001)
 IDEAL = {
@@ -35,33 +35,33 @@ def roll(driver, *speeds, seconds=2.0):
 
 
 def test_a_differential_drive_goes_round_between_its_wheels(field):
-    begin, end = roll(field(truck=TruckConfig(body=DifferentialBody(kind="differential"), **IDEAL)), 0.1, 0.2)
+    begin, end = roll(field(truck=SimTruckConfig(body=DifferentialBody(kind="differential"), **IDEAL)), 0.1, 0.2)
     assert begin.wz == pytest.approx(0.1 / 0.26, rel=1e-3)
     assert end.v == pytest.approx(0.15, rel=1e-3)
     assert (end.yaw - begin.yaw) % (2 * pi) == pytest.approx(2 * 0.1 / 0.26, rel=2e-3)
 
 
 def test_opposite_wheels_turn_it_on_the_spot(field):
-    begin, end = roll(field(truck=TruckConfig(body=DifferentialBody(kind="differential"), **IDEAL)), -0.1, 0.1)
+    begin, end = roll(field(truck=SimTruckConfig(body=DifferentialBody(kind="differential"), **IDEAL)), -0.1, 0.1)
     assert hypot(end.x, end.y) < 0.002
     assert begin.wz == pytest.approx(0.2 / 0.26, rel=1e-3)
 
 
 def test_skidding_turns_slower_than_rolling(field):
     body = SkidSteerBody(kind="skid_steer", icr_left=0.2, icr_right=-0.2, icr_x=-0.05)
-    begin, _ = roll(field(truck=TruckConfig(body=body, **IDEAL)), 0.1, 0.2)
+    begin, _ = roll(field(truck=SimTruckConfig(body=body, **IDEAL)), 0.1, 0.2)
     assert begin.wz == pytest.approx(0.1 / 0.4, rel=1e-3)
     assert begin.v == pytest.approx(hypot(0.15, 0.05 * 0.25), rel=1e-3)
 
 
 def test_mecanum_wheels_against_each_other_slide_sideways(field):
-    begin, end = roll(field(truck=TruckConfig(body=MecanumBody(kind="mecanum"), **IDEAL)), -0.1, 0.1, 0.1, -0.1)
+    begin, end = roll(field(truck=SimTruckConfig(body=MecanumBody(kind="mecanum"), **IDEAL)), -0.1, 0.1, 0.1, -0.1)
     assert (end.x - begin.x, end.y - begin.y) == pytest.approx((0.0, 0.2), abs=0.002)
     assert end.yaw == pytest.approx(0.0, abs=1e-3)
 
 
 def test_equal_omni_wheels_turn_about_the_middle(field):
-    begin, end = roll(field(truck=TruckConfig(body=OmniBody(kind="omni", circle=0.2), **IDEAL)), 0.1, 0.1, 0.1)
+    begin, end = roll(field(truck=SimTruckConfig(body=OmniBody(kind="omni", circle=0.2), **IDEAL)), 0.1, 0.1, 0.1)
     assert begin.wz == pytest.approx(0.1 / 0.2, rel=1e-3)
     assert hypot(end.x, end.y) < 0.002
 
@@ -72,7 +72,7 @@ def test_equal_omni_wheels_turn_about_the_middle(field):
     ids=["ackermann", "tricycle"],
 )
 def test_a_car_ignores_its_rear_servo(field, body, speed):
-    driver = field(truck=TruckConfig(body=body, **IDEAL))
+    driver = field(truck=SimTruckConfig(body=body, **IDEAL))
     driver.steer(0.3, 0.3)
     begin, _ = roll(driver, speed)
     assert begin.rear == 0.0
@@ -81,7 +81,7 @@ def test_a_car_ignores_its_rear_servo(field, body, speed):
 
 
 def test_a_synchro_drive_keeps_its_heading(field):
-    driver = field(truck=TruckConfig(body=SynchroBody(kind="synchro"), **IDEAL))
+    driver = field(truck=SimTruckConfig(body=SynchroBody(kind="synchro"), **IDEAL))
     driver.steer(0.2, 0.0)
     begin, end = roll(driver, 0.2)
     assert begin.rear == begin.front > 0.1
@@ -90,7 +90,7 @@ def test_a_synchro_drive_keeps_its_heading(field):
 
 
 def test_every_motor_has_its_own_noise_and_load(field):
-    driver = field(truck=TruckConfig(body=DifferentialBody(kind="differential")), noise=True)
+    driver = field(truck=SimTruckConfig(body=DifferentialBody(kind="differential")), noise=True)
     roll(driver, 0.2, 0.0)
     left, right = (motor.reading(driver.now) for motor in driver.world.motors)
     assert abs(left.current_ma) > 100 > abs(right.current_ma)
@@ -103,7 +103,7 @@ def test_every_motor_has_its_own_noise_and_load(field):
 
 
 def circle(field, speed, **more):
-    driver = field(truck=TruckConfig(**(IDEAL | more)))
+    driver = field(truck=SimTruckConfig(**(IDEAL | more)))
     driver.steer(0.3, -0.1)
     driver.drive(speed, 50_000)
     return driver, driver.wait(3.0)
@@ -128,7 +128,7 @@ def test_soft_front_tyres_understeer_by_the_models_gradient(field):
 def test_inertia_delays_the_turn(field):
     rates = {}
     for inertia in (0.2, 20.0):
-        driver = field(truck=TruckConfig(dynamics="single_track", yaw_inertia=inertia, **IDEAL))
+        driver = field(truck=SimTruckConfig(dynamics="single_track", yaw_inertia=inertia, **IDEAL))
         driver.steer(0.0, 0.0)
         driver.drive(0.2, 50_000)
         driver.wait(2.0)
@@ -139,7 +139,7 @@ def test_inertia_delays_the_turn(field):
 
 
 def test_tyres_with_inertia_stop_at_a_wall(field):
-    driver = field(truck=TruckConfig(dynamics="single_track", **IDEAL), walls=[(0.6, -1.0, 0.7, 1.0)])
+    driver = field(truck=SimTruckConfig(dynamics="single_track", **IDEAL), walls=[(0.6, -1.0, 0.7, 1.0)])
     driver.steer(0.0, 0.0)
     driver.drive(0.2)
     truth = driver.wait(5.0)
@@ -150,9 +150,9 @@ def test_tyres_with_inertia_stop_at_a_wall(field):
 @pytest.mark.parametrize("kind", ["differential", "mecanum", "synchro"])
 def test_bodies_without_steered_axles_have_no_single_track(kind):
     with pytest.raises(ValidationError, match=f"body {kind} has no axles that steer it into a curve"):
-        TruckConfig.model_validate({"body": {"kind": kind}, "dynamics": "single_track"})
+        SimTruckConfig.model_validate({"body": {"kind": kind}, "dynamics": "single_track"})
 
 
 def test_impossible_bodies_are_refused():
     with pytest.raises(ValidationError, match=r"icr_x is 0\.2: expected -0\.32 to 0"):
-        TruckConfig.model_validate({"body": {"kind": "skid_steer", "icr_x": 0.2}})
+        SimTruckConfig.model_validate({"body": {"kind": "skid_steer", "icr_x": 0.2}})

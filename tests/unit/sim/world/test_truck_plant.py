@@ -10,12 +10,12 @@ from monstertruck_sim.world.config import (
     BatteryConfig,
     MotorConfig,
     ServoConfig,
+    SimTruckConfig,
     SinusoidTilt,
-    TruckConfig,
 )
 from monstertruck_sim.world.obstacles import Box, Disc
 
-IDEAL = TruckConfig(front_slip_angle=0, rear_slip_angle=0, slip_per_newton=0)
+IDEAL = SimTruckConfig(front_slip_angle=0, rear_slip_angle=0, slip_per_newton=0)
 ROLLED_PER_TURN = 2 * pi * 0.075 / 644
 
 
@@ -135,7 +135,7 @@ def test_a_stop_of_the_servo_ends_its_travel_on_one_side(field):
 
 def test_tyres_understeer(field):
     turned = []
-    for truck in (IDEAL, TruckConfig()):
+    for truck in (IDEAL, SimTruckConfig()):
         driver = field(truck=truck)
         driver.steer(0.35, -0.35)
         driver.drive(0.2)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.battery import GROUND, BatteryWizard, Reading
+from monstertruckd.tools.calibrate.battery import GROUND, BatteryWizard, MeterReading
 
 WIZARD = BatteryWizard(meter_share=0.005, meter_digits=0.02)
 
 
 def test_one_reading_tells_the_scale_but_not_the_offset():
-    gain, offset = WIZARD.bounds([Reading(24.0, 24.6, 0.0)])
+    gain, offset = WIZARD.bounds([MeterReading(24.0, 24.6, 0.0)])
     assert gain.value == pytest.approx(24.6 / 24.0)
     assert gain.half == pytest.approx((0.005 * 24.6 + 0.02 + GROUND) / 24.0)
     assert (offset.value, offset.half) == (0.0, GROUND)
@@ -18,7 +18,7 @@ def test_one_reading_tells_the_scale_but_not_the_offset():
 
 def test_readings_far_apart_with_a_good_meter_tell_the_offset():
     fine = BatteryWizard(meter_share=0.0, meter_digits=0.002)
-    gain, offset = fine.bounds([Reading(raw, 1.02 * raw + 0.05, 0.0) for raw in (20.0, 24.5)])
+    gain, offset = fine.bounds([MeterReading(raw, 1.02 * raw + 0.05, 0.0) for raw in (20.0, 24.5)])
     assert offset.value == pytest.approx(0.05, abs=0.002)
     assert offset.half < 0.03
     assert gain.value == pytest.approx(1.02, abs=1e-3)
@@ -31,11 +31,11 @@ def test_the_truth_is_inside_whatever_the_meter_does_within_its_bounds():
         raws = rng.uniform(19, 25, int(rng.integers(1, 4)))
         volts = true_gain * raws + true_offset
         shown = volts * (1 + rng.uniform(-0.0049, 0.0049, raws.size)) + rng.uniform(-0.02, 0.02, raws.size)
-        gain, offset = WIZARD.bounds([Reading(raw, volt, 0.0) for raw, volt in zip(raws, shown, strict=True)])
+        gain, offset = WIZARD.bounds([MeterReading(raw, volt, 0.0) for raw, volt in zip(raws, shown, strict=True)])
         assert gain.low <= true_gain <= gain.high
         assert offset.low <= true_offset <= offset.high
 
 
 def test_readings_that_contradict_each_other_are_refused():
     with pytest.raises(InputError, match=r"no scale fits all 2 readings.*--fresh"):
-        WIZARD.bounds([Reading(24.0, 24.6, 0.0), Reading(20.0, 22.6, 0.0)])
+        WIZARD.bounds([MeterReading(24.0, 24.6, 0.0), MeterReading(20.0, 22.6, 0.0)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.compass import LINEARITY, Circle, result_of
+from monstertruckd.tools.calibrate.compass import LINEARITY, FieldCircle, result_of
 
 HARD = np.array((6.0, -4.0))
 SOFT = np.array(((1.1, 0.06), (0.06, 0.93)))
@@ -23,7 +23,7 @@ def circle(
     tilt: float = 0.0,
     count: int = 800,
     strength: float = 25.0,
-) -> Circle:
+) -> FieldCircle:
     rng = np.random.default_rng(seed)
     there = np.linspace(0, math.pi * turns, count // 2)
     heading = np.concatenate((there, there[::-1]))
@@ -40,7 +40,7 @@ def circle(
     flat = SOFT @ np.array((x, y)) + HARD[:, None] + MOTOR[:, None] * current
     flat += noise * rng.standard_normal(flat.shape)
     believed = np.arctan2(flat[1], flat[0])
-    return Circle(flat[0], flat[1], z, pitch, roll, current, np.unwrap(believed))
+    return FieldCircle(flat[0], flat[1], z, pitch, roll, current, np.unwrap(believed))
 
 
 def truth() -> dict[str, float]:

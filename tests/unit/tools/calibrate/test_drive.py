@@ -7,11 +7,11 @@ import pytest
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
-from monstertruckd.tools.calibrate.drive import Run, arc
-from monstertruckd.tools.calibrate.steps import Track
+from monstertruckd.tools.calibrate.drive import TapedRun, arc
+from monstertruckd.tools.calibrate.steps import MoveRecord
 
 
-def track(turns: float, turn: float = 0.0) -> Track:
+def track(turns: float, turn: float = 0.0) -> MoveRecord:
     """A run with a second of rest at both ends."""
 
     def drive(second: float, position: float) -> DriveFeedback:
@@ -28,7 +28,7 @@ def track(turns: float, turn: float = 0.0) -> Track:
     before = [compass(i / 20, 0.1 + 0.001 * (i % 2)) for i in range(20)]
     moving = [compass(1 + i / 20, 0.1 - turn * i / 80) for i in range(80)]
     after = [compass(5.05 + i / 20, 0.1 - turn + 0.001 * (i % 2)) for i in range(20)]
-    return Track(
+    return MoveRecord(
         drive=[drive(0, 0.0), drive(1, 0.0), drive(5, angle), drive(6, angle)],
         attitude=[*before, *moving, *after],
         left=SECOND,
@@ -37,14 +37,14 @@ def track(turns: float, turn: float = 0.0) -> Track:
 
 
 def test_a_straight_run():
-    run = Run.of(track(2732.0), 2.0)
+    run = TapedRun.of(track(2732.0), 2.0)
     assert run.turns / run.way == pytest.approx(1366.0, rel=1e-5)
-    assert Run.of(track(-2732.0), 2.0).turns == pytest.approx(2732.0)
+    assert TapedRun.of(track(-2732.0), 2.0).turns == pytest.approx(2732.0)
 
 
 def test_the_tape_measures_the_chord_of_a_bend():
     radius, turn = 8.0, 0.25
-    run = Run.of(track(2732.0, turn), 2 * radius * math.sin(turn / 2))
+    run = TapedRun.of(track(2732.0, turn), 2 * radius * math.sin(turn / 2))
     assert run.way == pytest.approx(radius * turn, rel=1e-4)
     assert run.bend == pytest.approx(turn**2 / 24, rel=0.02)
     assert arc(2.0, 0.0) == 2.0
@@ -52,11 +52,11 @@ def test_the_tape_measures_the_chord_of_a_bend():
 
 def test_a_crooked_run_measures_nothing():
     with pytest.raises(InputError, match=r"turned by 29 deg on its way: run `calibrate steering --rough` first"):
-        Run.of(track(2732.0, 0.5), 2.0)
+        TapedRun.of(track(2732.0, 0.5), 2.0)
 
 
 def test_no_headings_at_rest():
     short = track(2732.0)
     short.attitude = short.attitude[:-18]
     with pytest.raises(InputError, match="20 and 2 headings at rest: expected 5"):
-        Run.of(short, 2.0)
+        TapedRun.of(short, 2.0)

@@ -9,7 +9,7 @@ from monstertruck_kinematics.chassis import Dimensions, TruckChassis, truck_chas
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.calibrate.steering import Reach, _directions, _rough
-from monstertruckd.tools.calibrate.steering_model import Leg, Maps, SteeringModel, half_widths
+from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 
 CHASSIS = truck_chassis(Dimensions(DriveTrain()))
 assert isinstance(CHASSIS, TruckChassis)
@@ -27,22 +27,22 @@ def leg(
     *,
     string: bool = False,
     stop: float = math.pi / 4,
-) -> Leg:
+) -> SteeringRun:
     """What a truck with the maps ``true`` does when it is told axle angles by the believed ones."""
     count = 16
     motor = np.full(count, CHASSIS.drivetrain.motor_angle(metres) / count)
     servos = CHASSIS.servos(front, rear)
     pulses = BELIEVED.pulses(0, np.full(count, servos[0])), BELIEVED.pulses(1, np.full(count, servos[1]))
     arm = np.clip(true.servo(0, pulses[0]), -stop, stop)
-    real = Leg(motor, (true.pulses(0, arm), pulses[1]), 0.0, 0.002)
+    real = SteeringRun(motor, (true.pulses(0, arm), pulses[1]), 0.0, 0.002)
     turn, aside = MODEL.predict(real, true)
     if rng is not None:
         turn += float(rng.normal(0, math.hypot(0.002, 0.005 * turn, 0.004 * math.sqrt(abs(metres)))))
         aside += float(rng.normal(0, 0.008))
-    return Leg(motor, pulses, turn, math.hypot(0.002, 0.005 * turn), aside if string else None, 0.008)
+    return SteeringRun(motor, pulses, turn, math.hypot(0.002, 0.005 * turn), aside if string else None, 0.008)
 
 
-def session(true: Maps, rng: np.random.Generator | None = None, *, string: bool = True) -> list[Leg]:
+def session(true: Maps, rng: np.random.Generator | None = None, *, string: bool = True) -> list[SteeringRun]:
     straights = [leg(0, 0, sign * 2.0, true, rng, string=string and sign > 0) for _ in range(3) for sign in (1, -1)]
     return [
         *straights,

@@ -11,19 +11,21 @@ from monstertruck_sim.faults import FaultKind
 from monstertruckd.tools.cli import drill as command
 from monstertruckd.tools.cli.main import main
 from monstertruckd.tools.drill.observer import Violation
-from monstertruckd.tools.drill.random_drill import Drill, Outcome, Report
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 
 DEMO = Path(__file__).resolve().parents[4] / "configs" / "demo.yaml"
-SAFE = Outcome(
+SAFE = FaultOutcome(
     "stall: lidar", FaultKind.STALL, True, stop_bytes_s=0.27, standstill_s=0.56, metres=0.07, recovered_s=0.9
 )
-UNSAFE = Outcome("stall: drive", FaultKind.STALL, True, violations=(Violation(0.7, "stop", "0.2 m/s: must stand"),))
-STUCK = Outcome("reset: compass", FaultKind.RESET, False, stuck=("compass",))
+UNSAFE = FaultOutcome(
+    "stall: drive", FaultKind.STALL, True, violations=(Violation(0.7, "stop", "0.2 m/s: must stand"),)
+)
+STUCK = FaultOutcome("reset: compass", FaultKind.RESET, False, stuck=("compass",))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, outcomes: tuple[Outcome, ...], *arguments: str) -> int:
-    def drill(self: Drill, **_: Any) -> Report:
-        return Report(self.seed, outcomes[: self.count])
+def run(monkeypatch: pytest.MonkeyPatch, outcomes: tuple[FaultOutcome, ...], *arguments: str) -> int:
+    def drill(self: Drill, **_: Any) -> DrillReport:
+        return DrillReport(self.seed, outcomes[: self.count])
 
     monkeypatch.setattr(Drill, "run", drill)
     monkeypatch.setattr(sys, "argv", ["monstertruckd", "drill", "--config", str(DEMO), *arguments])
@@ -43,7 +45,7 @@ def test_a_report_names_fault_reaction_time_way_and_score(
 
 @pytest.mark.parametrize(("outcome", "text"), [(UNSAFE, "must stand"), (STUCK, "not recovered: compass")])
 def test_what_is_unsafe_or_stuck_is_the_exit_code_and_a_line(
-    outcome: Outcome, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    outcome: FaultOutcome, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     assert run(monkeypatch, (SAFE, outcome), "--count", "2") == 1
     assert text in capsys.readouterr().out

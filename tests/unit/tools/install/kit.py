@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from monstertruckd.tools.install.files import Program
-from monstertruckd.tools.install.plan import Plan, plan
+from monstertruckd.tools.install.plan import InstallPlan, plan
 
 ROOT = Path(__file__).resolve().parents[4]
 TRUCK = ROOT / "configs" / "truck.yaml"
@@ -12,11 +12,13 @@ PROGRAM = Program(
 )
 
 
-def truck_plan(root: Path, config: Path | None = TRUCK, program: Program = PROGRAM, user: str | None = None) -> Plan:
+def truck_plan(
+    root: Path, config: Path | None = TRUCK, program: Program = PROGRAM, user: str | None = None
+) -> InstallPlan:
     return plan(config, user, program, root)
 
 
-def text_of(planned: Plan, name: str) -> str:
+def text_of(planned: InstallPlan, name: str) -> str:
     return next(file.text for file in planned.files if file.path.name == name and file.target is None)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, NotFoundError, NotPermittedError
 from monstertruckd.tools.install import apply
-from monstertruckd.tools.install.apply import Change, Report, install, run_command, uninstall
+from monstertruckd.tools.install.apply import Change, InstallReport, install, run_command, uninstall
 from monstertruckd.tools.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
 from tests.unit.tools.install.kit import ROOT, TRUCK, settings, truck_plan
 
@@ -121,7 +121,7 @@ class Here:
         if self.fails is not None and self.fails in arguments:
             raise CommandFailedError(f"{arguments[0]}: no")
 
-    def install(self) -> Report:
+    def install(self) -> InstallReport:
         return install(truck_plan(Path("/")), Path("/"), run=self)
 
 

@@ -1,4 +1,4 @@
-"""The frame: typed steps with bounds, given up anywhere, nothing saved before the end."""
+"""The frame: typed steps with bounds, cancelled anywhere, nothing saved before the end."""
 
 import asyncio
 from pathlib import Path
@@ -15,8 +15,8 @@ from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.guide import Guide, Wizard, calibrate
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
+from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext, calibrate
 
 CONFIG = load_config(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml", TruckConfig)[0]
 RESULT = Result(
@@ -79,9 +79,9 @@ def run(steps, panel: Panel | None = None, truck: Truck | None = None):
 def test_the_result_is_saved_by_the_daemon_at_the_end():
     truck, panel = Truck(), Panel()
 
-    async def steps(guide: Guide) -> Result:
+    async def steps(context: WizardContext) -> Result:
         assert not truck.calls
-        return guide.fit("scale", lambda: RESULT)
+        return context.fit("scale", lambda: RESULT)
 
     assert run(steps, panel, truck) == (RESULT.model_copy(update={"date": DATE}), "0001.json")
     assert truck.calls == [("calibration_save", {"result": RESULT.model_dump(mode="json"), "by": "test"})]
@@ -92,8 +92,8 @@ def test_the_result_is_saved_by_the_daemon_at_the_end():
 def test_a_number_has_bounds(panel: Panel):
     truck = Truck()
 
-    async def steps(guide: Guide) -> Result:
-        await guide.ask(Number("volts", "volts?", 0.0, 2.0))
+    async def steps(context: WizardContext) -> Result:
+        await context.ask(Number("volts", "volts?", 0.0, 2.0))
         return RESULT
 
     with pytest.raises(InputError, match=r"volts: .* is not within 0 to 2"):
@@ -102,13 +102,13 @@ def test_a_number_has_bounds(panel: Panel):
 
 
 def test_no_to_what_has_to_be_ends_the_wizard():
-    async def steps(guide: Guide) -> Result:
-        assert not await guide.confirm(Confirm("seen", "did it?", fact=True)), "a fact may be either"
-        await guide.confirm(Confirm("ready", "ready?"))
+    async def steps(context: WizardContext) -> Result:
+        assert not await context.confirm(Confirm("seen", "did it?", fact=True)), "a fact may be either"
+        await context.confirm(Confirm("ready", "ready?"))
         return RESULT
 
     truck = Truck()
-    with pytest.raises(RequestRefusedError, match=r"given up at: ready\?") as caught:
+    with pytest.raises(RequestRefusedError, match=r"cancelled at: ready\?") as caught:
         run(steps, Panel(yes=False), truck)
     assert caught.value.refusal is Reason.CANCELLED
     assert not truck.calls
@@ -117,15 +117,15 @@ def test_no_to_what_has_to_be_ends_the_wizard():
 def test_messages_are_collected_within_their_time():
     truck, panel = Truck(), Panel()
 
-    async def steps(guide: Guide) -> Result:
-        collecting = asyncio.ensure_future(guide.collect(Collect("voltage", topics.BATTERY, 3, 5.0)))
+    async def steps(context: WizardContext) -> Result:
+        collecting = asyncio.ensure_future(context.collect(Collect("voltage", topics.BATTERY, 3, 5.0)))
         await asyncio.sleep(0)
         message = Battery(stamp=1, received=1, seq=0, raw_voltage=24.0, cells=6, level=BatteryLevel.NORMAL)
         for _ in range(3):
             truck.boxes[0].put(message)
             await asyncio.sleep(0.1)
         assert await collecting == [message] * 3
-        await guide.collect(Collect("voltage", topics.BATTERY, 3, 5.0))
+        await context.collect(Collect("voltage", topics.BATTERY, 3, 5.0))
         return RESULT
 
     with pytest.raises(NoAnswerError, match="sensor/battery: 0 of 3 messages came within 5 s"):
@@ -134,9 +134,9 @@ def test_messages_are_collected_within_their_time():
 
 
 def test_values_of_the_running_configuration():
-    async def steps(guide: Guide) -> Result:
-        assert guide.value("geometry.drive_ratio") == 644.0
-        guide.value("devices.camera.driver.rate")
+    async def steps(context: WizardContext) -> Result:
+        assert context.value("geometry.drive_ratio") == 644.0
+        context.value("devices.camera.driver.rate")
         return RESULT
 
     with pytest.raises(InputError, match=r"devices\.camera\.driver\.rate: not in this truck's configuration"):

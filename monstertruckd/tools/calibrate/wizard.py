@@ -1,9 +1,9 @@
-"""The frame of every wizard: a coroutine that walks the operator through typed steps.
+"""Calibration wizards: coroutines that lead the operator through typed steps.
 
-A wizard gets a ``Guide`` and awaits its steps one by one: ask for a number, have something confirmed, move, collect,
-fit. Every step is a place where it can be given up: the truck moves within ``move`` only and is disarmed between moves,
-and nothing is written before the wizard has returned its result. So an interrupt, a lost link or a killed process
-leaves the calibration as it was; the truck's stop is the gate's business, as for any operator that falls silent.
+A wizard awaits the steps of its ``WizardContext`` one by one: ask for a number, ask for a confirmation, move, collect
+messages, fit. It can be cancelled at every step: the truck moves within ``move`` only and is disarmed between moves;
+nothing is written before the wizard has returned its result. An interrupt, a lost link or a killed process leaves
+the calibration unchanged; the gate stops the truck as it does for any operator whose requests end.
 """
 
 import json
@@ -21,7 +21,7 @@ from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.motion import Mover, Truck
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, Move, Number, Panel, Track
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -31,24 +31,24 @@ CLEAR: Final = Confirm("clear", "The truck is about to move. Is the floor free a
 
 @dataclass(frozen=True, slots=True)
 class Wizard:
-    """One calibration."""
+    """One calibration procedure."""
 
     name: WizardName
     doc: str
     """What it finds, in a sentence"""
     room: str
-    """What the truck needs around it"""
-    run: Callable[["Guide"], Awaitable[Result]]
+    """Free space that the truck needs"""
+    run: Callable[["WizardContext"], Awaitable[Result]]
 
 
-class Guide:
-    """Leads through one wizard.
+class WizardContext:
+    """The steps of one wizard, and what it knows of the truck.
 
     Args:
         truck: link to it.
         panel: the operator.
         clock: time.
-        config: what the daemon runs on, calibration included.
+        config: the daemon's, calibration included.
         known: the truck's calibration so far, by wizard.
     """
 
@@ -70,11 +70,11 @@ class Guide:
         self._values: dict[str, Any] = config.model_dump()
 
     def say(self, text: str) -> None:
-        """Tell the operator something."""
+        """Show a sentence to the operator."""
         self._panel.say(text)
 
     def value(self, key: str) -> Value:
-        """A value the daemon runs on.
+        """A value of the daemon's configuration.
 
         Raises:
             InputError: this truck has no such device.
@@ -99,15 +99,15 @@ class Guide:
         """Yes or no.
 
         Raises:
-            RequestRefusedError: the operator said no to what has to be.
+            RequestRefusedError: the operator declined what is required.
             InputError: there is no answer.
         """
         yes = await self._panel.confirm(step)
         if not yes and not step.fact:
-            raise RequestRefusedError(Reason.CANCELLED, f"given up at: {step.question}")
+            raise RequestRefusedError(Reason.CANCELLED, f"cancelled at: {step.question}")
         return yes
 
-    async def move(self, step: Move) -> Track:
+    async def move(self, step: MoveStep) -> MoveRecord:
         """Drive; raises as ``Mover.move`` does."""
         self._panel.say(f"moving: {step.name}")
         return await self._mover.move(step, lambda way: self._panel.progress(step.name, way, step.metres))
@@ -139,14 +139,14 @@ class Guide:
 async def calibrate(
     wizard: Wizard, truck: Truck, panel: Panel, clock: Clock, config: TruckConfig, known: Mapping[WizardName, Result]
 ) -> tuple[Result, str]:
-    """Run a wizard, and have the daemon save what it found; returns that as it is saved and the path of the new file.
+    """Run a wizard and have the daemon save its result; returns the saved result and the path of the new file.
 
     Raises:
-        TruckError: whatever ended it; nothing was saved then.
+        TruckError: the wizard ended without a result; nothing was saved.
     """
     panel.say(f"{wizard.name}: {wizard.doc}")
     if wizard.room:
         panel.say(f"room: {wizard.room}")
-    result = await wizard.run(Guide(truck, panel, clock, config, known))
+    result = await wizard.run(WizardContext(truck, panel, clock, config, known))
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "by": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])
