@@ -4,11 +4,10 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.link_quality.driver import LinkJudge
-
 from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import disk_of, read_host
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
+from monstertruck_drivers.link_quality.driver import LinkJudge
 from monstertruck_drivers.link_quality.interfaces import choose, read_interfaces
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceError
