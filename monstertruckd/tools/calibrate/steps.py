@@ -6,15 +6,14 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
-from monstertruck_kinematics.elementary import Array
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.topics import Topic
-
 
 CURRENT_VALID: Final = 0.5
 """Seconds for which a motor current counts: not every feedback carries one."""
