@@ -35,7 +35,6 @@ from monstertruck_runtime.actors.actor import LoopActor
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
-from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config, load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.gate.config import GateConfig
@@ -222,7 +221,7 @@ def traced(
         rig = VirtualRig(config, clock)
         async with rig.running():
             await clock.sleep(3.0)
-            await LocalOperator(rig.bus, clock).order(Order.ARM)
+            await LocalOperator(rig.daemon, clock).arm()
             await clock.sleep(3.0)
             gate, now = (
                 rig.bus.subscribe(topics.GATE, latest()).latest

@@ -20,7 +20,7 @@ import signal
 import sys
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,10 +31,10 @@ from same_python import go_on_in_the_systems_python
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
 from monstertruckd.tools.simulation.operator import drive_lap
@@ -111,7 +111,8 @@ async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bo
             if gate.latest is not None and not gate.latest.mode.active:
                 if drives.states:
                     drives.stops.append("unknown" if stop.latest is None else stop.latest.reason.value)
-                await client.order(Order.ARM)
+                with suppress(RequestRefusedError):
+                    await client.arm()
             await clock.sleep(0.25)
 
 
@@ -151,7 +152,7 @@ async def wander(client: TruckClient, clock: Clock) -> None:
     with client.subscribe(topics.GOAL, latest()) as goals:
         await goals.next()
         for place in itertools.cycle(PLACES):
-            await client.go(place)
+            await client.goal(place)
             await clock.sleep(1.0)
             while goals.latest is None or goals.latest.phase is not GoalPhase.IDLE:
                 await clock.sleep(0.25)

@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -19,7 +20,7 @@ from time import perf_counter
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_schemas.req import Order
+from monstertruck_runtime.errors import TruckError
 from monstertruck_sim.faults import hubs_of
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
@@ -55,7 +56,7 @@ async def soak(clock: VirtualClock, config: SimulatedTruckConfig, minutes: int, 
     assert rig.daemon.black_box is not None
     ring = rig.daemon.black_box.ring
     async with rig.running():
-        operator = LocalOperator(rig.bus, clock)
+        operator = LocalOperator(rig.daemon, clock)
         began = clock.now()
         arming = asyncio.create_task(_arm_for_ever(operator, clock))
         try:
@@ -74,7 +75,8 @@ async def soak(clock: VirtualClock, config: SimulatedTruckConfig, minutes: int, 
 
 async def _arm_for_ever(operator: LocalOperator, clock: VirtualClock) -> None:
     while True:
-        await operator.order(Order.ARM)
+        with suppress(TruckError):
+            await operator.arm()
         await clock.sleep(1.0)
 
 

@@ -90,7 +90,7 @@ def draw_map(config: SimulatedTruckConfig) -> str:
     async def main(clock: VirtualClock) -> str:
         rig = VirtualRig(config, clock)
         async with rig.running():
-            lap = await drive_lap(LocalOperator(rig.bus, clock), clock)
+            lap = await drive_lap(LocalOperator(rig.daemon, clock), clock)
             await clock.sleep(1.0)
         return lap.outcome.value
 

@@ -43,6 +43,7 @@ from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.gate import rpc as gate_rpc
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
@@ -251,6 +252,7 @@ class Daemon:
         rpc.register("config", config)
         rpc.register("versions", versions)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
+        gate_rpc.register(rpc, self.bus)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
             rpc, self.config, loaded, self.clock, self._events, self._offload, lambda: self.gate.mode

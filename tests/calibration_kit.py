@@ -10,7 +10,7 @@ import numpy as np
 
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
-from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.req import DriveRequest
 from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
@@ -30,20 +30,12 @@ class LocalTruck(LocalOperator):
     """What a wizard needs of a client, inside the daemon's process."""
 
     def __init__(self, daemon: Daemon, clock: Clock, source: str = "calibrate") -> None:
-        super().__init__(daemon.bus, clock, source)
-        self.source = source
-        self._daemon = daemon
-        self._requests = 0
+        super().__init__(daemon, clock, source)
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
         """Inject a drive request as the bridge to Zenoh does."""
-        self._requests += 1
-        header = await self._header(self._requests, Role.STATION, lease)
-        self._bus.inject(topics.REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
-
-    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Call one of the daemon's."""
-        return await self._daemon.rpc.call(rpc, payload or {})
+        request = {**await self.header(lease), "speed": speed, "front": front, "rear": rear}
+        self._daemon.bus.inject(topics.REQ_DRIVE, DriveRequest(**request))
 
 
 @dataclass(frozen=True, slots=True)

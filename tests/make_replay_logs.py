@@ -17,7 +17,7 @@ from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
-from monstertruck_schemas.req import GoalRequest, Order, Role
+from monstertruck_schemas.req import GoalRequest, Role
 from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.wall import write_overlay
@@ -71,7 +71,7 @@ def drive_to_goals(folder: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         rig = VirtualRig(truck, clock, tree)
         async with rig.running():
-            operator = LocalOperator(rig.bus, clock)
+            operator = LocalOperator(rig.daemon, clock)
             states = rig.bus.subscribe(topics.GOAL, fifo(256))
             await clock.sleep(0.73)
             for number, (x, y) in enumerate(GOALS, start=1):
@@ -91,7 +91,7 @@ def drive_to_goals(folder: Path) -> None:
                 )
                 if number == 1:
                     rig.bus.inject(topics.REQ_GOAL, request)
-                    await operator.order(Order.ARM)
+                    await operator.arm()
                 else:
                     await rig.daemon.rpc.call("goal", request.model_dump(mode="json"))
                 async with clock.deadline(20.0):

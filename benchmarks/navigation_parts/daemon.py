@@ -26,7 +26,6 @@ from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruck_sim.world.obstacles import Disc
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
@@ -124,7 +123,7 @@ def drive(goal: Goal, seed: int, *, surprise: bool) -> dict[str, Any]:
 
 async def pursue(rig: VirtualRig, clock: VirtualClock, goal: Goal, *, surprise: bool) -> GoalState:
     """Ask for the goal, arm, perhaps step into the way, and wait for the end."""
-    operator, states = LocalOperator(rig.bus, clock), rig.bus.subscribe(topics.GOAL, fifo(100_000))
+    operator, states = LocalOperator(rig.daemon, clock), rig.bus.subscribe(topics.GOAL, fifo(100_000))
     gate = rig.bus.newest(topics.GATE)
     assert gate is not None
     header = {
@@ -136,7 +135,7 @@ async def pursue(rig: VirtualRig, clock: VirtualClock, goal: Goal, *, surprise: 
         await rig.daemon.rpc.call("goal", {**header, "goal": {"x": x, "y": y, "yaw": yaw}})
     except RequestRefusedError:
         return await last(states)
-    await operator.order(Order.ARM)
+    await operator.arm()
     if surprise:
         stepping = asyncio.create_task(step_in(rig, clock, goal))
     try:

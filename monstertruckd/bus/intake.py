@@ -62,7 +62,7 @@ class Intake:
     """
 
     def __init__(
-        self, topic: Topic[Any], bus: Bus, clock: Clock, guard: Callable[[Callable[[], None]], None], source: str
+        self, topic: Topic[Any], bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], source: str
     ) -> None:
         self.topic = topic
         self._limit = LIMITS.get(topic.name, Limit())

@@ -158,8 +158,10 @@ class Bus:
                 callback(topic, message, data, self._clock.now())
         return tap
 
-    def inject(self, topic: Topic[M], message: M) -> None:
+    def inject(self, topic: Topic[M], message: M) -> list[object]:
         """Take in a request from outside; ``received`` becomes the daemon's own time, whatever it claimed.
+
+        Returns what the topic's listeners returned, in their order.
 
         Raises:
             RuntimeError: ``topic`` is not one that outsiders write.
@@ -167,7 +169,7 @@ class Bus:
         if topic.writer is not Writer.OUTSIDE:
             msg = f"{topic.name} is written by {topic.writer}, not from outside"
             raise RuntimeError(msg)
-        self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
+        return self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
 
     @property
     def drops(self) -> int:
@@ -178,17 +180,17 @@ class Bus:
         """Count losses in a queue of someone else."""
         self._drops += count
 
-    def hand_over(self, topic: Topic[M], message: M) -> None:
-        """Deliver to listeners, readers and taps; called by the topic's own write end."""
+    def hand_over(self, topic: Topic[M], message: M) -> list[object]:
+        """Deliver to listeners, readers and taps; returns what the listeners returned."""
         if topic.retained:
             self._retained[topic.name] = (topic, message)
         ends = self._ends[topic.name]
-        for listener in ends.listeners:
-            listener(message)
+        answers = [listener(message) for listener in ends.listeners]
         for mailbox in ends.mailboxes:
             mailbox.put(message)
         if ends.taps:
             self._outgoing.send(topic, message, self._clock.now())
+        return answers
 
     def untap(self, tap: Tap) -> None:
         """End ``tap``; see ``Tap.close``."""

@@ -274,7 +274,7 @@ def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     ).put
 
 
-def _guarded(failed: "asyncio.Future[None]", job: Callable[[], None]) -> None:
+def _guarded(failed: "asyncio.Future[None]", job: Callable[[], object]) -> None:
     """Run ``job``; a bug in it ends the service instead of vanishing in the loop's exception handler."""
     try:
         job()

@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
 from monstertruck_runtime.requests import OPERATORS
-from monstertruck_runtime.stops import sentence
+from monstertruck_runtime.stops import causes_text
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
@@ -42,6 +42,17 @@ URGENT: Final = frozenset(
 
 DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
 """After these the truck must be armed again, however short they were."""
+
+
+class Decision(NamedTuple):
+    """What the gate decided about an order."""
+
+    reason: Reason
+    """OK, or why it was refused."""
+    text: str
+
+
+ACCEPTED: Final = Decision(Reason.OK, Reason.OK.text)
 
 
 class GateOutput(NamedTuple):
@@ -208,23 +219,24 @@ class Gate:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._sensors.assess(now), now)), Reason.OK)
 
-    def control(self, request: ControlRequest, now: int) -> Reason:
-        """Carry out an order; returns OK, or why it was refused.
+    def control(self, request: ControlRequest, now: int) -> Decision:
+        """Carry out an order, or refuse it.
 
         ESTOP and STOP are accepted from every source, authenticated or not: stopping is always safe. ARM and RESET need
-        an operator's role, a truck at rest and no operator requesting motion.
+        an operator's role, a truck at rest and no operator requesting motion. An authenticated ESTOP or STOP uses its
+        sequence number, so that an earlier order of its source that arrives later, by another way, is refused.
         """
+        reason = self._sources.accept_order(request, now)
         if request.order is Order.ESTOP:
             return self._estop(request, now)
         if request.order is Order.STOP:
             return self._stop_by(request, now)
-        reason = self._sources.accept_order(request, now)
         if reason is not Reason.OK:
-            return self._refuse(now, reason, request)
+            return self._refuse_order(now, reason, request)
         if request.order is Order.DISARM:
             return self._disarm_by(request, now)
         if request.role not in OPERATORS:
-            return self._refuse(now, Reason.BAD_ROLE, request)
+            return self._refuse_order(now, Reason.BAD_ROLE, request)
         return self._arm(request, now) if request.order is Order.ARM else self._reset(request, now)
 
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
@@ -233,7 +245,10 @@ class Gate:
         self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source)
         return reason
 
-    def _estop(self, request: ControlRequest, now: int) -> Reason:
+    def _refuse_order(self, now: int, reason: Reason, request: ControlRequest, text: str = "") -> Decision:
+        return Decision(self._refuse(now, reason, request, text), text or reason.text)
+
+    def _estop(self, request: ControlRequest, now: int) -> Decision:
         if self.mode is not GateMode.ESTOPPED:
             why = _order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
             self._trip(now, GateMode.ESTOPPED, [why])
@@ -242,9 +257,9 @@ class Gate:
             self._events.emit(
                 now, Reason.ESTOP_REQUESTED, Severity.ERROR, "", values, source=request.source, always=True
             )
-        return Reason.OK
+        return ACCEPTED
 
-    def _stop_by(self, request: ControlRequest, now: int) -> Reason:
+    def _stop_by(self, request: ControlRequest, now: int) -> Decision:
         if request.role is not Role.TRACKER:
             self._sources.claim(request.role)
         self._sources.hold()
@@ -252,9 +267,9 @@ class Gate:
             text = f"stop ordered by {request.source}"
             self._stop(now, [_order_cause(Reason.STOPPED, text, request, now)], ordered=True)
             self._emit_transition(now, Reason.STOPPED, text)
-        return Reason.OK
+        return ACCEPTED
 
-    def _disarm_by(self, request: ControlRequest, now: int) -> Reason:
+    def _disarm_by(self, request: ControlRequest, now: int) -> Decision:
         text = f"disarmed by {request.source}"
         if self.mode is GateMode.ARMED:
             self._disarm(now, text)
@@ -263,29 +278,29 @@ class Gate:
             if self.mode is GateMode.DRIVING:
                 self._stop(now, [_order_cause(Reason.DISARMED, text, request, now)], ordered=True)
                 self._emit_transition(now, Reason.DISARMED, text)
-        return Reason.OK
+        return ACCEPTED
 
-    def _arm(self, request: ControlRequest, now: int) -> Reason:
+    def _arm(self, request: ControlRequest, now: int) -> Decision:
         if self.mode is GateMode.ESTOPPED:
-            return self._refuse(now, Reason.ESTOPPED, request, self._stops.summary(now))
+            return self._refuse_order(now, Reason.ESTOPPED, request, self._stops.summary(now))
         blocks = self._blocks(self._sensors.assess(now), now)
         if blocks:
             causes = self._outages.explain(self._causes.causes(blocks, now, self._known))
-            return self._refuse(now, blocks[0], request, sentence(causes, now))
+            return self._refuse_order(now, blocks[0], request, causes_text(causes, now))
         moving = self.mode is GateMode.STOPPING or not self._sensors.at_rest(now)
         if moving or self._sources.motion_requested(now, OPERATORS):
-            return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
+            return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request)
         self._sources.release()
         self._states.arm(now, request.source)
-        return Reason.OK
+        return ACCEPTED
 
-    def _reset(self, request: ControlRequest, now: int) -> Reason:
+    def _reset(self, request: ControlRequest, now: int) -> Decision:
         if self.mode is not GateMode.ESTOPPED:
-            return Reason.OK
+            return ACCEPTED
         if not self._sensors.at_rest(now) or self._sources.motion_requested(now):
-            return self._refuse(now, Reason.NOT_ARMED_SPEED, request)
+            return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request)
         self._disarm(now, f"emergency stop reset by {request.source}")
-        return Reason.OK
+        return ACCEPTED
 
     # Ticks
 

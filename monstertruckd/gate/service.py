@@ -12,7 +12,7 @@ import numpy as np
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.schedule import Schedule
-from monstertruck_runtime.stops import sentence
+from monstertruck_runtime.stops import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
@@ -21,7 +21,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.gate.core import Gate, GateOutput
+from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
 from monstertruckd.gate.stops import Trip
 
@@ -166,9 +166,10 @@ class GateService:
         """Punctuality of the tick."""
         return self._meter.lateness()
 
-    def control(self, order: ControlRequest) -> Reason:
+    def control(self, order: ControlRequest) -> Decision:
         """Carry out an order at once; see ``Gate.control``."""
-        return self._guarded(Reason.INTERNAL, self._gate.control, order, self._clock.now())
+        bug = Decision(Reason.INTERNAL, Reason.INTERNAL.text)
+        return self._guarded(bug, self._gate.control, order, self._clock.now())
 
     def request(self, request: DriveRequest) -> Reason:
         """Take a drive request from outside, at once; see ``Gate.request``."""
@@ -281,7 +282,7 @@ class GateService:
             stopping_distance=trip.stopping_distance,
             causes=trip.causes,
             black_box=self._boxed[1],
-            text=f"stopped: {sentence(trip.causes, trip.at)}",
+            text=f"stopped: {causes_text(trip.causes, trip.at)}",
         )
 
     def _state(self, output: GateOutput, now: int) -> GateState:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.stops import sentence, span
+from monstertruck_runtime.stops import causes_text, duration_text
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Cause, Event, Measurement, Severity
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
@@ -313,7 +313,7 @@ class StopLog:
         newest = self._newest
         if newest is None:
             return ""
-        return f"stopped {span((now - newest.at) / SECOND)} ago: {sentence(newest.causes, newest.at)}"
+        return f"stopped {duration_text((now - newest.at) / SECOND)} ago: {causes_text(newest.causes, newest.at)}"
 
     def drain(self, now: int) -> tuple[Trip, ...]:
         """Stops since the last call, or the newest one again if more of its causes are known."""

@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink
-from monstertruck_runtime.stops import sentence
+from monstertruck_runtime.stops import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -315,7 +315,7 @@ class BlackBox:
             "stops": ",".join(str(trip.number) for trip in pending.trips),
             "stopped_at_ns": str(first.at),
             "reason": first.reason.value,
-            "text": "; ".join(sentence(trip.causes, trip.at) for trip in pending.trips),
+            "text": "; ".join(causes_text(trip.causes, trip.at) for trip in pending.trips),
             "lost": str(self.ring.lost),
         }
         try:

@@ -1,4 +1,4 @@
-"""What a station or a script uses to watch and drive a robot: typed messages over Zenoh."""
+"""Client of one robot for stations and scripts: typed messages and remote calls over Zenoh."""
 
 import asyncio
 import getpass
@@ -10,7 +10,7 @@ import socket
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import zenoh
 from zenoh import ext, handlers
@@ -19,28 +19,26 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, WallClock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_runtime.requests import OVERTAKING, Operator
 from monstertruck_runtime.station import ClientTls, session_config, station_tls
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_runtime.zenoh_threads import in_network_thread
-from monstertruck_schemas.base import Message, Pose2D
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     ControlRequest,
     DriveRequest,
     GoalOrder,
-    GoalRequest,
     Order,
     PathRequest,
     Role,
-    Waypoint,
 )
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import (
     GATE,
     REQ_CONTROL,
     REQ_DRIVE,
-    REQ_GOAL,
     REQ_PATH,
     Topic,
     Writer,
@@ -54,19 +52,22 @@ M = TypeVar("M", bound=Message)
 
 _HOP_DEPTH = 1024
 
+ORDER_TIMEOUT: Final = 6.0
+"""Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
 
-class TruckClient:
+
+class TruckClient(Operator):
     """Session with one robot; an async context manager.
 
-    It never listens and never discovers: it dials one endpoint, and again for ever when the robot restarts.
+    It never listens and never discovers: it connects to one endpoint, and reconnects when the robot restarts.
     Messages that cannot be decoded are logged and skipped.
 
     Args:
         robot: name in the keys ``mt/<robot>/...``.
         endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``.
         source: this program's name in requests; default ``user@host:pid``.
-        role: what it acts as; decides its priority.
-        clock: time of stamps and deadlines; its own, robots do not trust it.
+        role: of its requests; decides their priority.
+        clock: time of stamps and deadlines; robots do not trust it.
         timeout: seconds to wait for the link and for answers.
         tls: certificate files for ``tls/...`` endpoints; None = those of ``station_tls``.
     """
@@ -93,11 +94,11 @@ class TruckClient:
         self._subscriptions: dict[Mailbox[Any], Callable[[], None]] = {}
         self._gate: Mailbox[GateState] | None = None
         self._asking = asyncio.Lock()
-        # Must grow for each source over runs of this program, too.
+        # Must also grow from one run of this program to the next.
         self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
 
     async def __aenter__(self) -> Self:
-        """Dial the endpoint.
+        """Connect to the endpoint.
 
         Raises:
             NotFoundError: nothing answers there, or a file of the certificate is missing.
@@ -118,10 +119,10 @@ class TruckClient:
             mailbox.close()
         await self._close()
 
-    # Watching
+    # Subscriptions
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Follow ``topic``; of a retained topic the newest message comes at once.
+        """Subscribe to ``topic``; of a retained topic the newest message comes at once.
 
         Args:
             topic: row of the topic table.
@@ -174,10 +175,17 @@ class TruckClient:
         )
         return any(reply.ok is not None for reply in replies)
 
-    # Asking
+    # Remote calls
 
-    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+    async def call(
+        self, rpc: str, payload: dict[str, Any] | None = None, timeout: float | None = None
+    ) -> dict[str, Any]:
         """Call ``rpc`` on the robot with a JSON object; returns its answer.
+
+        Args:
+            rpc: name.
+            payload: JSON object.
+            timeout: seconds to wait; None = those of the client.
 
         Raises:
             NotFoundError: no such robot or rpc.
@@ -185,18 +193,21 @@ class TruckClient:
             NoAnswerError: no answer in time.
             RequestRefusedError: refused; carries the reason.
         """
-        replies = await self._get(rpc_key(self.robot, rpc), json.dumps(payload or {}))
+        answer: dict[str, Any] = json.loads(await self._call(rpc, payload or {}, timeout))
+        return answer
+
+    async def _call(self, rpc: str, payload: dict[str, Any], timeout: float | None) -> bytes:
+        replies = await self._get(rpc_key(self.robot, rpc), json.dumps(payload), timeout)
         if not replies:
             raise self._absent()
-        answer: dict[str, Any] = json.loads(_payload(replies[0]))
-        return answer
+        return _payload(replies[0])
 
     # Requests
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
-        """Ask for a speed (m/s) and axle angles (rad, left positive), to stand for ``lease`` seconds.
+        """Request a speed (m/s) and axle angles (rad, left positive) for ``lease`` seconds.
 
-        Whether it is granted shows in ``state/gate`` (holder, last_seq) and in events.
+        It goes by topic, for speed; whether it is granted shows in ``state/gate`` (holder, last_seq) and in events.
 
         Raises:
             NoAnswerError: the robot's nonce did not come in time.
@@ -204,32 +215,33 @@ class TruckClient:
         header = await self._answered(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
 
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Arm, disarm, stop, reset; an emergency stop goes out at once, whatever is known of the robot.
+    async def order(self, order: Order) -> GateState:
+        """Give an order and wait until it is carried out; returns the gate's state then.
+
+        An emergency stop or stop is published at once, whatever is known of the robot, before its outcome is awaited.
 
         Raises:
-            NoAnswerError: the robot's nonce did not come in time; never of an emergency stop.
+            RequestRefusedError: refused; carries the reason.
+            NoAnswerError: no answer in time, or the robot's nonce did not come in time.
+            NotFoundError: the robot is not there.
         """
-        header = self._header(lease) if order is Order.ESTOP else await self._answered(lease)
-        self._put(REQ_CONTROL, ControlRequest(**header, order=order))
+        if order in OVERTAKING:
+            self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
+            header = self._header(1.0)
+        else:
+            header = await self._answered(1.0)
+        return wire.decode(GATE, await self._call(order.value, header, ORDER_TIMEOUT))
 
     async def goal(
-        self, goal: Pose2D, frame: str = "map", lease: float = 1.0, waypoints: Sequence[Waypoint] = ()
-    ) -> None:
-        """Ask to drive to a pose in ``frame``, by way of places. Raises as ``drive`` does."""
-        header = await self._answered(lease)
-        self._put(REQ_GOAL, GoalRequest(**header, frame=frame, goal=goal, waypoints=tuple(waypoints)))
-
-    async def go(
         self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
     ) -> dict[str, Any]:
-        """Ask to drive to x, y (m), yaw (rad), and wait for the first route; returns the goal's ``number``.
+        """Request to drive to x, y (m), yaw (rad), and wait for the first route; returns the goal's ``number``.
 
-        ``via`` are places to be passed, x, y and, if it matters, yaw. Progress is ``plan/goal``. Numbers that are not
+        ``via`` are waypoints, x, y and optionally yaw. Progress is published on ``plan/goal``. Numbers that are not
         finite reach the robot, which refuses them by name.
 
         Raises:
-            RequestRefusedError: no way leads there, or why the robot does not go.
+            RequestRefusedError: no route to the goal, or why the robot does not drive.
             NotFoundError: the robot is not there, or has no planner.
             NoAnswerError: no answer in time.
         """
@@ -245,11 +257,11 @@ class TruckClient:
         )
 
     async def goal_control(self, order: GoalOrder) -> None:
-        """Pause, resume or cancel the goal. Raises as ``go`` does."""
+        """Pause, resume or cancel the goal. Raises as ``goal`` does."""
         await self.call("goal_control", {**await self._answered(1.0), "order": order})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
-        """Ask to follow a path computed here. Raises as ``drive`` does."""
+        """Request to follow a path computed here. Raises as ``drive`` does."""
         self._put(REQ_PATH, PathRequest(**await self._answered(lease), frame=path.frame, path=path))
 
     def _put(self, topic: Topic[M], message: M) -> None:
@@ -327,14 +339,14 @@ class TruckClient:
     def _unsubscribe(self, mailbox: Mailbox[Any]) -> None:
         self._subscriptions.pop(mailbox)()
 
-    async def _get(self, key: str, payload: str | None = None) -> list[zenoh.Reply]:
+    async def _get(self, key: str, payload: str | None = None, timeout: float | None = None) -> list[zenoh.Reply]:
         return await self._collect(
             lambda handler: self._open_session().get(
                 key,
                 handler,
                 payload=payload,
                 encoding=None if payload is None else "application/json",
-                timeout=self._timeout,
+                timeout=timeout or self._timeout,
             )
         )
 

@@ -1,18 +1,99 @@
-"""Whether a request from outside counts: nonce, sequence, freshness and role. The gate and the planners ask alike."""
+"""Requests from outside: parsing, authentication by nonce, sequence, freshness and role, and who sends orders.
 
+The gate and the planners check requests by the same rules, whether they come by topic or by remote call.
+"""
+
+import json
 from collections.abc import Collection
-from typing import Final
+from typing import Any, Final, Protocol, TypeVar
+
+from pydantic import ValidationError
 
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.mailbox import Delivery, Mailbox
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Request, Role
+from monstertruck_schemas.req import Order, Request, Role
 from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import Topic
+
+M = TypeVar("M", bound=Message)
+R = TypeVar("R", bound=Request)
 
 OPERATORS: Final = frozenset({Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
-"""Roles with a human behind them: may arm and reset."""
+"""Roles of human operators: may arm and reset."""
 
 MAX_SOURCES: Final = 64
-"""Names remembered for each kind of request; the one heard least recently is forgotten for a new one."""
+"""Sources kept for each kind of request; the least recent one is dropped for a new one."""
+
+OVERTAKING: Final = frozenset({Order.ESTOP, Order.STOP})
+"""Orders that are published on ``req/control`` first: a topic waits for no other call."""
+
+
+class Operator(Protocol):
+    """Client of one robot that gives orders."""
+
+    source: str
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """Subscribe to a topic."""
+        ...
+
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Call ``rpc`` with a JSON object; returns its answer."""
+        ...
+
+    async def order(self, order: Order) -> GateState:
+        """Give an order and wait until it is carried out; returns the gate's state then.
+
+        Raises:
+            RequestRefusedError: refused; carries the reason.
+            NoAnswerError: no answer in time.
+            NotFoundError: the robot is not there.
+        """
+        ...
+
+    async def arm(self) -> GateState:
+        """Allow driving; answered once armed. Raises as ``order`` does."""
+        return await self.order(Order.ARM)
+
+    async def disarm(self) -> GateState:
+        """Stop and forbid driving; answered once disarmed. Raises as ``order`` does."""
+        return await self.order(Order.DISARM)
+
+    async def estop(self) -> GateState:
+        """Emergency stop, latched; answered once latched. Raises as ``order`` does."""
+        return await self.order(Order.ESTOP)
+
+    async def reset(self) -> GateState:
+        """Clear the emergency stop; answered once disarmed. Raises as ``order`` does."""
+        return await self.order(Order.RESET)
+
+    async def stop(self) -> GateState:
+        """Stop driving by the ordinary ramp; answered once at rest. Raises as ``order`` does."""
+        return await self.order(Order.STOP)
+
+
+def parse_request(model: type[R], payload: dict[str, Any]) -> R:
+    """The request a remote call carries.
+
+    Args:
+        model: its kind.
+        payload: JSON object.
+
+    Raises:
+        RequestRefusedError: a number is not finite.
+        InputError: it is no such request; the text names the first wrong field.
+    """
+    try:
+        return model.model_validate_json(json.dumps(payload))
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+        if detail["type"] == "finite_number":
+            raise RequestRefusedError(Reason.NOT_FINITE, text) from None
+        raise InputError(text) from None
 
 
 class Sequences:
@@ -22,12 +103,12 @@ class Sequences:
         self._newest: dict[str, int] = {}
 
     def accept(self, request: Request, nonce: str, keep: Collection[str] = ()) -> Reason:
-        """OK, or why the request does not belong to this run; an accepted sequence number is used up.
+        """OK, or why the request does not belong to this run; an accepted sequence number is not accepted again.
 
         Args:
             request: what was asked.
             nonce: what it must carry.
-            keep: sources that must not be forgotten; with all places taken by them a new one is refused.
+            keep: sources that must not be dropped; if all places are theirs, a new one is refused.
         """
         source = request.source
         if request.nonce != nonce:
@@ -45,20 +126,20 @@ class Sequences:
 
 
 def freshness(request: Request, now: int, limit: float) -> Reason:
-    """OK, or LEASE_EXPIRED for a request whose sender's newest gate state is older than ``limit`` s, or not told."""
+    """OK, or LEASE_EXPIRED for a request whose gate stamp is missing or older than ``limit`` s."""
     known = request.gate_stamp
     return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
 
 
 def refusal(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> Reason:
-    """OK, or why a request to the planners does not count: the authority is that of driving.
+    """OK, or why a request to the planners is refused; the rules are those of driving.
 
     Args:
         request: what was asked.
         gate: newest state of the gate.
         sequences: of this kind of requests.
         now: ns.
-        max_age: greatest age of what its sender knew of the gate, s; None for what sets nothing in motion.
+        max_age: greatest age of its gate stamp, s; None for a request that moves nothing.
     """
     reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce)
     if reason is Reason.OK and max_age is not None:

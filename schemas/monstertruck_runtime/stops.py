@@ -6,17 +6,19 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.event import Cause, Measurement, Stop
 
 
-def sentence(causes: Sequence[Cause], now: int) -> str:
+def causes_text(causes: Sequence[Cause], now: int) -> str:
     """All causes in one line, each followed by what was behind it.
 
     Args:
         causes: as in ``Stop``.
         now: instant the durations count to, ns.
     """
-    return "; ".join(", because ".join(clause(cause, now) for cause in chain(causes, head)) for head in heads(causes))
+    return "; ".join(
+        ", because ".join(cause_text(cause, now) for cause in chain(causes, head)) for head in heads(causes)
+    )
 
 
-def story(stop: Stop, now: int) -> list[str]:
+def stop_lines(stop: Stop, now: int) -> list[str]:
     """The stop in a few lines: what and when, then the causes, each indented below what it led to.
 
     Args:
@@ -26,10 +28,10 @@ def story(stop: Stop, now: int) -> list[str]:
     how = "quick stop" if stop.quick else "stop"
     speed = "" if stop.speed is None else f" at {abs(stop.speed):.2f} m/s"
     driver = "" if stop.holder is None else f", driver {stop.holder}"
-    lines = [f"{how}{speed} {span((now - stop.stamp) / SECOND)} ago{driver}"]
+    lines = [f"{how}{speed} {duration_text((now - stop.stamp) / SECOND)} ago{driver}"]
     for head in heads(stop.causes):
         for depth, cause in enumerate(chain(stop.causes, head)):
-            lines.append("  " * depth + ("because " if depth else "") + clause(cause, stop.stamp))
+            lines.append("  " * depth + ("because " if depth else "") + cause_text(cause, stop.stamp))
     if stop.black_box is not None:
         lines.append(f"black box {stop.black_box}")
     return lines
@@ -53,30 +55,30 @@ def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
         cause = causes[cause.because]
 
 
-def clause(cause: Cause, now: int) -> str:
+def cause_text(cause: Cause, now: int) -> str:
     """One cause: ``no fresh lidar scan (for 10 ms, age 260 ms, limit 250 ms)``."""
     lasted = (now - cause.since) / SECOND
-    notes = [f"for {span(lasted)}"] if lasted >= 1e-3 else []
-    notes += [figure(measurement) for measurement in cause.measurements]
+    notes = [f"for {duration_text(lasted)}"] if lasted >= 1e-3 else []
+    notes += [measurement_text(measurement) for measurement in cause.measurements]
     return cause.text + (f" ({', '.join(notes)})" if notes else "")
 
 
-def figure(measurement: Measurement) -> str:
+def measurement_text(measurement: Measurement) -> str:
     """One measurement with its limit and, where it is not the age itself, its age."""
-    text = f"{measurement.name} {_quantity(measurement.value, measurement.unit)}"
+    text = f"{measurement.name} {_quantity_text(measurement.value, measurement.unit)}"
     if measurement.limit is not None:
-        text += f", limit {_quantity(measurement.limit, measurement.unit)}"
-    return text if measurement.age is None else f"{text}, {span(measurement.age)} old"
+        text += f", limit {_quantity_text(measurement.limit, measurement.unit)}"
+    return text if measurement.age is None else f"{text}, {duration_text(measurement.age)} old"
 
 
-def span(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """A duration: ms below a second, then s, then minutes."""
     if seconds < 1.0:
         return f"{seconds * 1e3:.0f} ms"
     return f"{seconds:.1f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
-def _quantity(value: float | None, unit: str) -> str:
+def _quantity_text(value: float | None, unit: str) -> str:
     if value is None:
         return "unknown"
-    return span(value) if unit == "s" else f"{value:.3g} {unit}".rstrip()
+    return duration_text(value) if unit == "s" else f"{value:.3g} {unit}".rstrip()

@@ -10,7 +10,6 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -31,7 +30,7 @@ class Trip:
     def __init__(self, rig: VirtualRig) -> None:
         self.rig = rig
         self.clock: VirtualClock = rig.clock
-        self.operator = LocalOperator(rig.bus, rig.clock)
+        self.operator = LocalOperator(rig.daemon, rig.clock)
         self.states = rig.bus.subscribe(topics.GOAL, fifo(4096))
         self.events = rig.bus.subscribe(topics.EVENT, fifo(4096))
         self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
@@ -54,7 +53,7 @@ class Trip:
         await self.rig.daemon.rpc.call("goal_control", {**self.header(), "order": order})
 
     async def arm(self) -> None:
-        await self.operator.order(Order.ARM)
+        await self.operator.arm()
 
     async def end(self, limit: float = 200.0) -> GoalState:
         async with self.clock.deadline(limit):

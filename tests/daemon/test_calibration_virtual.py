@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import ConfigError, InputError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_sim.world.obstacles import Box
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName
 from monstertruckd.config.load import load_config
@@ -148,9 +148,10 @@ class Falling(LocalTruck):
         if not self.silent:
             await super().drive(speed, front, rear, lease)
 
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        if not self.silent:
-            await super().order(order, lease)
+    async def order(self, order: Order) -> GateState:
+        if self.silent:
+            raise NoAnswerError("silent")
+        return await super().order(order)
 
 
 class Bench:
@@ -164,7 +165,7 @@ class Bench:
         self.files = {path: path.read_bytes() for path in self.store.files()}
         self.gate = rig.bus.subscribe(topics.GATE, latest())
         self.drives = rig.bus.subscribe(topics.CMD_DRIVE, fifo(1 << 14))
-        self.operator = LocalOperator(rig.bus, clock, "somebody", Role.GAMEPAD)
+        self.operator = LocalOperator(rig.daemon, clock, "somebody", Role.GAMEPAD)
 
     @property
     def speed(self) -> float:
@@ -236,7 +237,7 @@ async def pull_the_steering(bench: Bench, _: asyncio.Task[Any]) -> None:
 
 
 async def emergency_stop(bench: Bench, _: asyncio.Task[Any]) -> None:
-    await bench.operator.order(Order.ESTOP)
+    await bench.operator.estop()
 
 
 async def put_something_before_it(bench: Bench, _: asyncio.Task[Any]) -> None:
@@ -284,13 +285,9 @@ def test_a_wizard_that_falls_silent_is_stopped_by_its_lease(tmp_path: Path):
 class Distant(LocalTruck):
     """Orders take a while to arrive."""
 
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        late = asyncio.create_task(self._arrive(order, lease))
-        self.late = [*getattr(self, "late", []), late]
-
-    async def _arrive(self, order: Order, lease: float) -> None:
+    async def order(self, order: Order) -> GateState:
         await self._clock.sleep(0.2)
-        await super().order(order, lease)
+        return await super().order(order)
 
 
 def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path):
@@ -303,7 +300,6 @@ def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path
             truck, panel = Distant(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
             wizard = drive_wizard(DriveWizard(runs=3, metres=0.5))
             result, _ = await calibrate(wizard, truck, panel, clock, config, {})
-            await asyncio.gather(*truck.late)
             return result
 
     assert len(run_virtual(main).estimates) == 4
@@ -316,7 +312,7 @@ def test_a_truck_that_somebody_has_armed_is_left_alone(tmp_path: Path):
         rig = VirtualRig(config, clock)
         async with rig.running():
             await clock.sleep(3.0)
-            await LocalOperator(rig.daemon.bus, clock).order(Order.ARM)
+            await LocalOperator(rig.daemon, clock).arm()
             await clock.sleep(0.2)
             truck, panel = LocalTruck(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
             with pytest.raises(RequestRefusedError, match="armed already") as refusal:

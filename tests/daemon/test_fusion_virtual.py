@@ -9,7 +9,6 @@ import pytest
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
-from monstertruck_schemas.req import Order
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -33,10 +32,10 @@ def drive() -> dict:
             topic.name: rig.bus.subscribe(topic, fifo(20_000))
             for topic in (topics.POSE, topics.ODOMETRY, topics.SCAN_MOTION, topics.EVENT)
         }
-        operator = LocalOperator(rig.bus, clock)
+        operator = LocalOperator(rig.daemon, clock)
         async with rig.running():
             await clock.sleep(1.5)
-            await operator.order(Order.ARM)
+            await operator.arm()
             await clock.sleep(SECONDS)
         return {**{name: box.drain() for name, box in boxes.items()}, "truth": rig.truth.array()}
 

@@ -36,7 +36,7 @@ def drive(name: str) -> tuple[Lap, np.ndarray, Odometry, VirtualRig]:
         rig = VirtualRig(config, clock)
         with rig.bus.subscribe(topics.ODOMETRY, latest()) as odometry:
             async with rig.running():
-                lap = await drive_lap(LocalOperator(rig.bus, clock), clock, limit=40)
+                lap = await drive_lap(LocalOperator(rig.daemon, clock), clock, limit=40)
                 await clock.sleep(0.5)
             assert odometry.latest is not None
             return lap, rig.truth.array(), odometry.latest, rig
@@ -130,7 +130,7 @@ def test_a_lap_that_a_stop_interrupts_is_driven_to_its_end():
 
         async with rig.running(), asyncio.TaskGroup() as group:
             group.create_task(unplug())
-            return await drive_lap(LocalOperator(rig.bus, clock), clock, limit=60)
+            return await drive_lap(LocalOperator(rig.daemon, clock), clock, limit=60)
 
     lap = run_virtual(main, start=SECOND)
     assert lap.outcome is Reason.GOAL_REACHED

@@ -11,7 +11,6 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import LocalisationStatus
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.config.load import load_config
@@ -39,10 +38,10 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> dict:
             for topic in (topics.POSE, topics.ODOMETRY, topics.MAP, topics.MAP_TILES, topics.SLAM, topics.EVENT)
         }
         frames = rig.bus.subscribe(topics.TRANSFORMS, latest())
-        operator = LocalOperator(rig.bus, clock)
+        operator = LocalOperator(rig.daemon, clock)
         async with rig.running():
             await clock.sleep(1.5)
-            await operator.order(Order.ARM)
+            await operator.arm()
             await clock.sleep(SECONDS)
         return {
             **{name: box.drain() for name, box in boxes.items()},

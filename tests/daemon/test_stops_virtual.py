@@ -1,6 +1,8 @@
 """Stops of the whole daemon, told with their causes and kept in black boxes, on the virtual clock."""
 
+import asyncio
 import os
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,11 +10,11 @@ from types import SimpleNamespace
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Stop
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
 from monstertruckd.recorder.black_box import black_boxes
@@ -37,7 +39,7 @@ class Drive:
     def __init__(self, rig: VirtualRig) -> None:
         self.rig = rig
         self.clock: VirtualClock = rig.clock
-        self.operator = LocalOperator(rig.bus, rig.clock)
+        self.operator = LocalOperator(rig.daemon, rig.clock)
         self._stops = rig.bus.subscribe(topics.STOP, fifo(64))
         self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
         self.stops: list[Stop] = []
@@ -45,7 +47,8 @@ class Drive:
     async def begin(self, seconds: float = 1.5) -> None:
         """Arm as soon as that is possible, then drive for so long."""
         for _ in range(200):
-            await self.operator.order(Order.ARM)
+            with suppress(RequestRefusedError):
+                await self.operator.arm()
             await self.clock.sleep(0.1)
             state = self._gate.latest
             if state is not None and state.mode is GateMode.DRIVING:
@@ -100,7 +103,9 @@ def shutdown_after_estop(folder: Path) -> tuple[str, bytes]:
         drive = Drive(rig)
         async with rig.running():
             await drive.begin()
-            await drive.operator.order(Order.ESTOP)
+            stopping = asyncio.create_task(drive.operator.estop())
+            await asyncio.sleep(0)  # published, not answered yet
+        stopping.cancel()
         (stop,) = drive.news()
         assert (stop.reason, stop.quick) == (Reason.ESTOP_REQUESTED, True)
         return rig.daemon.digest.hexdigest()

@@ -12,7 +12,6 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import LocalisationStatus, OdometryHealth
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruck_sim.world.config import Iron
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -71,12 +70,12 @@ def troubled() -> dict:
             topic.name: rig.bus.subscribe(topic, fifo(20_000))
             for topic in (topics.ODOMETRY, topics.FUSION, topics.EVENT)
         }
-        operator = LocalOperator(rig.bus, clock)
+        operator = LocalOperator(rig.daemon, clock)
         compass, motor = rig.world.compass, rig.world.motor
         at = {}
         async with rig.running():
             await clock.sleep(1.5)
-            await operator.order(Order.ARM)
+            await operator.arm()
             await clock.sleep(4.0)
             at["iron"], plain = clock.now(), compass._config
             compass._config = plain.model_copy(update={"iron": Iron(hard_x=150.0, hard_y=100.0)})

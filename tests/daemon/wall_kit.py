@@ -15,11 +15,10 @@ import numpy as np
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
-from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.demo.wall import free_endpoint, write_overlay
 
@@ -95,7 +94,8 @@ class Robot:
             async with asyncio.timeout(30):
                 while gate.latest is None or gate.latest.mode is not GateMode.DRIVING:
                     if gate.latest is None or gate.latest.mode is GateMode.DISARMED:
-                        await client.order(Order.ARM)
+                        with contextlib.suppress(RequestRefusedError):
+                            await client.arm()
                     await asyncio.sleep(0.1)
                 while odometry.latest is None or odometry.latest.twist.vx < speed:
                     await asyncio.sleep(0.05)

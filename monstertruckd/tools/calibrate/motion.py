@@ -1,23 +1,20 @@
 """Moves of a wizard: drive requests of an ordinary operator, through the safety gate."""
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from typing import Any, Final, Protocol, TypeVar
+from typing import Final, Protocol
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
-from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
-
-M = TypeVar("M", bound=Message)
 
 PERIOD: Final = 0.05
 """Seconds between two requests."""
@@ -42,25 +39,11 @@ SETTLE: Final = 5.0
 DEPTH: Final = 4096
 
 
-class Truck(Protocol):
-    """What a wizard needs of ``TruckClient``, or of an equivalent in the daemon's process."""
-
-    source: str
-
-    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Follow a topic."""
-        ...
+class Truck(Operator, Protocol):
+    """Client of a truck that a wizard moves."""
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
         """Request a motion."""
-        ...
-
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Arm, disarm, stop."""
-        ...
-
-    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Call a service of the daemon."""
         ...
 
 
@@ -128,11 +111,9 @@ class Mover:
             await run.arm()
             yield
         finally:
-            # If the link is lost, the gate's lease ends without requests.
-            for order in (Order.STOP, Order.DISARM):
-                with suppress(TruckError):
-                    await self._truck.order(order)
-        await run.disarmed()
+            # Without a link the gate stops the truck itself: the lease of the last request expires.
+            with suppress(TruckError):
+                await self._truck.disarm()
 
 
 class _Run:
@@ -172,34 +153,43 @@ class _Run:
             raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
 
     async def arm(self) -> None:
-        """Request standstill for a moment, so that no operator of a lower role drives, and arm.
+        """Request standstill for a moment, so that no lower role can drive, and arm.
 
         Raises:
             RequestRefusedError: the gate refused.
+            NoAnswerError: the gate did not answer.
         """
         end = self._clock.now() + round(ARMING * SECOND)
-        sent = 0
-        while self.state is None or self.state.mode is not GateMode.DRIVING or self.state.holder != self._truck.source:
-            if self._clock.now() > end:
-                reasons = self.state.reasons if self.state is not None else ()
-                why = ", ".join(reason.text for reason in reasons if reason is not Reason.DISARMED)
-                refusal = next((r for r in reasons if r is not Reason.DISARMED), Reason.DISARMED)
-                raise RequestRefusedError(refusal, f"the truck could not be armed: {why or 'no reason given'}")
-            await self._truck.drive(0.0, 0.0, 0.0, LEASE)
-            sent += 1
-            if sent >= REST_REQUESTS and self.state is not None and self.state.mode is GateMode.DISARMED:
-                await self._truck.order(Order.ARM)
-            await self._clock.sleep(PERIOD)
-            self._take()
+        requests = 0
+        refusal: TruckError | None = None
+        arming: asyncio.Task[TruckError | None] | None = None
+        try:
+            while not self._driving():
+                if self._clock.now() > end:
+                    raise refusal or NoAnswerError(f"the gate did not arm the truck within {ARMING:g} s")
+                await self._truck.drive(0.0, 0.0, 0.0, LEASE)
+                requests += 1
+                if arming is not None and arming.done():
+                    refusal, arming = arming.result(), None
+                elif arming is None and requests >= REST_REQUESTS and self.state is not None and not self.state.mode.active:
+                    arming = asyncio.create_task(self._try_to_arm())
+                await self._clock.sleep(PERIOD)
+                self._take()
+        finally:
+            if arming is not None:
+                arming.cancel()
 
-    async def disarmed(self) -> None:
-        """Wait until the gate has disarmed, so that the next move does not see the state of this one."""
-        end = self._clock.now() + round(ARMING * SECOND)
-        while self.state is None or self.state.mode.active:
-            if self._clock.now() > end:
-                raise NoAnswerError(f"the gate did not disarm the truck within {ARMING:g} s")
-            await self._clock.sleep(PERIOD)
-            self._take()
+    async def _try_to_arm(self) -> TruckError | None:
+        """None, or why it failed."""
+        try:
+            await self._truck.arm()
+        except TruckError as error:
+            return error
+        return None
+
+    def _driving(self) -> bool:
+        state = self.state
+        return state is not None and state.mode is GateMode.DRIVING and state.holder == self._truck.source
 
     async def hold(self, speed: float, front: float, rear: float, seconds: float) -> None:
         """Request one motion for ``seconds``.
@@ -240,7 +230,7 @@ class _Run:
 
     def _check(self) -> None:
         state = self.state
-        if state is None or (state.mode is GateMode.DRIVING and state.holder == self._truck.source):
+        if state is None or self._driving():
             return
         reasons = [reason for reason in state.reasons if reason is not Reason.DISARMED]
         if not reasons and state.mode is GateMode.DRIVING:

@@ -34,6 +34,8 @@ class Stream:
     """Seconds to the robot and back; None = no answer."""
     trouble: str = ""
     """Why nothing can be sent."""
+    refusal: str = ""
+    """Why the newest order was refused."""
 
 
 def draw(state: ScreenState, teleop: Teleop, stream: Stream, width: int) -> RenderableType:
@@ -52,12 +54,14 @@ def _controls(state: ScreenState, teleop: Teleop, stream: Stream) -> Panel:
     body.add_row(table)
     body.add_row(_modes(teleop))
     body.add_row(Text(HELP, style="dim", no_wrap=True, overflow="ellipsis"))
-    body.add_row(Text(stream.trouble, style="bold red") if stream.trouble else _hint(state))
+    body.add_row(_message(state, stream))
     return Panel(body, title="drive: moves only while a key is held", border_style="dim")
 
 
-def _hint(state: ScreenState) -> Text:
-    """What to press before anything moves."""
+def _message(state: ScreenState, stream: Stream) -> Text:
+    """What is wrong, or the key to press before anything moves."""
+    if text := stream.trouble or stream.refusal:
+        return Text(text, style="bold red", no_wrap=True, overflow="ellipsis")
     mode = None if state.gate is None else state.gate.mode
     return Text(HINTS.get(mode, ""), style="bold yellow")
 

@@ -3,7 +3,6 @@
 import asyncio
 import os
 import signal
-from collections.abc import Coroutine
 from contextlib import suppress
 from typing import IO, Any, Final
 
@@ -26,9 +25,11 @@ RATE: Final = 20.0
 LEASE: Final = 0.25
 """Seconds a request stands."""
 TAKE_HOLD: Final = 0.15
-"""Seconds of neutral requests before an order to arm: a live one is what keeps a tracker from driving off."""
+"""Seconds of neutral requests before an order to arm: they keep a tracker from driving off."""
 STALLED: Final = 0.3
-"""After a longer pause of this program, s, keys read late may have been let go long ago."""
+"""After a longer pause of this program, s, keys that are read late may have been released meanwhile."""
+END: Final = 1.0
+"""Seconds to wait at the end for the truck to stop."""
 PING: Final = 1.0
 """Seconds between two measurements of the round trip."""
 
@@ -51,11 +52,10 @@ class DriveSession:
         self._reader = KeyReader()
         self._commands: asyncio.Queue[Command] = asyncio.Queue()
         self._stream = Stream()
-        self._sending = asyncio.Lock()
         self._arming: asyncio.TimerHandle | None = None
 
     async def run(self, robot: str, endpoint: str) -> None:
-        """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck told to stop.
+        """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck stopped.
 
         Raises:
             NotFoundError: no robot answers there.
@@ -112,18 +112,32 @@ class DriveSession:
         self._commands.put_nowait(Order.ARM)
 
     def _hold_arming(self) -> None:
-        """Forget an order to arm that was not sent yet."""
+        """Cancel an order to arm that was not sent yet."""
         if self._arming is not None:
             self._arming.cancel()
             self._arming = None
 
     async def _obey(self, client: TruckClient) -> None:
-        """Carry out orders as they come; returns at the end."""
-        while (command := await self._commands.get()) != "end":
-            await self._send(client.order(command))
+        """Give the keys' orders, each without waiting for the outcome of the one before; returns at the end."""
+        orders: set[asyncio.Task[None]] = set()
+        try:
+            while (command := await self._commands.get()) != "end":
+                order = asyncio.create_task(self._order(client, command))
+                orders.add(order)
+                order.add_done_callback(orders.discard)
+        finally:
+            for order in orders:
+                order.cancel()
+
+    async def _order(self, client: TruckClient, order: Order) -> None:
+        self._stream.refusal = ""
+        try:
+            await client.order(order)
+        except TruckError as error:
+            self._stream.refusal = f"{order.value} refused: {error}"
 
     async def _ask(self, client: TruckClient) -> None:
-        """The deadman's stream: requests while keys stand, silence otherwise."""
+        """Deadman switch: send requests while keys are held, nothing otherwise."""
         before = self._clock.now()
         while True:
             await self._clock.sleep(1.0 / RATE)
@@ -136,15 +150,11 @@ class DriveSession:
 
     async def _request(self, client: TruckClient, request: TeleopRequest | None) -> None:
         self._stream.request = request
-        if request is not None:
-            await self._send(client.drive(request.speed, request.front, request.rear, lease=LEASE))
-
-    async def _send(self, sending: Coroutine[Any, Any, None]) -> None:
-        """A silent robot is shown instead of ending the session: it may come back."""
+        if request is None:
+            return
         try:
-            async with self._sending:
-                await sending
-        except TruckError as error:
+            await client.drive(request.speed, request.front, request.rear, lease=LEASE)
+        except TruckError as error:  # shown: the robot may come back
             self._stream.trouble = str(error)
         else:
             self._stream.trouble = ""
@@ -174,5 +184,6 @@ class DriveSession:
                 await self._clock.sleep(PERIOD)
 
     async def _stop(self, client: TruckClient) -> None:
-        with suppress(TruckError):
-            await client.order(Order.STOP)
+        with suppress(TruckError, TimeoutError):
+            async with self._clock.deadline(END):
+                await client.stop()

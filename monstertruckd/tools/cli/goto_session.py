@@ -1,52 +1,35 @@
-"""One drive to a goal or along a path, seen from outside."""
+"""One drive to a goal or along a path, as a client of the robot."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
-from monstertruck_schemas.base import Message
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalOrder, Order
+from monstertruck_schemas.req import GoalOrder
 from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER, Topic
-from monstertruckd.tools.cli.answer import give
+from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER
 from monstertruckd.tools.cli.output import progress, remark
 
-M = TypeVar("M", bound=Message)
-
 LOOK: Final = 0.5
-"""Seconds between two looks at the gate."""
+"""Half the period of reports why the truck stands, s."""
 PATIENCE: Final = 3.0
-"""Seconds in which a path is taken on or refused."""
+"""Seconds in which a path is accepted or refused."""
 
 
-class Driver(Protocol):
-    """What is needed of a ``TruckClient``."""
+class Driver(Operator, Protocol):
+    """Client of a robot that drives to goals and along paths."""
 
-    source: str
-
-    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Follow a topic."""
-        ...
-
-    async def get_retained(self, topic: Topic[M]) -> M | None:
-        """Newest message of a retained topic."""
-        ...
-
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Send an order."""
-        ...
-
-    async def go(
+    async def goal(
         self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
     ) -> dict[str, Any]:
-        """Ask to drive to a pose, by way of places."""
+        """Request to drive to a pose by way of waypoints."""
         ...
 
     async def goal_control(self, order: GoalOrder) -> None:
@@ -54,7 +37,7 @@ class Driver(Protocol):
         ...
 
     async def path(self, path: Path, lease: float = 1.0) -> None:
-        """Ask to follow a path."""
+        """Request to follow a path."""
         ...
 
 
@@ -86,7 +69,7 @@ async def drive_to(
         NoAnswerError: the robot does not answer.
     """
     with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
-        number = int((await driver.go(goal, via=via))["number"])
+        number = int((await driver.goal(goal, via=via))["number"])
         return await _watched(
             driver,
             clock,
@@ -128,13 +111,11 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool) -> Arri
         driver.subscribe(PATH, latest()) as present,
     ):
         await driver.path(path)
-        await _taken_on(driver, clock, events, present, path.name)
-        return await _watched(
-            driver, clock, gate, arm=arm, end=_path_end(clock, states, path.name), undo=lambda: driver.order(Order.STOP)
-        )
+        await _accepted(driver, clock, events, present, path.name)
+        return await _watched(driver, clock, gate, arm=arm, end=_path_end(clock, states, path.name), undo=driver.stop)
 
 
-async def _taken_on(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
+async def _accepted(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
     try:
         async with clock.deadline(PATIENCE):
             while present.latest is None or present.latest.name != name:
@@ -143,7 +124,7 @@ async def _taken_on(driver: Driver, clock: Clock, events: Mailbox[Event], presen
                         raise RequestRefusedError(event.reason, event.text)
                 await clock.sleep(0.05)
     except TimeoutError:
-        raise NoAnswerError(f"the robot did not take on the path within {PATIENCE:g} s") from None
+        raise NoAnswerError(f"the robot did not accept the path within {PATIENCE:g} s") from None
 
 
 async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str) -> Arrival:
@@ -166,16 +147,17 @@ async def _watched(
     *,
     arm: bool,
     end: Awaitable[Arrival],
-    undo: Callable[[], Awaitable[None]],
+    undo: Callable[[], Awaitable[object]],
 ) -> Arrival:
-    """Wait for the end, and say why the truck stands meanwhile; ``undo`` if that is cut short."""
+    """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
     watching = asyncio.create_task(_say_why_it_stands(gate, clock))
     ending = asyncio.ensure_future(end)
     try:
         if arm:
-            answer = await give(driver, clock, Order.ARM)
-            if answer.reason is not Reason.OK:
-                raise RequestRefusedError(answer.reason, f"arm refused: {answer.text}")
+            try:
+                await driver.arm()
+            except RequestRefusedError as error:
+                raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
         return await ending
     except BaseException:
         await undo()

@@ -1,31 +1,81 @@
-"""``arm``, ``disarm``, ``estop``, ``reset``: one order each; the gate's answer is the exit code."""
+"""``arm``, ``disarm``, ``estop``, ``reset``: one order each; its outcome is the exit code."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_schemas.req import Order
+    from monstertruck_schemas.state import GateState
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Outcome of an order."""
+
+    order: "Order"
+    reason: Reason
+    """OK, or why the gate refused."""
+    text: str
+    state: "GateState"
+    """The gate's state after it."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "order": self.order,
+            "accepted": self.reason is Reason.OK,
+            "reason": self.reason,
+            "text": self.text,
+            "mode": self.state.mode,
+            "holder": self.state.holder,
+            "limited_by": self.state.reasons,
+        }
+
+
+async def give(client: "TruckClient", order: "Order") -> Outcome:
+    """Give an order and wait for its outcome.
+
+    Raises:
+        NoAnswerError: no answer in time.
+        NotFoundError: the robot is not there.
+    """
+    from monstertruck_schemas.topics import GATE
+
+    try:
+        return Outcome(order, Reason.OK, Reason.OK.text, await client.order(order))
+    except RequestRefusedError as error:
+        state = await client.get_retained(GATE)
+        if state is None:
+            raise NoAnswerError("the robot does not publish its gate state") from error
+        return Outcome(order, error.refusal, str(error), state)
 
 
 def _run(name: str, robot: str, endpoint: str, *, json_output: bool) -> None:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import Order
-    from monstertruckd.tools.cli.answer import Answer, give
 
-    async def main(clock: Clock) -> Answer:
+    async def main(clock: Clock) -> Outcome:
         async with TruckClient(robot, endpoint, clock=clock) as client:
-            return await give(client, clock, Order(name))
+            return await give(client, Order(name))
 
-    answer = run_wall(main)
+    outcome = run_wall(main)
     if json_output:
-        print_json(answer.as_json())
-    elif answer.reason is Reason.OK:
-        held = ", ".join(r.text for r in answer.state.reasons if r not in (Reason.DISARMED, Reason.ESTOPPED))
-        print(answer.state.mode.value + (f"; {held}" if held else ""))
-    finish(answer.reason, f"{name} refused: {answer.text}")
+        print_json(outcome.as_json())
+    elif outcome.reason is Reason.OK:
+        held = ", ".join(r.text for r in outcome.state.reasons if r not in (Reason.DISARMED, Reason.ESTOPPED))
+        print(outcome.state.mode.value + (f"; {held}" if held else ""))
+    finish(outcome.reason, f"{name} refused: {outcome.text}")
 
 
 def arm(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:
-    """Allow the truck to move: whoever asks for it drives from now on, a configured path too."""
+    """Allow the truck to move: any source that requests it may drive then, a configured path too."""
     _run("arm", robot, endpoint, json_output=json_output)
 
 

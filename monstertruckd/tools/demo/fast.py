@@ -27,7 +27,7 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
         begin_wall, begin = wall.now(), clock.now()
         gc.freeze()  # as the daemon's own start does: what is loaded stays
         async with rig.running():
-            lap = await drive_lap(LocalOperator(rig.bus, clock), clock)
+            lap = await drive_lap(LocalOperator(rig.daemon, clock), clock)
             await clock.sleep(1.0)
             speed = (clock.now() - begin) / (wall.now() - begin_wall)
         return rig, lap, speed

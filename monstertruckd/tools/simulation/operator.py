@@ -1,21 +1,24 @@
-"""Somebody who arms the truck and watches a lap, over Zenoh or beside the bus."""
+"""An operator that arms the truck and watches a lap, over Zenoh or inside the daemon's process."""
 
+import json
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import NoAnswerError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
+from monstertruck_runtime.requests import OVERTAKING, Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
-from monstertruckd.bus.local import Bus
+from monstertruckd.daemon import Daemon
 
 M = TypeVar("M", bound=Message)
 
@@ -23,50 +26,45 @@ INTERRUPTIONS = 20
 """Times in a lap that the truck is armed again after a stop; more are a fault, not a busy computer."""
 
 
-class Operator(Protocol):
-    """What ``TruckClient`` and ``LocalOperator`` have in common."""
+class LocalOperator(Operator):
+    """An operator inside the daemon's process: for the virtual clock, on which nothing comes over Zenoh."""
 
-    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Follow a topic."""
-        ...
-
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Arm, disarm, stop."""
-        ...
-
-
-class LocalOperator:
-    """An operator inside the daemon's process: for the virtual clock, where nothing comes over Zenoh."""
-
-    def __init__(self, bus: Bus, clock: Clock, source: str = "operator", role: Role = Role.STATION) -> None:
-        self._bus = bus
+    def __init__(self, daemon: Daemon, clock: Clock, source: str = "operator", role: Role = Role.STATION) -> None:
+        self.source = source
+        self._daemon = daemon
         self._clock = clock
-        self._source = source
         self._role = role
         self._seq = 0
-        self._gate = bus.subscribe(topics.GATE, latest())
+        self._gate = daemon.bus.subscribe(topics.GATE, latest())
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Follow a topic of this process."""
-        return self._bus.subscribe(topic, delivery)
+        """Subscribe to a topic of this process."""
+        return self._daemon.bus.subscribe(topic, delivery)
 
-    async def order(self, order: Order, lease: float = 1.0) -> None:
-        """Send a control request with the robot's present nonce."""
-        self._seq += 1
-        header = await self._header(self._seq, self._role, lease)
-        self._bus.inject(topics.REQ_CONTROL, ControlRequest(**header, order=order))
+    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Call ``rpc`` of the daemon."""
+        return await self._daemon.rpc.call(rpc, payload or {})
 
-    async def _header(self, seq: int, role: Role, lease: float) -> dict[str, Any]:
-        """What every request begins with, once the gate has told its nonce."""
+    async def order(self, order: Order) -> GateState:
+        """Give an order as ``TruckClient.order`` does."""
+        if order in OVERTAKING:
+            request = ControlRequest.model_validate_json(json.dumps({**await self.header(), "order": order}))
+            self._daemon.bus.inject(topics.REQ_CONTROL, request)
+        answer = await self.call(order.value, await self.header())
+        return wire.decode(topics.GATE, json.dumps(answer).encode())
+
+    async def header(self, lease: float = 1.0) -> dict[str, Any]:
+        """The header of the next request, once the gate has published its nonce."""
         while self._gate.latest is None:
             await self._gate.next()
+        self._seq += 1
         now, gate = self._clock.now(), self._gate.latest
         return {
             "stamp": now,
             "received": now,
-            "seq": seq,
-            "source": self._source,
-            "role": role,
+            "seq": self._seq,
+            "source": self.source,
+            "role": self._role,
             "lease": lease,
             "nonce": gate.nonce,
             "gate_stamp": gate.stamp,
@@ -75,7 +73,7 @@ class LocalOperator:
 
 @dataclass(frozen=True, slots=True)
 class Lap:
-    """What the tracker said about one lap."""
+    """What the tracker reported about one lap."""
 
     outcome: Reason
     start: int
@@ -102,7 +100,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
     """Arm the truck, watch the tracker drive its path to the end, disarm; after a stop that disarms it, arm it again.
 
     Args:
-        operator: who gives the orders.
+        operator: gives the orders.
         clock: time.
         patience: seconds to wait until the truck can be armed.
         limit: seconds the path may take.
@@ -115,7 +113,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
         operator.subscribe(topics.STOP, latest()) as stop,
         operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
     ):
-        await _arm(operator, clock, gate, patience)
+        await _arm(operator, clock, patience)
         start = clock.now()
         cross_track: list[float] = []
         interruptions: list[Reason] = []
@@ -127,25 +125,30 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
                         continue
                     cross_track.append(report.cross_track)
                     if report.outcome is not Reason.DRIVING and report.along > 0:
-                        told = (np.array(cross_track), tuple(interruptions))
-                        return Lap(report.outcome, start, report.stamp, *told)
+                        return Lap(report.outcome, start, report.stamp, np.array(cross_track), tuple(interruptions))
                     state = gate.latest
                     if state is not None and not state.mode.active and len(interruptions) < INTERRUPTIONS:
                         interruptions.append(stop.latest.reason if stop.latest is not None else Reason.DISARMED)
-                        await _arm(operator, clock, gate, patience)
+                        await _arm(operator, clock, patience)
         except TimeoutError:
             held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""
             raise NoAnswerError(f"path not finished within {limit:g} s ({held or 'nothing held the truck'})") from None
         finally:
-            await operator.order(Order.DISARM)
+            await operator.disarm()
 
 
-async def _arm(operator: Operator, clock: Clock, gate: Mailbox[GateState], patience: float) -> None:
+async def _arm(operator: Operator, clock: Clock, patience: float) -> None:
+    refusal = ""
     try:
         async with clock.deadline(patience):
-            while gate.latest is None or not gate.latest.mode.active:
-                await operator.order(Order.ARM)
+            while True:
+                try:
+                    await operator.arm()
+                except (RequestRefusedError, NoAnswerError) as error:
+                    refusal = str(error)
+                else:
+                    return
                 await clock.sleep(0.25)
     except TimeoutError:
-        held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else "no gate state seen"
-        raise NoAnswerError(f"the truck could not be armed within {patience:g} s: {held}") from None
+        text = f"the truck could not be armed within {patience:g} s: {refusal or 'no answer'}"
+        raise NoAnswerError(text) from None

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
-from monstertruck_runtime.stops import story
+from monstertruck_runtime.stops import stop_lines
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
@@ -72,7 +72,7 @@ class ScreenState:
         """The newest stop in a few lines, while it still holds the truck; nothing otherwise."""
         if self.stop is None or self.gate is None or self.gate.speed_limit > 0:
             return []
-        return story(self.stop, self.gate.stamp)
+        return stop_lines(self.stop, self.gate.stamp)
 
     def take(self, message: object) -> None:
         """Remember ``message`` if the screen shows its kind."""

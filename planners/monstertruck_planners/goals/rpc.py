@@ -1,23 +1,17 @@
 """Goals by remote call: unlike a request by topic, a call is answered."""
 
-import json
-from typing import Any, Final, TypeVar
-
-from pydantic import ValidationError
+from typing import Any, Final
 
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import RpcRegistry
-from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalControl, GoalRequest, Request
+from monstertruck_runtime.requests import parse_request
+from monstertruck_schemas.req import GoalControl, GoalRequest
 
 GOAL: Final = "goal"
 CONTROL: Final = "goal_control"
 PATIENCE: Final = 4.0
 """Seconds to wait for the first route; the goal is pursued further."""
-
-R = TypeVar("R", bound=Request)
 
 
 def register(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
@@ -30,7 +24,7 @@ def register(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
     """
 
     async def goal(payload: dict[str, Any]) -> dict[str, Any]:
-        number = service.take(_request(GoalRequest, payload))
+        number = service.take(parse_request(GoalRequest, payload))
         try:
             async with clock.deadline(PATIENCE):
                 state = await service.settled(number)
@@ -39,25 +33,8 @@ def register(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
         return {"number": number, "planned": True, "length": state.remaining}
 
     async def control(payload: dict[str, Any]) -> dict[str, Any]:
-        service.control(_request(GoalControl, payload))
+        service.control(parse_request(GoalControl, payload))
         return {}
 
     rpc.register(GOAL, goal)
     rpc.register(CONTROL, control)
-
-
-def _request(model: type[R], payload: dict[str, Any]) -> R:
-    """A request from outside.
-
-    Raises:
-        RequestRefusedError: a number is not finite.
-        InputError: it is none.
-    """
-    try:
-        return model.model_validate_json(json.dumps(payload))
-    except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
-        if detail["type"] == "finite_number":
-            raise RequestRefusedError(Reason.NOT_FINITE, text) from None
-        raise InputError(text) from None

@@ -123,7 +123,8 @@ class Rig:
 
     def order(self, order, source="ann", role=Role.GAMEPAD, **more):
         fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
-        return self.gate.control(ControlRequest(source=source, role=role, lease=1.0, order=order, **fields), self.now)
+        request = ControlRequest(source=source, role=role, lease=1.0, order=order, **fields)
+        return self.gate.control(request, self.now).reason
 
     def sense(self):
         """Every sensor that is not silent delivers now."""

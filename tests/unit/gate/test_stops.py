@@ -3,7 +3,7 @@
 import pytest
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.stops import sentence, story
+from monstertruck_runtime.stops import causes_text, stop_lines
 from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
@@ -52,7 +52,7 @@ def test_a_lapsed_lease_names_holder_silence_and_round_trip():
     assert 0.25 < silence.value <= 0.27 + 1e-9
     assert cause.since == trip.at - round((silence.value - silence.limit) * SECOND)
     assert figures(cause)["last round trip"].value == pytest.approx(0.18)
-    assert sentence(trip.causes, trip.at) == (
+    assert causes_text(trip.causes, trip.at) == (
         "lease of ann expired (for 10 ms, silence 260 ms, limit 250 ms, last round trip 180 ms)"
     )
 
@@ -123,7 +123,7 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
         (Reason.DEVICE_LOST, 2),
         (Reason.HUB_LOST, None),
     ]
-    assert sentence(better.causes, better.at) == (
+    assert causes_text(better.causes, better.at) == (
         "no fresh lidar scan (for 20 ms, age 20 ms, limit 250 ms), because lidar: port vanished (for 20 ms), "
         "because hub 1-2 vanished: lidar, camera"
     )
@@ -147,7 +147,7 @@ def test_one_hub_behind_two_sensors_comes_once():
         ("usb", None),
         ("steering", 3),
     ]
-    assert sentence(trip.causes, trip.at).count("hub 1-1") == 2, "each chain is told to its end"
+    assert causes_text(trip.causes, trip.at).count("hub 1-1") == 2, "each chain is told to its end"
 
 
 def test_an_outage_that_is_over_is_not_behind_a_later_silence():
@@ -177,7 +177,9 @@ def test_a_failed_service_is_named_with_what_it_failed_of():
         (Reason.SERVICE_FAILED, "tracker", 1),
         (Reason.INTERNAL, "tracker", None),
     ]
-    assert sentence(trip.causes, trip.at).startswith("a service failed: tracker, because tracker: unexpected exception")
+    assert causes_text(trip.causes, trip.at).startswith(
+        "a service failed: tracker, because tracker: unexpected exception"
+    )
     assert trip.quick
 
 
@@ -301,9 +303,9 @@ def cause(reason=Reason.SCAN_STALE, since=0, because=None, *figures):
 
 
 def test_chains_that_lead_nowhere_or_back_end():
-    assert sentence([cause(because=7)], 0) == "no fresh lidar scan"
+    assert causes_text([cause(because=7)], 0) == "no fresh lidar scan"
     there_and_back = [cause(because=1), cause(Reason.HUB_LOST, 0, 2), cause(Reason.DEVICE_LOST, 0, 1)]
-    assert sentence(there_and_back, 0).count("because") == 2
+    assert causes_text(there_and_back, 0).count("because") == 2
 
 
 def test_a_story_counts_from_now_and_its_causes_from_the_stop():
@@ -322,7 +324,7 @@ def test_a_story_counts_from_now_and_its_causes_from_the_stop():
         black_box="blackbox-000001-scan_stale.mcap",
         text="",
     )
-    assert story(stop, 310 * SECOND) == [
+    assert stop_lines(stop, 310 * SECOND) == [
         "quick stop at 0.12 m/s 5 min ago, driver ann",
         "no fresh lidar scan (for 20 ms, age unknown, limit 250 ms)",
         "  because device unplugged or its port vanished (for 2.0 s, volts 4.12 V, 50 ms old)",

@@ -1,21 +1,22 @@
 """The station's client against a real bridge."""
 
 import asyncio
+import json
 import re
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
-from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order, Role
-from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Writer
-from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
+from monstertruck_schemas.req import ControlRequest, GoalRequest, Order, Role
+from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_CONTROL, REQ_DRIVE, REQ_PATH, Writer
+from tests.bus_kit import Robot, free_endpoint, gate_state, odometry, running_robot
 
 
 async def test_a_stream_arrives_whole_and_in_order():
@@ -116,11 +117,28 @@ async def test_a_robot_that_never_answers_times_out():
             await client.drive(0.0, 0.0)
 
 
+def called(robot: Robot, *names: str) -> asyncio.Queue[tuple[str, dict[str, Any]]]:
+    """Payloads of calls, which are answered with a state of the gate."""
+    payloads: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue()
+
+    def register(name: str) -> None:
+        async def take(payload: dict[str, Any]) -> dict[str, Any]:
+            payloads.put_nowait((name, payload))
+            return gate_state(5).model_dump(mode="json") | {"of a later version": 1}
+
+        robot.rpc.register(name, take)
+
+    for name in names:
+        register(name)
+    return payloads
+
+
 async def test_requests_carry_the_nonce_and_a_growing_sequence():
     async with running_robot() as robot:
         gate = robot.bus.publisher(GATE, Writer.GATE)
         gate.put(gate_state(17, nonce="first"))
-        boxes = [robot.bus.subscribe(topic, fifo(9)) for topic in (REQ_DRIVE, REQ_CONTROL, REQ_GOAL, REQ_PATH)]
+        boxes = [robot.bus.subscribe(topic, fifo(9)) for topic in (REQ_DRIVE, REQ_PATH)]
+        calls = called(robot, "arm", "goal")
         seqs = []
         for _run in range(2):
             async with (
@@ -129,42 +147,77 @@ async def test_requests_carry_the_nonce_and_a_growing_sequence():
             ):
                 await client.drive(0.5, 0.1, -0.1, lease=0.2)
                 drive = await boxes[0].next()
-                await client.order(Order.ARM)
-                order = await boxes[1].next()
-                await client.goal(Pose2D(x=1.0, y=2.0, yaw=0.0))
-                goal = await boxes[2].next()
+                assert await client.arm() == gate_state(5)
+                order = ControlRequest.model_validate_json(json.dumps({**(await calls.get())[1], "order": "arm"}))
+                await client.goal((1.0, 2.0, 0.0))
+                goal = GoalRequest.model_validate_json(json.dumps((await calls.get())[1]))
                 await client.path(Path(stamp=0, received=0, seq=0, frame="odom", poses=[0.0, 0.0, 0.0], directions=[]))
-                path = await boxes[3].next()
+                path = await boxes[1].next()
                 seqs += [drive.seq, order.seq, goal.seq, path.seq]
         assert (drive.speed, drive.front, drive.rear, drive.lease) == (0.5, 0.1, -0.1, 0.2)
         assert (drive.source, drive.role, drive.nonce) == ("ann@laptop", Role.KEYBOARD, "first")
         assert {request.gate_stamp for request in (drive, order, goal, path)} == {17}
-        assert order.order is Order.ARM
         assert (goal.frame, goal.goal.y) == ("map", 2.0)
         assert (path.frame, path.path.poses.tolist()) == ("odom", [0.0, 0.0, 0.0])
         assert seqs == sorted(set(seqs))
 
 
-async def test_an_emergency_stop_waits_for_nothing():
+@pytest.mark.parametrize("order", [Order.ESTOP, Order.STOP])
+async def test_an_emergency_stop_is_published_before_anything_is_awaited(order: Order):
     async with running_robot() as robot, TruckClient(endpoint=robot.endpoint, timeout=60.0) as client:
         orders = robot.bus.subscribe(REQ_CONTROL, fifo(4))
+        calls = called(robot, order.value)
         async with asyncio.timeout(3):
-            await client.order(Order.ESTOP)
+            answer = await client.order(order)
             stop = await orders.next()
-    assert (stop.order, stop.nonce) == (Order.ESTOP, "")
+            name, payload = await calls.get()
+    assert (stop.order, stop.nonce) == (order, "")
+    assert (name, payload["nonce"], payload["seq"]) == (order.value, "", stop.seq + 1)
+    assert answer == gate_state(5)
+
+
+async def test_other_orders_are_calls_only():
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
+        robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        orders = robot.bus.subscribe(REQ_CONTROL, fifo(4))
+        called(robot, "arm", "disarm", "reset")
+        async with asyncio.timeout(3):
+            for give in (client.arm, client.disarm, client.reset):
+                await give()
+    assert orders.drain() == []
+
+
+async def test_a_refused_order_carries_its_reason():
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
+        robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+
+        async def refuse(_: dict[str, Any]) -> dict[str, Any]:
+            raise RequestRefusedError(Reason.SCAN_STALE, "no fresh lidar scan (age 1.0 s)")
+
+        robot.rpc.register("arm", refuse)
+        with pytest.raises(RequestRefusedError, match=r"no fresh lidar scan \(age 1.0 s\)") as refused:
+            await client.arm()
+    assert refused.value.refusal is Reason.SCAN_STALE
+
+
+async def test_orders_of_a_robot_that_is_not_there():
+    async with running_robot() as robot, TruckClient("rover", robot.endpoint, timeout=0.1) as client:
+        with pytest.raises(NoAnswerError, match="does not publish its gate state"):
+            await client.arm()
+        with pytest.raises(NotFoundError, match="no robot 'rover'"):
+            await client.estop()
 
 
 async def test_tasks_that_ask_at_once_share_one_wait():
     async with running_robot() as robot, TruckClient(endpoint=robot.endpoint) as client:
-        orders = robot.bus.subscribe(REQ_CONTROL, fifo(4))
-        asking = asyncio.gather(client.order(Order.ARM), client.order(Order.STOP))
+        calls = called(robot, "arm", "disarm")
+        asking = asyncio.gather(client.arm(), client.disarm())
         await asyncio.sleep(0.2)
         robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
         async with asyncio.timeout(3):
             await asking
-            first, second = await orders.next(), await orders.next()
-    assert second.seq == first.seq + 1
-    assert {first.order, second.order} == {Order.ARM, Order.STOP}
+            seqs = {name: payload["seq"] for name, payload in (await calls.get(), await calls.get())}
+    assert seqs["disarm"] == seqs["arm"] + 1
 
 
 async def test_a_source_the_robot_knows_goes_on_counting_above_it():
@@ -191,10 +244,9 @@ async def test_a_restarted_robot_is_found_again_with_its_new_nonce():
         robot.bus.publisher(GATE, Writer.GATE).put(gate_state(0, nonce="second"))
         async with asyncio.timeout(10):
             assert (await gate.next()).nonce == "second"
-        box = robot.bus.subscribe(REQ_CONTROL, fifo(1))
-        await client.order(Order.ARM)
-        async with asyncio.timeout(3):
-            assert (await box.next()).nonce == "second"
+        calls = called(robot, "arm")
+        await client.arm()
+        assert calls.get_nowait()[1]["nonce"] == "second"
         await client.__aexit__(None, None, None)
 
 
