@@ -115,7 +115,7 @@ class SensorMonitor:
         if valid and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
             valid = False
             self._refused[Reason.SCAN_STALE] = Measurement(
-                name="tilt of its plane", value=scan.tilt, unit="rad", limit=self._config.scan_tilt
+                name="scan plane tilt", value=scan.tilt, unit="rad", limit=self._config.scan_tilt
             )
         if valid:
             self.scan = scan

@@ -153,7 +153,7 @@ class States:
 
     def release(self, now: int) -> None:
         """The driver ended its requests while the truck was at rest."""
-        text = f"{self.holder_name} let go"
+        text = f"{self.holder_name} released control"
         self._enter(GateMode.ARMED, now)
         self._events.emit(now, Reason.STOPPED, Severity.INFO, text)
 

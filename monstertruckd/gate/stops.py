@@ -88,7 +88,7 @@ class CauseBuilder:
         request = source.request
         figures = [
             Measurement(
-                name="silence",
+                name="request age",
                 value=(now - source.arrived) / SECOND,
                 unit="s",
                 limit=(source.deadline - source.arrived) / SECOND,
@@ -97,7 +97,7 @@ class CauseBuilder:
         if not source.inside and request.gate_stamp is not None:
             # From the gate state its sender had to the request's arrival: both directions and the sender's own delay.
             figures.append(
-                Measurement(name="last round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s")
+                Measurement(name="round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s")
             )
         return Cause(
             reason=Reason.LEASE_EXPIRED,
@@ -141,12 +141,12 @@ class CauseBuilder:
     def _turn(self, _now: int) -> Iterator[Measurement]:
         if self._check is not None and self._config.turning is not None:
             limit = self._config.turning.tolerance
-            yield Measurement(name="turned otherwise by", value=self._check.difference, unit="rad", limit=limit)
+            yield Measurement(name="yaw difference", value=self._check.difference, unit="rad", limit=limit)
 
     def _obstacle(self, now: int) -> Iterator[Measurement]:
         age = _age(self._sensors.scan, now)
         keep = self._config.obstacle.ahead
-        yield Measurement(name="free way", value=self._limiter.free, unit="m", limit=keep, age=age)
+        yield Measurement(name="free distance", value=self._limiter.free, unit="m", limit=keep, age=age)
 
 
 def _age(message: Message | None, now: int) -> float | None:

@@ -2,10 +2,11 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Final, Self
 
 from monstertruck_runtime.clock import SECOND, VirtualClock
+from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event
@@ -37,7 +38,7 @@ class DrillTruck:
         self.rig = rig
         self.clock = rig.clock
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
-        self.operator = LocalOperator(rig.bus, rig.clock)
+        self.operator = LocalOperator(rig.daemon, rig.clock)
         queues = (rig.bus.subscribe(topic, fifo(1 << 16)) for topic in (topics.EVENT, topics.GATE, topics.HEALTH))
         self._reports = tuple(queues)
         self._gate = rig.bus.subscribe(topics.GATE, latest())
@@ -88,9 +89,10 @@ class DrillTruck:
         return condition()
 
     async def order(self, order: Order) -> None:
-        """Send an order, if the daemon runs."""
+        """Give an order, if the daemon runs; a refused one is not an error."""
         if not self.rig.daemon_ended:
-            await self.operator.order(order)
+            with suppress(TruckError):
+                await self.operator.order(order)
 
     def drives(self) -> bool:
         """Whether it moves at a speed worth stopping."""

@@ -85,7 +85,7 @@ def test_who_lets_go_of_a_truck_at_rest_does_not_stop_it():
     assert (rig.out.action, rig.out.speeds[0]) == (DriveAction.RUN, 0.0)
     assert rig.trips == []
     (told,) = rig.told(Reason.STOPPED)
-    assert (told.severity, told.text) == (Severity.INFO, "ann let go")
+    assert (told.severity, told.text) == (Severity.INFO, "ann released control")
     assert not rig.told(Reason.LEASE_EXPIRED)
     rig.driver = {"speed": 0.2}
     rig.tick(5)

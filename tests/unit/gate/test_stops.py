@@ -47,20 +47,20 @@ def test_a_lapsed_lease_names_holder_silence_and_round_trip():
     assert not trip.quick
     assert trip.speed == pytest.approx(0.2, abs=0.01)
     assert trip.stopping_distance == pytest.approx(0.036, abs=0.005)
-    silence = figures(cause)["silence"]
+    silence = figures(cause)["request age"]
     assert silence.limit == pytest.approx(0.25)
     assert 0.25 < silence.value <= 0.27 + 1e-9
     assert cause.since == trip.at - round((silence.value - silence.limit) * SECOND)
-    assert figures(cause)["last round trip"].value == pytest.approx(0.18)
+    assert figures(cause)["round trip"].value == pytest.approx(0.18)
     assert causes_text(trip.causes, trip.at) == (
-        "lease of ann expired (for 10 ms, silence 260 ms, limit 250 ms, last round trip 180 ms)"
+        "lease of ann expired (for 10 ms, request age 260 ms, limit 250 ms, round trip 180 ms)"
     )
 
 
 def test_a_planner_has_no_round_trip():
     rig = Rig().driving(source="tracker", role=Role.TRACKER, inside=True)
     rig.driver = None
-    assert set(figures(stopped(rig).causes[0])) == {"silence"}
+    assert set(figures(stopped(rig).causes[0])) == {"request age"}
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_an_obstacle_that_stops_the_truck_is_a_stop_once():
     trip = stopped(rig)
     (cause,) = trip.causes
     assert (cause.reason, trip.mode) == (Reason.OBSTACLE_STOP, GateMode.DRIVING)
-    free = figures(cause)["free way"]
+    free = figures(cause)["free distance"]
     assert free.limit == 0.05
     assert 0 <= free.value < 0.3
     rig.tick(50)
