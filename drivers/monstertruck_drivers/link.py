@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Protocol, Self
 
 import serial
-import serial_asyncio
 
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
 
@@ -304,64 +303,79 @@ class SerialPort:
             raise self._open_error(error) from error
         except (OSError, termios.error) as error:
             raise DeviceLostError(f"{self.name}: {error}") from error
-        protocol = _SerialProtocol(self.name)
-        link = protocol.own(_Transport(asyncio.get_running_loop(), protocol, tty))
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(tty.fileno(), termios.TCIOFLUSH)
-        return link
+        return _Tty(self.name, tty).link
 
     def _open_error(self, error: serial.SerialException) -> Exception:
         busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
         return PortBusyError(f"{self.name}: held by another process") if busy else DeviceLostError(str(error))
 
 
-class _Transport(serial_asyncio.SerialTransport):  # type: ignore[misc]  # untyped
-    """Reads and writes at once what the tty has and takes; pyserial would ask the kernel once more for each."""
+class _Tty:
+    """Reads and writes at once what an open tty has and takes; what it does not take waits until it does.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, tty: serial.Serial) -> None:
-        super().__init__(loop, protocol, tty)
+    Args:
+        name: for error messages.
+        tty: open and exclusive; closed with the link.
+    """
+
+    def __init__(self, name: str, tty: serial.Serial) -> None:
+        self.link = Link(name, self._send, self._close)
+        self._tty = tty
         self._fd = tty.fileno()
+        self._unsent = bytearray()
+        self._loop = asyncio.get_running_loop()
+        os.set_blocking(self._fd, False)
+        self._loop.add_reader(self._fd, self._readable)
 
-    def send(self, data: bytes) -> None:
-        """Write; what the tty does not take now, hardly ever anything, goes later, or ends in the loss of the link."""
-        if not self._write_buffer:
-            try:  # noqa: SIM105  # four hundred times a second
-                data = data[os.write(self._fd, data) :]
-            except OSError:  # not even one byte now
-                pass
-        if data:
-            self.write(data)
-
-    def _read_ready(self) -> None:
+    def _readable(self) -> None:
         try:
             data = os.read(self._fd, BUFFER_LIMIT)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
-            self._close(exc=error)
+            self._lose(f"unplugged ({error})")
             return
         if data:
-            self._protocol.data_received(data)
-        else:
-            self._close(exc=serial.SerialException("hung up"))
-
-
-class _SerialProtocol(asyncio.Protocol):
-    """Feeds a ``Link`` from a pyserial-asyncio transport."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self.link: Link | None = None
-
-    def own(self, transport: _Transport) -> Link:
-        # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(self._name, transport.send, transport.abort)
-        return self.link
-
-    def data_received(self, data: bytes) -> None:
-        if self.link is not None:
             self.link.feed(data)
+        else:
+            self._lose("unplugged (hung up)")
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self.link is not None:
-            self.link.lose(f"unplugged ({exc})" if exc else "unplugged")
+    def _send(self, data: bytes) -> None:
+        if not self._unsent:
+            try:  # noqa: SIM105  # four hundred times a second
+                data = data[os.write(self._fd, data) :]
+            except OSError:  # not even one byte now; a lost tty says so again when it is written to later
+                pass
+        if data:
+            if not self._unsent:
+                self._loop.add_writer(self._fd, self._writable)
+            self._unsent += data
+
+    def _writable(self) -> None:
+        try:
+            del self._unsent[: os.write(self._fd, self._unsent)]
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(f"unplugged ({error})")
+            return
+        if not self._unsent:
+            self._loop.remove_writer(self._fd)
+
+    def _lose(self, why: str) -> None:
+        self._close()
+        self.link.lose(why)
+
+    def _close(self) -> None:
+        """Drop what was not sent; closing with a peer that reads nothing must not wait for it."""
+        if self._fd < 0:
+            return
+        self._loop.remove_reader(self._fd)
+        self._loop.remove_writer(self._fd)
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcflush(self._fd, termios.TCIOFLUSH)
+        self._fd = -1
+        with contextlib.suppress(OSError, serial.SerialException):
+            self._tty.close()
