@@ -164,7 +164,7 @@ class Machine:
     clock: Clock
     sysfs: Sysfs = field(default_factory=Sysfs)
     dev: Path = Path("/dev")
-    beside: Offload = in_thread
+    offload: Offload = in_thread
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
     serial: Callable[[Path, int], Port] = SerialPort
     """A serial node and a baud rate to a port."""

@@ -6,7 +6,7 @@ from typing import Final
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Present, alarm_names, word
-from monstertruck_drivers.ax12.session import RETRIES, Session
+from monstertruck_drivers.ax12.session import RETRIES, Ax12Session
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
@@ -99,7 +99,7 @@ class Joint:
 
     # Exchanges
 
-    async def join(self, session: Session, retries: int = RETRIES) -> None:
+    async def join(self, session: Ax12Session, retries: int = RETRIES) -> None:
         """Make sure that the unit is there and what is configured; the next ``poll`` makes it hold.
 
         Raises:
@@ -124,7 +124,7 @@ class Joint:
         self.torque = TorqueState.LIMP
         self._hold_at = 0
 
-    async def poll(self, session: Session) -> None:
+    async def poll(self, session: Ax12Session) -> None:
         """Read the unit, and do what it needs.
 
         Raises:
@@ -144,7 +144,7 @@ class Joint:
         except (DeviceTimeoutError, ProtocolError) as error:
             self._miss(str(error))
 
-    async def _look_after(self, session: Session, present: Present, error: Alarm) -> None:
+    async def _look_after(self, session: Ax12Session, present: Present, error: Alarm) -> None:
         now = self._clock.now()
         changed, self._error = error != self._error, error
         self._tell_alarms(error, now)
@@ -154,7 +154,7 @@ class Joint:
         if self.torque is TorqueState.LIMP and now >= self._hold_at and cool:
             await self._hold(session, present)
 
-    async def _check_torque(self, session: Session, present: Present) -> None:
+    async def _check_torque(self, session: Ax12Session, present: Present) -> None:
         enabled, speed, limit = await self._settings(session)
         if not limit:
             self._go_limp()
@@ -162,7 +162,7 @@ class Joint:
             self._tell(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as by a brown-out: sent again")
             await self._hold(session, present)
 
-    async def _hold(self, session: Session, present: Present) -> None:
+    async def _hold(self, session: Ax12Session, present: Present) -> None:
         """Give torque without a jump: the goal is where the joint is, or the limit next to it."""
         config, joint = self._config, self._joint
         goal = min(max(present.position, joint.min_position), joint.max_position)
@@ -208,14 +208,14 @@ class Joint:
         self._outage = True
         self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
 
-    async def _settings(self, session: Session) -> tuple[int, int, int]:
+    async def _settings(self, session: Ax12Session) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
         answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries=0)
         self._error, data = answer.error, answer.data
         self._check_at = self._clock.now() + round(self._config.check_interval * SECOND)
         return data[0], word(data, 8), word(data, 10)
 
-    async def _answer_all(self, session: Session) -> None:
+    async def _answer_all(self, session: Ax12Session) -> None:
         """Store the status level that answers everything; whether this write is answered depends on the old one."""
         with contextlib.suppress(DeviceTimeoutError):
             await session.write(self.id, p.STATUS_LEVEL, ANSWERS_ALL, retries=0)
@@ -302,12 +302,12 @@ class Ax12Driver:
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
-            session = Session(link, self._clock, self._config.timeout)
+            session = Ax12Session(link, self._clock, self._config.timeout)
             await self._join(session)
             ready()
             await self._serve(session)
 
-    async def _join(self, session: Session) -> None:
+    async def _join(self, session: Ax12Session) -> None:
         await session.find_echo(*(joint.id for joint in self._joints))
         missing: dict[Joint, str] = {}
         for joint in self._joints:
@@ -329,7 +329,7 @@ class Ax12Driver:
         for joint, why in missing.items():
             joint.tell_absent(why)
 
-    async def _serve(self, session: Session) -> None:
+    async def _serve(self, session: Ax12Session) -> None:
         schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
         while True:
             await self._follow(session, schedule.step())
@@ -340,13 +340,13 @@ class Ax12Driver:
                 raise DeviceTimeoutError(f"{self._port.name}: no unit answers any more: is the 12 V rail down?")
             self._publish(asked)
 
-    async def _follow(self, session: Session, until: int) -> None:
+    async def _follow(self, session: Ax12Session, until: int) -> None:
         """Pass goals on as they come."""
         while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:
             if self._clock.now() - command.stamp <= self._config.command_timeout * SECOND:
                 await self._aim(session, command)
 
-    async def _aim(self, session: Session, command: StabiliserCommand) -> None:
+    async def _aim(self, session: Ax12Session, command: StabiliserCommand) -> None:
         angles = ((self._pitch, command.pitch), (self._roll, command.roll))
         goals = {joint.id: joint.goal(angle) for joint, angle in angles if joint.torque is TorqueState.HOLDING}
         if goals:

@@ -3,7 +3,7 @@
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.protocol import Present, alarm_names, word
-from monstertruck_drivers.ax12.session import Session
+from monstertruck_drivers.ax12.session import Ax12Session
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
@@ -27,7 +27,7 @@ async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) ->
         PortBusyError: another process holds the port.
     """
     async with await port.open() as link:
-        session = Session(link, clock, (settings or Ax12Config()).timeout)
+        session = Ax12Session(link, clock, (settings or Ax12Config()).timeout)
         await session.find_echo(*IDS)
         units = [found for unit in IDS if (found := await _describe(session, unit)) is not None]
     if not units and session.strange:
@@ -39,7 +39,7 @@ async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) ->
     return {"device": "Dynamixel AX-12A", "port": port.name, "echo": session.echo, "units": units}
 
 
-async def _describe(session: Session, unit: int) -> dict[str, object] | None:
+async def _describe(session: Ax12Session, unit: int) -> dict[str, object] | None:
     try:
         error = await session.ping(unit)
     except DeviceTimeoutError:

@@ -23,7 +23,7 @@ class Answer:
     data: bytes
 
 
-class Session:
+class Ax12Session:
     """One conversation; the host speaks first, always.
 
     A passive adapter gives back every byte that is sent. An echoed request looks like a status packet, even like a

@@ -43,7 +43,7 @@ class IioBatteryDriver:
         self._config = config
         self._clock = clock
         self._root = computer.root / iio.CONVERTERS
-        self._offload = computer.machine.beside
+        self._offload = computer.machine.offload
         self._monitor = BatteryMonitor(config, out, events, name, drive)
 
     async def run(self, ready: Ready) -> None:

@@ -16,7 +16,7 @@ async def probe(computer: Computer, clock: Clock, settings: IioConfig | None = N
         JSON-able: ``converters``: name, path, and per channel the reading and the volts at the pin, or why not.
     """
     root = computer.root / iio.CONVERTERS
-    return await computer.machine.beside(
+    return await computer.machine.offload(
         lambda: {"converters": [_describe(converter) for converter in iio.converters(root)]}
     )
 

@@ -45,7 +45,7 @@ class HostHealthDriver:
         self._events = events
         self._root = computer.root
         self._disk = computer.disk
-        self._offload = computer.machine.beside
+        self._offload = computer.machine.offload
         self._before: Reading | None = None
         self._alarms = {
             Reason.HOST_HOT: Alarm(Threshold(config.hot, config.hot_clear, config.after)),

@@ -20,4 +20,4 @@ async def probe(computer: Computer, clock: Clock, settings: HostHealthConfig | N
         DeviceError: /proc cannot be read.
     """
     disk = Path() if settings is None else settings.disk_path
-    return asdict(await computer.machine.beside(lambda: read_host(computer.root, computer.disk(disk))))
+    return asdict(await computer.machine.offload(lambda: read_host(computer.root, computer.disk(disk))))

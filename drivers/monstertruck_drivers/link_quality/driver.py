@@ -107,7 +107,7 @@ class LinkQualityDriver:
         self._out = out
         self._events = events
         self._root = computer.root
-        self._offload = computer.machine.beside
+        self._offload = computer.machine.offload
         self._judge = LinkJudge(config)
         self._concern = FINE
         self._before: tuple[int, Sample] | None = None

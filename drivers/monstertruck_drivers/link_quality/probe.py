@@ -15,6 +15,6 @@ async def probe(computer: Computer, clock: Clock, settings: LinkQualityConfig | 
     Returns:
         JSON-able: ``interfaces``, and ``chosen``: the one that is watched if none is configured.
     """
-    samples = await computer.machine.beside(lambda: read_interfaces(computer.root))
+    samples = await computer.machine.offload(lambda: read_interfaces(computer.root))
     chosen = choose(samples, None)
     return {"interfaces": [asdict(sample) for sample in samples], "chosen": chosen.name if chosen else None}

@@ -7,7 +7,7 @@ from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
-from monstertruck_drivers.maestro.session import Session
+from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -95,7 +95,7 @@ class MaestroDriver:
         self._start_session()
         async with await self._port.open() as link:
             encoder = Encoder(config.device_number, config.use_crc)
-            session = Session(link, self._clock, encoder, config.answer_timeout)
+            session = MaestroSession(link, self._clock, encoder, config.answer_timeout)
             # Errors pending since power-up say nothing about this session.
             await session.identify(config.front.channel, config.rear.channel)
             self._restore(session)
@@ -106,7 +106,7 @@ class MaestroDriver:
                 with contextlib.suppress(DeviceLostError):
                     session.send(*self._line(session, high=False))
 
-    async def _serve(self, session: Session) -> None:
+    async def _serve(self, session: MaestroSession) -> None:
         schedule = Schedule(self._clock, self._config.poll_rate, QUESTIONS)
         every = max(1, round(self._config.poll_rate / self._config.battery_rate))
         cycle = 0
@@ -118,7 +118,7 @@ class MaestroDriver:
                 await self._poll(session, self._battery if cycle % every == 0 else None)
             cycle += 1
 
-    async def _follow(self, session: Session, until: int) -> None:
+    async def _follow(self, session: MaestroSession, until: int) -> None:
         """Pass commands on as they come."""
 
         def pass_on(command: SteeringCommand) -> bool:
@@ -134,7 +134,7 @@ class MaestroDriver:
     def _is_fresh(self, command: SteeringCommand) -> bool:
         return self._clock.now() - command.stamp <= self._config.command_timeout * SECOND
 
-    def _watch(self, session: Session) -> None:
+    def _watch(self, session: MaestroSession) -> None:
         """Release the deadman when commands stop."""
         if self._fresh and self._command is not None and not self._is_fresh(self._command):
             self._fresh = False
@@ -142,15 +142,15 @@ class MaestroDriver:
             text = f"no steering command for {self._config.command_timeout} s: servos hold"
             self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
 
-    def _targets(self, session: Session, command: SteeringCommand) -> list[bytes]:
+    def _targets(self, session: MaestroSession, command: SteeringCommand) -> list[bytes]:
         pairs = ((self._config.front, command.front_servo), (self._config.rear, command.rear_servo))
         return [session.encode.set_target(servo.channel, servo.quarters(angle)) for servo, angle in pairs]
 
-    def _line(self, session: Session, *, high: bool) -> list[bytes]:
+    def _line(self, session: MaestroSession, *, high: bool) -> list[bytes]:
         channel = self._config.deadman_channel
         return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else LINE_LOW)]
 
-    def _restore(self, session: Session) -> None:
+    def _restore(self, session: MaestroSession) -> None:
         """Send everything a Maestro forgets at power-up or loses by an error."""
         packets: list[bytes] = []
         for servo in (self._config.front, self._config.rear):
@@ -161,7 +161,7 @@ class MaestroDriver:
         alive = self._fresh and self._command is not None and self._command.deadman
         session.send(*packets, *self._line(session, high=alive))
 
-    async def _poll(self, session: Session, battery: "BatteryInput | None") -> None:
+    async def _poll(self, session: MaestroSession, battery: "BatteryInput | None") -> None:
         config = self._config
         channels = [config.front.channel, config.rear.channel] + ([battery.channel] if battery else [])
         asked = self._clock.now()
@@ -184,7 +184,7 @@ class MaestroDriver:
         if battery is not None:
             battery.take(stamp, received, positions[2])
 
-    def _report(self, session: Session, stamp: int, received: int, positions: list[int], errors: int) -> None:
+    def _report(self, session: MaestroSession, stamp: int, received: int, positions: list[int], errors: int) -> None:
         servos: tuple[ServoConfig, ServoConfig] = (self._config.front, self._config.rear)
         for axle, (servo, position) in enumerate(zip(servos, positions[:2], strict=True)):
             if position > 0:  # 0: no pulses, the servo stays where it is

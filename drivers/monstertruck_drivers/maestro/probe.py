@@ -3,7 +3,7 @@
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.protocol import CHANNELS, Encoder, error_names
-from monstertruck_drivers.maestro.session import Session
+from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import Clock
 
 
@@ -23,7 +23,7 @@ async def probe(port: Port, clock: Clock, settings: MaestroConfig | None = None)
         PortBusyError: another process holds the port.
     """
     async with await port.open() as link:
-        session = Session(link, clock, Encoder(), timeout=0.3)
+        session = MaestroSession(link, clock, Encoder(), timeout=0.3)
         errors = await session.identify(0, 1)
         positions = await session.ask(*(session.encode.get_position(channel) for channel in range(CHANNELS)))
     return {

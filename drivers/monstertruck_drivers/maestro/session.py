@@ -13,7 +13,7 @@ QUIET: Final = 0.02
 """Seconds of silence that end an answer; a Maestro says nothing unasked."""
 
 
-class Session:
+class MaestroSession:
     """One conversation. Answers carry no mark of their own: only their number and form can be checked.
 
     Args:

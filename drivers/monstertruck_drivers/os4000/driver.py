@@ -6,7 +6,7 @@ from monstertruck_drivers.link import Port
 from monstertruck_drivers.os4000.attitude import to_attitude
 from monstertruck_drivers.os4000.config import NEEDED, Os4000Config
 from monstertruck_drivers.os4000.protocol import Fields, Key, Sentence
-from monstertruck_drivers.os4000.session import LISTEN, Session, observed_fields, observed_rate
+from monstertruck_drivers.os4000.session import LISTEN, Os4000Session, observed_fields, observed_rate
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
@@ -61,12 +61,12 @@ class Os4000Driver:
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
-            session = Session(link, self._clock)
+            session = Os4000Session(link, self._clock)
             await self._set_up(session)
             ready()
             await self._serve(session)
 
-    async def _set_up(self, session: Session) -> None:
+    async def _set_up(self, session: Os4000Session) -> None:
         heard = await session.start(self._config.rate)
         wrong = self._differences(heard)
         if not wrong:
@@ -95,7 +95,7 @@ class Os4000Driver:
             wrong[Key.RATE] = config.rate, f"the unit sends {seen}, configured is {config.rate}"
         return wrong
 
-    async def _serve(self, session: Session) -> None:
+    async def _serve(self, session: Os4000Session) -> None:
         patience = round(self._config.patience * SECOND)
         limit, heard = self._clock.now() + patience, session.bytes_heard
         while True:

@@ -3,7 +3,7 @@
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.protocol import Fields, Key
-from monstertruck_drivers.os4000.session import Session, observed_fields, observed_rate
+from monstertruck_drivers.os4000.session import Os4000Session, observed_fields, observed_rate
 from monstertruck_runtime.clock import Clock
 
 PROBE_RATE = 20
@@ -24,7 +24,7 @@ async def probe(port: Port, clock: Clock, settings: Os4000Config | None = None) 
         PortBusyError: another process holds the port.
     """
     async with await port.open() as link:
-        session = Session(link, clock)
+        session = Os4000Session(link, clock)
         heard = await session.start(PROBE_RATE)
         version = await session.ask(Key.VERSION)
     _, sample = heard[-1]

@@ -19,7 +19,7 @@ SAMPLES: Final = 6
 """Sentences that tell rate and fields."""
 
 
-class Session:
+class Os4000Session:
     """One conversation.
 
     Args:

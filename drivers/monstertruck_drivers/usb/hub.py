@@ -427,7 +427,7 @@ class UsbService:
         return self._look_at if due is None else min(self._look_at, due)
 
     async def _look(self) -> None:
-        snapshot = await self._machine.beside(lambda: read_tree(self._machine.sysfs))
+        snapshot = await self._machine.offload(lambda: read_tree(self._machine.sysfs))
         self._hubs.update(snapshot)
         # Who waits for a hub does not ask for a look, so without announcements one has to be quick oneself.
         rescan = min(self._config.rescan, IMPATIENT) if self._hubs.waiting else self._config.rescan
@@ -462,4 +462,4 @@ async def keep_awake(machine: Machine, name: str) -> bool:
             machine.sysfs.write(f"{DEVICES}/{name}/power/control", "on")
         return machine.sysfs.text(f"{DEVICES}/{name}/power/control") == "on"
 
-    return await machine.beside(write)
+    return await machine.offload(write)

@@ -101,7 +101,7 @@ class PortPower:
         method = self.config.method
         if method is None:
             raise DeviceError("no method to switch USB ports is configured (power.method)")
-        device = await self._machine.beside(lambda: read_device(self._machine.sysfs, name))
+        device = await self._machine.offload(lambda: read_device(self._machine.sysfs, name))
         if parent_of(name) is None or (device is not None and device.hub):
             raise DeviceError(f"{name} is a hub: only ports of single devices are switched")
         self._pace(name)
@@ -132,11 +132,11 @@ class PortPower:
 
     async def _toggle(self, attribute: str, off: str, on: str, seconds: float) -> None:
         machine = self._machine
-        await machine.beside(lambda: machine.sysfs.write(attribute, off))
+        await machine.offload(lambda: machine.sysfs.write(attribute, off))
         try:
             await machine.clock.sleep(seconds)
         finally:
-            await machine.beside(lambda: machine.sysfs.write(attribute, on))
+            await machine.offload(lambda: machine.sysfs.write(attribute, on))
 
     async def _uhubctl(self, name: str) -> None:
         hub = str(parent_of(name)).removeprefix("usb")
@@ -198,7 +198,7 @@ class HubNode:
 
     async def _look(self) -> Node:
         config = self._config
-        device = await self._machine.beside(lambda: read_device(self._machine.sysfs, config.device))
+        device = await self._machine.offload(lambda: read_device(self._machine.sysfs, config.device))
         if device is None:
             raise DeviceLostError(f"{self.name}: not plugged in")
         if config.usb_id is not None and device.usb_id != config.usb_id:
@@ -277,7 +277,7 @@ class HubPort:
     async def _lower_latency(self, node: Node) -> None:
         wanted = self._config.latency_ms
         device = self._machine.dev / node.name
-        latency = await self._machine.beside(lambda: set_latency(self._machine.sysfs, node, device, wanted))
+        latency = await self._machine.offload(lambda: set_latency(self._machine.sysfs, node, device, wanted))
         slow = latency is not None and latency > wanted
         if slow and not self._told_slow:
             text = f"{self.name}: latency stays at {latency} ms instead of {wanted} ms; {ADVICE}"

@@ -21,7 +21,7 @@ _MODE: Final = struct.Struct("<IId")
 HEADER_SIZE: Final = _HEADER.size + _CRC.size
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """What a packet is."""
 
     GRANTED = 1
@@ -36,7 +36,7 @@ class Kind(IntEnum):
 class Packet:
     """One packet."""
 
-    kind: Kind
+    kind: PacketKind
     number: int = 0
     stamp: int = 0
     payload: bytes = b""
@@ -68,7 +68,7 @@ class PacketParser:
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._header: tuple[Kind, int, int, int] | None = None
+        self._header: tuple[PacketKind, int, int, int] | None = None
 
     @property
     def missing(self) -> int:
@@ -108,8 +108,8 @@ class PacketParser:
             header = bytes(self._buffer[: _HEADER.size])
             _, kind, number, stamp, length = _HEADER.unpack(header)
             (crc,) = _CRC.unpack(self._buffer[_HEADER.size : HEADER_SIZE])
-            if crc == zlib.crc32(header) and length <= PAYLOAD_LIMIT and kind in list(Kind):
+            if crc == zlib.crc32(header) and length <= PAYLOAD_LIMIT and kind in list(PacketKind):
                 del self._buffer[:HEADER_SIZE]
-                self._header = Kind(kind), number, stamp, length
+                self._header = PacketKind(kind), number, stamp, length
                 return True
             del self._buffer[: len(MAGIC)]

@@ -5,7 +5,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port, SerialPort
-from monstertruck_drivers.webcam.packets import Kind, Packet, PacketParser, decode_mode
+from monstertruck_drivers.webcam.packets import Packet, PacketKind, PacketParser, decode_mode
 from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, FrameSource, FrameStream, Mode, device_error
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import Clock
@@ -50,9 +50,9 @@ class RenderedSource:
         """Wait for it; pictures of an earlier session are dropped."""
         while True:
             for packet in parser.feed(await link.exactly(min(parser.missing, MOST))):
-                if packet.kind is Kind.GRANTED:
+                if packet.kind is PacketKind.GRANTED:
                     return decode_mode(packet.payload)
-                if packet.kind is Kind.REFUSED:
+                if packet.kind is PacketKind.REFUSED:
                     error = OSError(packet.number, "refused")
                     raise device_error(self.name, SET_FORMAT, error)
 
@@ -70,7 +70,7 @@ class RenderedStream:
         picture: Packet | None = None
         while picture is None:
             for packet in self._parser.feed(await self._link.read(least=min(self._parser.missing, MOST))):
-                if packet.kind is Kind.PICTURE:
+                if packet.kind is PacketKind.PICTURE:
                     picture = packet
         return Frame(picture.stamp, picture.number, picture.payload)
 

@@ -39,7 +39,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], pa
     say("plug it in again")
     try:
         async with machine.clock.deadline(patience):
-            while await machine.beside(lambda: read_device(machine.sysfs, device.name)) is None:
+            while await machine.offload(lambda: read_device(machine.sysfs, device.name)) is None:
                 await machine.clock.sleep(POLL)
     except TimeoutError:
         say("still not plugged in there; the port counts all the same")
@@ -58,7 +58,7 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
     """Wait until one device with a node vanishes alone."""
 
     async def look() -> Snapshot:
-        return await machine.beside(lambda: read_tree(machine.sysfs))
+        return await machine.offload(lambda: read_tree(machine.sysfs))
 
     before = await look()
     while True:

@@ -7,7 +7,7 @@ import pytest
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import Alarm, Packet
-from monstertruck_drivers.ax12.session import Session
+from monstertruck_drivers.ax12.session import Ax12Session
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
@@ -36,12 +36,12 @@ def scripted(answers: list[bytes], test, *, echo: bool = False) -> None:
     """Run ``test(session, script, clock)`` against prepared answers."""
 
     @contextlib.asynccontextmanager
-    async def ready(clock: VirtualClock) -> AsyncIterator[tuple[Session, Script]]:
+    async def ready(clock: VirtualClock) -> AsyncIterator[tuple[Ax12Session, Script]]:
         port = MemoryPort("/dev/test")
         port.plug()
         script = Script(port, answers)
         async with background(script.run()), await port.open() as link:
-            session = Session(link, clock, lambda size: 0.005)
+            session = Ax12Session(link, clock, lambda size: 0.005)
             session.echo = echo
             yield session, script
 
@@ -57,7 +57,7 @@ def status(error: int = 0, data: bytes = b"", unit: int = 1) -> bytes:
 
 
 def test_a_request_that_arrived_damaged_is_sent_again():
-    async def test(session: Session, script: Script, _clock) -> None:
+    async def test(session: Ax12Session, script: Script, _clock) -> None:
         assert await session.write(1, p.LED, b"\x01") == Alarm.VOLTAGE
         assert (await session.read(1, p.LED, 1)).data == b"\x01"
         assert len(script.requests) == 4
@@ -67,7 +67,7 @@ def test_a_request_that_arrived_damaged_is_sent_again():
 
 
 def test_a_refused_write_is_an_error_that_names_its_bits():
-    async def test(session: Session, script: Script, _clock) -> None:
+    async def test(session: Ax12Session, script: Script, _clock) -> None:
         with pytest.raises(ProtocolError, match=r"/dev/test: unit 1 refused a write to 30: angle\+range error"):
             await session.write(1, p.GOAL_POSITION, b"\x00\x00")
         with pytest.raises(ProtocolError, match="checksum error"):
@@ -78,7 +78,7 @@ def test_a_refused_write_is_an_error_that_names_its_bits():
 
 
 def test_an_answer_without_its_data_is_an_error():
-    async def test(session: Session, _script, _clock) -> None:
+    async def test(session: Ax12Session, _script, _clock) -> None:
         with pytest.raises(ProtocolError, match="unit 1 gave no data: range error"):
             await session.read(1, p.PUNCH, 8)
 
@@ -86,7 +86,7 @@ def test_an_answer_without_its_data_is_an_error():
 
 
 def test_answers_of_others_and_of_other_lengths_do_not_count():
-    async def test(session: Session, _script, _clock) -> None:
+    async def test(session: Ax12Session, _script, _clock) -> None:
         assert (await session.read(1, p.PRESENT_POSITION, 8)).data == bytes(range(8))
 
     late = status(0, bytes(12))
@@ -94,7 +94,7 @@ def test_answers_of_others_and_of_other_lengths_do_not_count():
 
 
 def test_an_answer_that_came_too_late_is_thrown_away():
-    async def test(session: Session, script: Script, clock) -> None:
+    async def test(session: Ax12Session, script: Script, clock) -> None:
         with pytest.raises(DeviceTimeoutError):
             await session.read(1, p.PRESENT_POSITION, 8, retries=0)
         script.say(status(0, bytes(8)))
@@ -105,7 +105,7 @@ def test_an_answer_that_came_too_late_is_thrown_away():
 
 
 def test_silence_is_asked_three_times():
-    async def test(session: Session, script: Script, clock) -> None:
+    async def test(session: Ax12Session, script: Script, clock) -> None:
         start = clock.now()
         with pytest.raises(DeviceTimeoutError, match="unit 1: no correct answer"):
             await session.ping(1)
@@ -119,7 +119,7 @@ def test_silence_is_asked_three_times():
 
 
 def test_an_echo_is_dropped_once():
-    async def test(session: Session, _script, _clock) -> None:
+    async def test(session: Ax12Session, _script, _clock) -> None:
         assert await session.ping(1) == Alarm.VOLTAGE, "the answer looks like the ping itself"
         with pytest.raises(DeviceTimeoutError):
             await session.ping(1, retries=0)
@@ -131,7 +131,7 @@ def test_an_echo_is_dropped_once():
 def test_an_echo_is_found_by_a_request_no_answer_resembles(answer: bytes | None, echo: bool):
     request = p.read(1, p.MODEL_NUMBER, 3)
 
-    async def test(session: Session, script: Script, _clock) -> None:
+    async def test(session: Ax12Session, script: Script, _clock) -> None:
         await session.find_echo(1, 2)
         assert session.echo is echo
         assert script.requests == [request]
@@ -140,7 +140,7 @@ def test_an_echo_is_found_by_a_request_no_answer_resembles(answer: bytes | None,
 
 
 def test_after_a_sync_write_the_bus_gets_a_pause():
-    async def test(session: Session, script: Script, clock) -> None:
+    async def test(session: Ax12Session, script: Script, clock) -> None:
         start = clock.now()
         await session.sync_write(p.GOAL_POSITION, {1: b"\x00\x01"})
         assert clock.now() == start
