@@ -21,10 +21,10 @@ import numpy as np
 import zenoh
 
 from monstertruck_runtime import wire
+from monstertruck_runtime.client import in_network_thread
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.memory import settle
-from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
 from monstertruckd.bus.local import Bus

@@ -20,8 +20,7 @@ from typing import Any
 
 import uvloop
 
-from monstertruck_runtime.clock import WallClock, run_wall
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.clock import Schedule, WallClock, run_wall
 from monstertruckd.gate.service import TickMeter
 
 NOTABLE = 0.5

@@ -25,8 +25,7 @@ from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import latest
-from monstertruck_runtime.scope import Scope, scope
-from monstertruck_runtime.service import OnBug, RestartPolicy, Service, supervise
+from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, scope, supervise
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity

@@ -9,9 +9,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_runtime.stops import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand

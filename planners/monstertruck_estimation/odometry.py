@@ -18,9 +18,8 @@ from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate, integration_jacobians
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import ESTIMATES, Schedule
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry

@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.sensor import StabiliserFeedback
 from monstertruck_schemas.state import Odometry, Transform, Transforms
 

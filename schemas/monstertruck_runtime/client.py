@@ -1,14 +1,18 @@
 """Client of one robot for stations and scripts: typed messages and remote calls over Zenoh."""
 
 import asyncio
+import ctypes
 import getpass
 import json
 import logging
 import os
 import re
 import socket
-from collections.abc import Callable, Sequence
+import stat
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
@@ -17,13 +21,18 @@ from zenoh import ext, handlers
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, WallClock
-from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import (
+    InputError,
+    NoAnswerError,
+    NotFoundError,
+    NotPermittedError,
+    RequestRefusedError,
+    TruckError,
+)
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.requests import OVERTAKING, Operator
-from monstertruck_runtime.station import ClientTls, session_config, station_tls
 from monstertruck_runtime.threads import ThreadHop, in_thread
-from monstertruck_runtime.zenoh_threads import in_network_thread
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
@@ -54,6 +63,80 @@ _HOP_DEPTH = 1024
 
 ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
+
+TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
+"""Names the folder of the station's certificate."""
+
+
+class ClientTls(Schema):
+    """Files of a station with its own certificate."""
+
+    ca: Path
+    """Certificate of the authority that signed the robot's."""
+    certificate: Path
+    key: Path
+
+
+def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
+    """The certificate of this user's station: ``ca.pem``, ``station.pem`` and ``station.key`` of one folder.
+
+    The folder is that of ``MONSTERTRUCKD_TLS``, else ``monstertruckd/tls`` in the user's configuration.
+
+    Raises:
+        NotFoundError: a file is missing.
+        NotPermittedError: others may read the key.
+    """
+    home = Path(environment.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    folder = Path(environment.get(TLS_VARIABLE) or home / "monstertruckd" / "tls")
+    files = ClientTls(ca=folder / "ca.pem", certificate=folder / "station.pem", key=folder / "station.key")
+    for file in (files.ca, files.certificate, files.key):
+        if not file.is_file():
+            raise NotFoundError(f"{file}: not there; tls/... endpoints want it ({TLS_VARIABLE} names another folder)")
+    if files.key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise NotPermittedError(f"{files.key}: others may read this key; expected mode 600 (chmod 600 {files.key})")
+    return files
+
+
+def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict[str, Any]:
+    """Of a Zenoh session that dials one endpoint, and neither listens nor discovers.
+
+    Args:
+        endpoint: of the robot.
+        timeout: for the link, s.
+        tls: for ``tls/...`` endpoints.
+    """
+    config: dict[str, Any] = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint], "timeout_ms": round(timeout * 1000), "exit_on_failure": True},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    if tls is not None:
+        config["transport"]["link"] = {
+            "tls": {
+                "root_ca_certificate": str(tls.ca),
+                "connect_certificate": str(tls.certificate),
+                "connect_private_key": str(tls.key),
+                "enable_mtls": True,
+            }
+        }
+    return config
+
+
+def in_network_thread(take: Callable[[zenoh.Sample], None]) -> "handlers.Callback[zenoh.Sample]":
+    """Handler that calls ``take`` in the thread that reads the network; zenoh-python's own way is one thread further.
+
+    While it runs nothing else is read from that link: it must be quick, and must not use the session. The interpreter's
+    state of that thread is kept; made anew for every message, it costs more than the way to another thread.
+    """
+    kept = threading.local()
+
+    def receive(sample: zenoh.Sample) -> None:
+        if not hasattr(kept, "state"):
+            kept.state = ctypes.pythonapi.PyGILState_Ensure()  # never released
+        take(sample)
+
+    return handlers.Callback(receive, indirect=False)
 
 
 class TruckClient(Operator):

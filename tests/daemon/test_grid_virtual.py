@@ -4,8 +4,7 @@ from collections import defaultdict
 
 import pytest
 
-from monstertruck_runtime.clock import MILLISECOND, VirtualClock, run_virtual
-from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, QUESTIONS
+from monstertruck_runtime.clock import AHEAD, ESTIMATES, IN_THREADS, MILLISECOND, QUESTIONS, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.load import load_config

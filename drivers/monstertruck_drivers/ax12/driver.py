@@ -8,10 +8,9 @@ from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Present, alarm_names, word
 from monstertruck_drivers.ax12.session import RETRIES, Ax12Session
 from monstertruck_drivers.link import Port
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
-from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.reasons import Reason

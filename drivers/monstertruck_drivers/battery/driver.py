@@ -6,10 +6,9 @@ from monstertruck_drivers.battery import iio
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.computer import Computer
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_schemas.sensor import Battery, DriveFeedback
 
 MISSES: Final = 3

@@ -19,7 +19,7 @@ from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, ObjectError,
 from monstertruck_drivers.epos.objects import Entry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceFaultError,
@@ -30,7 +30,6 @@ from monstertruck_runtime.errors import (
     WrongDeviceError,
 )
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason

@@ -5,9 +5,8 @@ from typing import Final
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_runtime.thresholds import Alarm, Threshold
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth

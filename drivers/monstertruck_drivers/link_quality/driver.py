@@ -6,9 +6,8 @@ from typing import Final
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.interfaces import Sample, choose, read_interfaces
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import IN_THREADS, SECOND, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.schedule import IN_THREADS, Schedule
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
 from monstertruck_schemas.reasons import Reason

@@ -11,7 +11,6 @@ from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import QUESTIONS, Schedule
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason

@@ -15,9 +15,8 @@ from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.emulation import EmulatorSetup, ViewSource
 from monstertruck_drivers.webcam.packets import Packet, PacketKind, encode_mode
 from monstertruck_drivers.webcam.source import Mode
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_runtime.threads import Offload, in_thread
 
 FONT_SIZE: Final = 20

@@ -23,9 +23,8 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude

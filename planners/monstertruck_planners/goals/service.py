@@ -17,11 +17,10 @@ from monstertruck_planners.goals.lookout import blocked, way_ahead
 from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
 from monstertruck_planners.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
 from monstertruck_runtime.actors.actor import Actor
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.requests import Sequences, refusal
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason

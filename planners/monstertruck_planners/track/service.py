@@ -16,10 +16,9 @@ from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
 from monstertruck_planners.track.segments import Progress, SegmentedPath
 from monstertruck_runtime.actors.actor import Actor
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
-from monstertruck_runtime.schedule import Schedule
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason

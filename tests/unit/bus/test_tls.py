@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.client import VARIABLE, ClientTls, TruckClient, station_tls
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, TruckError
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_runtime.station import VARIABLE, ClientTls, station_tls
 from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot

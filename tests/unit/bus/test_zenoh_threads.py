@@ -9,10 +9,9 @@ from pathlib import Path
 
 import zenoh
 
-from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.client import TruckClient, in_network_thread
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.threads import ThreadHop
-from monstertruck_runtime.zenoh_threads import in_network_thread
 from monstertruck_schemas.topics import DRIVE, GATE, Writer
 from tests.bus_kit import gate_state, running_robot
 from tests.unit.bus.test_zenoh_session import put, raw_session

@@ -3,8 +3,16 @@ from itertools import pairwise
 
 import pytest
 
-from monstertruck_runtime.clock import MILLISECOND, SECOND, run_virtual, run_wall
-from monstertruck_runtime.schedule import AHEAD, ESTIMATES, IN_THREADS, Schedule
+from monstertruck_runtime.clock import (
+    AHEAD,
+    ESTIMATES,
+    IN_THREADS,
+    MILLISECOND,
+    SECOND,
+    Schedule,
+    run_virtual,
+    run_wall,
+)
 
 TENTH = SECOND // 10
 

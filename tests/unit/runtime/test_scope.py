@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.scope import scope
+from monstertruck_runtime.service import scope
 
 
 async def until_cancelled(name: str, log: list[str], linger: float = 0.0) -> None:

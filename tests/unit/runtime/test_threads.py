@@ -1,6 +1,7 @@
 """Blocking work that nobody has to wait for."""
 
 import asyncio
+import queue
 import threading
 
 import pytest
@@ -20,17 +21,21 @@ def test_results_and_errors_come_back_from_a_daemon_thread():
 
 
 def test_neither_a_cancelled_caller_nor_the_loops_end_waits_for_work_that_hangs():
-    release = threading.Event()
+    release, threads = threading.Event(), queue.SimpleQueue()
+
+    def hang():
+        threads.put(threading.current_thread())
+        release.wait()
 
     async def main():
-        task = asyncio.create_task(in_daemon_thread(release.wait))
+        task = asyncio.create_task(in_daemon_thread(hang))
         await asyncio.sleep(0.01)
         task.cancel()
         await asyncio.wait([task])
         assert task.cancelled()
 
     asyncio.run(main())
-    workers = [thread for thread in threading.enumerate() if thread.name == "offloaded"]
-    assert len(workers) == 1, "it hangs still"
+    thread = threads.get(timeout=10)
+    assert thread.is_alive(), "it hangs still"
     release.set()
-    workers[0].join()
+    thread.join()

@@ -3,8 +3,7 @@
 import asyncio
 
 from monstertruck_runtime.actors.actor import delivery_of, use_delivery
-from monstertruck_runtime.clock import SECOND, VirtualLoop
-from monstertruck_runtime.schedule import Schedule
+from monstertruck_runtime.clock import SECOND, Schedule, VirtualLoop
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
 
 
