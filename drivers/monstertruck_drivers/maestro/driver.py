@@ -8,7 +8,7 @@ from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.cmd import SteeringCommand
