@@ -89,14 +89,11 @@ def _route(
     ends: tuple[tuple[float, ...], tuple[float, ...]],
     via: list[str], now: Any,
 ) -> "RouteResult":  # fmt: skip
-    from monstertruck_planners.route.hybrid import HybridPlanner
     from monstertruck_planners.route.replan import ViaPoint, plan_through
 
     start, goal = (vehicle.reference_pose(pose) for pose in ends)
     if not via:
         return planner.plan(route_map, start, goal, now)
-    if not isinstance(planner, HybridPlanner):
-        raise InputError("--via: expected the planner hybrid")
     poses = [parse_pose(text, yaw_needed=False) for text in via]
     places = [ViaPoint(*(pose if len(pose) == 2 else vehicle.reference_pose(pose).tolist())) for pose in poses]
     return plan_through(planner, route_map, start, [*places, ViaPoint(*goal.tolist())], now)

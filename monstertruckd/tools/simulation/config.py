@@ -55,6 +55,8 @@ def with_overlay(config: SimulatedTruckConfig, overlay: Mapping[str, Any]) -> Si
 
 
 def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    if "kind" in top and top["kind"] != base.get("kind"):
+        return dict(top)  # another kind has other keys
     deep = {
         k: _merged(base[k], v) if isinstance(v, Mapping) and isinstance(base.get(k), Mapping) else v
         for k, v in top.items()

@@ -161,7 +161,7 @@ class Deformation:
         if self._route is not None and (self._fresh or self._sent_way != self._number):
             assert self._route.poses is not None
             assert self._route.directions is not None
-            way = Way(self._number, self._route.poses, self._route.directions)
+            way = Way(self._number, self._route.poses, self._route.directions, self._route.drivable)
             self._sent_way = self._number
         task = DeformTask(
             scan,

@@ -60,7 +60,7 @@ class DeformStep:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
-        if self._free(setup, here, task.pose, points):
+        if self._way.drivable and self._free(setup, here, task.pose, points):
             self._rest, self._state = None, LocalPlannerState()
             return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
         if self._rest is None:

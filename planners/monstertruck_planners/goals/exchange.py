@@ -63,13 +63,15 @@ class PlanAnswer:
     directions: Array | None = None
     """Shape (n,): +1 or -1."""
     steering: tuple[Steering, ...] = ()
-    """n of them."""
+    """n of them; none: the tracker's own."""
     length: float = 0.0
     """Metres."""
     cost: float = 0.0
     """Metres, with all prices."""
     kept: bool = False
     """It is the rest of the route before."""
+    drivable: bool = True
+    """Its poses follow from motions of the truck; else they only show where to go."""
 
     @property
     def ok(self) -> bool:
@@ -87,6 +89,8 @@ class Way:
     """Shape (n, 3): of the base."""
     directions: Array
     """Shape (n,): +1 or -1."""
+    drivable: bool = True
+    """Else it only shows where to go: what is driven is a local path along it, always."""
 
 
 @dataclass(frozen=True, slots=True)

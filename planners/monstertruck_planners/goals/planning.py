@@ -13,10 +13,9 @@ from monstertruck_planners.collision import OCCUPIED, DistanceField, rectangle_d
 from monstertruck_planners.goals.escape import escape, placed, seen_from
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
 from monstertruck_planners.goals.memory import ObstacleMemory
-from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle
+from monstertruck_planners.route.api import Clock, RouteMap, Vehicle
 from monstertruck_planners.route.catalog import make_planner
-from monstertruck_planners.route.hybrid import HybridPlanner
-from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError
@@ -147,23 +146,19 @@ class PlanningStep:
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
         via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
-        result = self._search(self._planner, route_map, start, via, goal)
+        result = replan(self._planner, route_map, self._route, start, goal, self._now, via=via)
         if result.reason is Reason.START_BLOCKED:
-            result = self._search(self._tight, route_map, start, via, goal)
-        if result.path is None:
+            result = replan(self._tight, route_map, self._route, start, goal, self._now, via=via)
+        if not result.ok:
             return PlanAnswer(result.reason, result.text)
         self._route = result.path
-        kept = bool(result.statistics.get("kept_route", 0.0))
-        return answer_of(result.path, result.cost, kept=kept)
-
-    def _search(
-        self, planner: RoutePlanner, ground: RouteMap, start: Array, via: list[Array], goal: Array
-    ) -> RouteResult:
-        if isinstance(planner, HybridPlanner):
-            return replan(planner, ground, self._route, start, goal, self._now, via=via)
-        if via:
-            return RouteResult(Reason.BAD_INPUT, text="waypoints: expected planner.route.kind hybrid")
-        return planner.plan(ground, start, goal, self._now)
+        if result.path is not None:
+            return answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"]))
+        if result.poses is None or self._setup.config.deform is None:
+            return PlanAnswer(Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.deform")
+        poses = moved(result.poses, -self._vehicle.reference)
+        length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+        return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
 
     def _escape(self, ground: Ground, task: PlanTask) -> PlanAnswer:
         setup = self._setup

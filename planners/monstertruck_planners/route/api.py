@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceField, Footprint
-from monstertruck_planners.route.config import DriveCosts, Unknown
+from monstertruck_planners.route.config import DriveCosts, GoalConfig, Unknown
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from monstertruck_planners.route.search import CostLayer
@@ -176,9 +176,32 @@ class RouteResult:
         """Whether there is a route."""
         return self.reason is Reason.OK
 
+    @property
+    def end(self) -> Array:
+        """Last pose of the reference point, shape (3,).
+
+        Raises:
+            ValueError: there is no route.
+        """
+        if self.path is not None:
+            return self.path.end
+        if self.poses is None:
+            raise ValueError("no route, no end")
+        return np.asarray(self.poses[-1])
+
 
 class RoutePlanner(Protocol):
     """Pure: the same arguments, without a clock, give the same result."""
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """What is driven."""
+        ...
+
+    @property
+    def config(self) -> GoalConfig:
+        """Settings it was made with."""
+        ...
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Route between two poses (x, y, yaw) of the vehicle's reference point.

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.route.api import Clock, RouteMap, RouteResult
+from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult
+from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
@@ -31,7 +33,7 @@ class ViaPoint:
 
 
 def plan_through(
-    planner: HybridPlanner,
+    planner: RoutePlanner,
     route_map: RouteMap,
     start: ArrayLike,
     waypoints: Sequence[ViaPoint],
@@ -49,22 +51,30 @@ def plan_through(
     leg_config = config.model_copy(
         update={"budget": config.budget * share, "effort": max(int(config.effort * share), 1)}
     )
-    leg_planner = HybridPlanner(planner.vehicle, leg_config)
+    leg_planner = make_planner(planner.vehicle, leg_config)
     here = np.asarray(start, dtype=np.float64)
-    legs: list[MotionPath] = []
+    legs: list[RouteResult] = []
     cost, statistics = 0.0, dict[str, float]()
     for number, goal in enumerate(with_headings(here, waypoints), start=1):
         result = leg_planner.plan(route_map, here, goal, now)
-        margin = min(statistics.get("margin", math.inf), result.statistics.get("margin", math.inf))
         for name, value in result.statistics.items():
-            statistics[name] = statistics.get(name, 0.0) + value
-        statistics["margin"] = margin
-        if result.path is None:
+            known = statistics.get(name)
+            statistics[name] = value if known is None else min(known, value) if name == "margin" else known + value
+        if not result.ok:
             return replace(result, text=f"waypoint {number} of {len(waypoints)}: {result.text}", statistics=statistics)
-        legs.append(result.path)
+        legs.append(result)
         cost += result.cost
-        here = result.path.end
-    return RouteResult(Reason.OK, joined(legs), cost=cost, statistics=statistics)
+        here = result.end
+    return replace(_joined(legs), cost=cost, statistics=statistics)
+
+
+def _joined(legs: Sequence[RouteResult]) -> RouteResult:
+    """One path where all legs are paths, else poses."""
+    paths = [leg.path for leg in legs if leg.path is not None]
+    if len(paths) == len(legs):
+        return RouteResult(Reason.OK, joined(paths))
+    poses = [leg.poses if leg.path is None else leg.path.sample(PASSING / 2).poses for leg in legs]
+    return RouteResult(Reason.OK, poses=np.vstack([part for part in poses if part is not None]))
 
 
 def with_headings(start: ArrayLike, waypoints: Sequence[ViaPoint]) -> list[Array]:
@@ -92,7 +102,7 @@ class KeepPolicy:
 
 
 def replan(
-    planner: HybridPlanner,
+    planner: RoutePlanner,
     route_map: RouteMap,
     previous: MotionPath | None,
     pose: ArrayLike,
@@ -104,7 +114,7 @@ def replan(
     """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
 
     This hysteresis keeps a truck before an obstacle from changing sides.
-    ``statistics["kept_route"]`` is 1 if it is kept.
+    ``statistics["kept_route"]`` is 1 if it is kept. Only paths are kept; routes that are mere poses are planned anew.
 
     Args:
         planner: of both.
@@ -119,15 +129,25 @@ def replan(
     policy = policy or KeepPolicy()
     stops = [ViaPoint(*place.tolist()) for place in (*via, np.asarray(goal, dtype=np.float64))] if via else []
     fresh = plan_through(planner, route_map, pose, stops, now) if stops else planner.plan(route_map, pose, goal, now)
-    keeper = planner.planner_for(fresh.statistics.get("margin", planner.config.margin))
+    judge = _judge(planner)
+    keeper = judge.planner_for(fresh.statistics.get("margin", judge.config.margin))
     kept = None if previous is None else remaining_route(keeper, route_map, previous, pose, goal, policy.reach)
     if kept is not None and not all(_passes(kept, place) for place in via):
         kept = None
-    if kept is None or (fresh.ok and fresh.cost < (1.0 - policy.gain) * keeper.cost(route_map, kept)):
+    cost = fresh.cost if judge is planner or fresh.path is None else keeper.cost(route_map, fresh.path)
+    if kept is None or (fresh.ok and cost < (1.0 - policy.gain) * keeper.cost(route_map, kept)):
         return replace(fresh, statistics={**fresh.statistics, "kept_route": 0.0})
     return RouteResult(
         Reason.OK, kept, cost=keeper.cost(route_map, kept), statistics={**fresh.statistics, "kept_route": 1.0}
     )
+
+
+def _judge(planner: RoutePlanner) -> HybridPlanner:
+    """Says which paths are free, and what they cost by the settings that the planner shares with hybrid A*."""
+    if isinstance(planner, HybridPlanner):
+        return planner
+    shared = (set(type(planner.config).model_fields) & set(HybridConfig.model_fields)) - {"kind"}
+    return HybridPlanner(planner.vehicle, HybridConfig(**{name: getattr(planner.config, name) for name in shared}))
 
 
 def remaining_route(

@@ -9,6 +9,7 @@ from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_primitives
 from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.replan import replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
 
@@ -80,3 +81,14 @@ def test_every_kind_plans(kind):
     warm_up(planner)
     result = planner.plan(RouteMap.from_cells(np.zeros((60, 60), np.int8), 0.1), (1, 1, 0), (4, 4, 0))
     assert result.ok
+
+
+def test_a_route_of_any_planner_of_paths_is_kept_while_it_is_good():
+    planner = make_planner(CAR, ROUTE_PLANNERS.settings["lattice"](effort=2000))
+    route_map = RouteMap.from_cells(np.zeros((60, 60), np.int8), 0.1)
+    first = replan(planner, route_map, None, (1, 1, 0), (4, 4, 0))
+    assert first.statistics["kept_route"] == 0.0
+    on_the_way = first.path.part(0.5, math.inf).start
+    again = replan(planner, route_map, first.path, on_the_way, (4, 4, 0))
+    assert again.statistics["kept_route"] == 1.0
+    assert again.path.length < first.path.length - 0.5 + 1e-3

@@ -23,7 +23,9 @@ def run(*arguments):
     return CliRunner().invoke(app, ["plan", *map(str, arguments)])
 
 
-@pytest.mark.parametrize("options", [(), ("--steering", "2ws", "--planner", "lattice"), ("--via", "2,2.4")])
+@pytest.mark.parametrize(
+    "options", [(), ("--steering", "2ws", "--planner", "lattice", "--via", "2,2.4,0"), ("--via", "2,2.4")]
+)
 def test_a_route_in_figures_and_as_a_picture(hall, tmp_path, options):
     picture = tmp_path / "route.png"
     result = run(hall, "-0.3,0,0", "4,0,0", "--reproducible", "--json", "--png", picture, *options)
@@ -37,9 +39,17 @@ def test_a_route_in_figures_and_as_a_picture(hall, tmp_path, options):
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_waypoints_of_a_planner_over_the_grid(hall):
+    result = run(hall, "0,0,0", "4,0,0", "--reproducible", "--json", "-p", "grid_astar", "--via", "1,2", "--via", "3,2")
+    poses = np.array(json.loads(result.stdout)["poses"])
+    assert [poses[0].tolist(), poses[-1].tolist()] == [pytest.approx([0, 0, 0]), pytest.approx([4, 0, 0])]
+    for place in ((1, 2), (3, 2)):
+        assert np.hypot(*(poses[:, :2] - place).T).min() < 1e-9
+
+
 def test_words_for_people(hall):
     assert "changes of direction" in run(hall, "0,0,0", "4,0,0", "--reproducible").stdout
-    assert "not drivable" in run(hall, "0,0,0", "4,0,0", "--reproducible", "--planner", "grid_astar").stdout
+    assert "poses only" in run(hall, "0,0,0", "4,0,0", "--reproducible", "--planner", "grid_astar").stdout
 
 
 @pytest.mark.parametrize(
@@ -56,7 +66,7 @@ def test_nonsense_is_refused(hall):
         ("0,0", ()),
         ("a,b,c", ()),
         ("0,0,0", ("--via", "1")),
-        ("0,0,0", ("--via", "1,2", "-p", "lattice")),
+        ("0,0,0", ("-p", "teleport")),
     ):
         result = run(hall, start, "4,0,0", "--reproducible", *options)
         assert result.exit_code == 3
