@@ -49,7 +49,7 @@ def test_waypoints_of_a_planner_over_the_grid(hall):
 
 def test_words_for_people(hall):
     assert "changes of direction" in run(hall, "0,0,0", "4,0,0", "--reproducible").stdout
-    assert "poses only" in run(hall, "0,0,0", "4,0,0", "--reproducible", "--planner", "grid_astar").stdout
+    assert "no drivable motion" in run(hall, "0,0,0", "4,0,0", "--reproducible", "--planner", "grid_astar").stdout
 
 
 @pytest.mark.parametrize(
