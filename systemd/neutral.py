@@ -22,7 +22,7 @@ sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checko
 
 from monstertruck_drivers.epos.protocol import Frame, FrameError, decode_body, stop_frames
 
-PATIENCE = 5.0
+TIMEOUT = 5.0
 FRAME_TIMEOUT = 0.55
 """The controller forgets a half-received frame after 500 ms of silence."""
 BRAKING = 0.4
@@ -56,8 +56,8 @@ def drive(argument: str) -> tuple[str, int, int]:
 
 
 def insist(port: str, node: int, baud: int, stopped: list[str]) -> None:
-    """Try until the controller has stopped or patience ends; adds the port to ``stopped``."""
-    give_up = time.monotonic() + PATIENCE
+    """Try until the controller has stopped or the time-out; adds the port to ``stopped``."""
+    give_up = time.monotonic() + TIMEOUT
     while time.monotonic() < give_up:
         try:
             stop(port, node, baud)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruckd.tools.cli.goto_session import Arrival
 
-PATIENCE: Final = 6.0
+ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
 
 ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the truck as well; it drives off at once.")]
@@ -80,7 +80,7 @@ def _run(
     from monstertruck_runtime.client import TruckClient
 
     async def main(clock: Clock) -> "Arrival":
-        async with TruckClient(robot, endpoint, clock=clock, timeout=PATIENCE) as client:
+        async with TruckClient(robot, endpoint, clock=clock, timeout=ROUTE_TIMEOUT) as client:
             return await drive(client, clock)
 
     arrival = run_wall(main)

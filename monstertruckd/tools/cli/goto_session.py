@@ -19,7 +19,7 @@ from monstertruckd.tools.cli.output import progress, remark
 
 LOOK: Final = 0.5
 """Half the period of reports why the truck stands, s."""
-PATIENCE: Final = 3.0
+ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
 
 
@@ -117,14 +117,14 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool) -> Arri
 
 async def _accepted(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
     try:
-        async with clock.deadline(PATIENCE):
+        async with clock.deadline(ACCEPT_TIMEOUT):
             while present.latest is None or present.latest.name != name:
                 for event in events.drain():
                     if event.source == driver.source and event.severity is Severity.WARNING:
                         raise RequestRefusedError(event.reason, event.text)
                 await clock.sleep(0.05)
     except TimeoutError:
-        raise NoAnswerError(f"the robot did not accept the path within {PATIENCE:g} s") from None
+        raise NoAnswerError(f"the robot did not accept the path within {ACCEPT_TIMEOUT:g} s") from None
 
 
 async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str) -> Arrival:
@@ -135,7 +135,7 @@ async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str) -> A
                 continue
             show(state.along / state.length if state.length else 1.0)
             if state.outcome is not Reason.DRIVING:
-                text = f"{state.along:.2f} of {state.length:.2f} m, {state.cross_track:+.3f} m beside it"
+                text = f"{state.along:.2f} of {state.length:.2f} m, {state.cross_track:+.3f} m off the path"
                 return Arrival(state.outcome, text, state.length, (clock.now() - begin) / SECOND)
     raise NoAnswerError("the link to the robot was closed")
 

@@ -1,8 +1,8 @@
-"""Keyboard driving without a terminal: keys in, requests and orders out. Pure.
+"""Keyboard driving: bytes of a terminal to keys, keys to drive requests and orders. Pure.
 
-A terminal tells that a key went down and repeats it while it is held, but never that it was let go. So every driving
-key stands for a short time only, and with none standing there is one neutral request and then silence: the truck stops
-even if this program hangs or its link breaks, for nothing renews the lease.
+A terminal reports a key press and repeats it while the key is held, but never its release. So every driving key is
+valid for a short time only; after the last one there is one neutral request and then none: the truck stops even if this
+program hangs or its link breaks, because nothing renews the lease.
 """
 
 import math
@@ -12,6 +12,22 @@ from typing import Final, Literal
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
+
+ESCAPE: Final = b"\x1b"
+PASTE: Final = b"\x1b[200~"
+PASTE_END: Final = b"\x1b[201~"
+
+_FINALS: Final = {
+    "A": "up",
+    "B": "down",
+    "C": "right",
+    "D": "left",
+    "I": "focus in",
+    "O": "focus out",
+}
+"""Last character of a control sequence (ECMA-48 section 5.4; xterm's arrow keys and focus reports)."""
+
+_NAMES: Final = {"\r": "enter", "\n": "enter", " ": "space", "\x1b": "escape", "\x04": "end"}
 
 STEPS: Final = 8
 """Key presses from straight to full lock."""
@@ -28,9 +44,74 @@ ENDS: Final = frozenset({"q", "end"})
 Command = Order | Literal["end"]
 
 
+class KeyReader:
+    """Cuts a stream of bytes into keys; what was pasted is no key."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._pasting = False
+
+    def feed(self, data: bytes) -> list[str]:
+        """Names of the keys that ``data`` completes; letters come as lower case."""
+        self._rest += data
+        keys = []
+        while (part := self._next()) is not None:
+            if part == PASTE:
+                self._pasting = True
+            elif part == PASTE_END:
+                self._pasting = False
+            elif not self._pasting and (name := _name(part)) is not None:
+                keys.append(name)
+        return keys
+
+    def flush(self) -> list[str]:
+        """The escape key, if that was all: to be called when nothing has followed for a moment."""
+        rest, self._rest = self._rest, b""
+        return ["escape"] if rest == ESCAPE and not self._pasting else []
+
+    def clear(self) -> None:
+        """Forget what has come so far."""
+        self._rest, self._pasting = b"", False
+
+    def _next(self) -> bytes | None:
+        """Cut the first whole key off; None if there is none yet."""
+        length = _length(self._rest)
+        if length is None:
+            return None
+        part, self._rest = self._rest[:length], self._rest[length:]
+        return part
+
+
+def _length(data: bytes) -> int | None:
+    """Bytes of the first key; None while it may go on."""
+    if not data or data == ESCAPE:
+        return None
+    if not data.startswith(ESCAPE):
+        return 1
+    if data[1:2] == b"O":
+        return 3 if len(data) >= 3 else None
+    if data[1:2] != b"[":
+        return 1 if data[1:2] == ESCAPE else 2
+    for index, byte in enumerate(data[2:], start=3):
+        if 0x40 <= byte <= 0x7E:
+            return index
+    return None
+
+
+def _name(part: bytes) -> str | None:
+    if not part.isascii():
+        return None
+    text = part.decode("ascii")
+    if part.startswith((b"\x1b[", b"\x1bO")):
+        return _FINALS.get(text[-1])
+    if len(part) > 1:
+        return None
+    return _NAMES.get(text, text.lower() if text.isprintable() else None)
+
+
 @dataclass(frozen=True, slots=True)
 class TeleopRequest:
-    """What to ask of the gate."""
+    """Requested motion."""
 
     speed: float
     """m/s."""
@@ -62,16 +143,16 @@ def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]
 
 @dataclass(slots=True)
 class Teleop:
-    """State between the keys. Times are ns."""
+    """State of keyboard driving. Times are ns."""
 
     angle: float = 0.4
     """Full lock of an axle, rad."""
     first_hold: float = 0.6
-    """Seconds a first press stands: longer than the keyboard waits before it repeats."""
+    """Seconds a first press is valid: longer than the keyboard's delay before it repeats."""
     hold: float = 0.25
-    """Seconds a repetition stands."""
+    """Seconds a repetition is valid."""
     arm_hold: float = 2.0
-    """Seconds the keyboard holds the truck at rest after arming it, so that no tracker drives off instead."""
+    """Seconds of neutral requests after arming, so that no tracker starts to drive."""
     level: int = 1
     """Index into ``SPEEDS``."""
     mode: SteeringMode = SteeringMode.FRONT
@@ -80,9 +161,9 @@ class Teleop:
     _throttle: int = 0
     _last: str = ""
     _until: int = 0
-    """What the driving keys ask for stands until then."""
+    """The driving keys are valid until then."""
     _resting: int = 0
-    """Until then the truck is held at rest where no key stands."""
+    """Until then standstill is requested without a key."""
     _asking: bool = False
 
     @property
@@ -106,7 +187,7 @@ class Teleop:
         return self._throttle
 
     def press(self, key: str, now: int) -> Command | None:
-        """Take a key; returns what is to be done at once."""
+        """Take a key; returns the command it gives, if any."""
         if key in ENDS:
             self.release()
             return "end"
@@ -128,7 +209,7 @@ class Teleop:
         return None
 
     def _drive(self, key: str, now: int) -> None:
-        """A driving key: it sets its own part and keeps the rest standing."""
+        """Take a driving key: it sets its own part and extends the rest."""
         self._steer = _stepped(self._steer, STEERING.get(key, 0))
         self._drift = _stepped(self._drift, DRIFTING.get(key, 0))
         if key == CENTRE:
@@ -140,11 +221,11 @@ class Teleop:
         self._last = key
 
     def release(self) -> None:
-        """All keys count as let go."""
+        """Release all keys."""
         self._until = self._resting = self._throttle = 0
 
     def request(self, now: int) -> TeleopRequest | None:
-        """What to ask for now: the keys' motion, once a stop after it, then nothing."""
+        """The present request: the keys' motion, one standstill after it, then none."""
         front, rear = axles(self.mode, self.steer, self.drift)
         rear = math.copysign(min(abs(rear), self.angle), rear)
         if now <= self._until:

@@ -5,7 +5,7 @@ from rich.console import Console
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.tools.cli.drive_screen import Stream, draw
+from monstertruckd.tools.cli.drive_session import Stream, draw
 from monstertruckd.tools.cli.live import shortened
 from monstertruckd.tools.cli.teleop import Teleop, TeleopRequest
 from monstertruckd.tools.status.screen import ScreenState

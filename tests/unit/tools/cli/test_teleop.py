@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
-from monstertruckd.tools.cli.keys import KeyReader
-from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Teleop, TeleopRequest, axles
+from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, KeyReader, Teleop, TeleopRequest, axles
 
 START = 5 * SECOND
 
