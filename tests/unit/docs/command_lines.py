@@ -35,6 +35,7 @@ class Instead:
 
 MOVES = "drives for minutes; tests/daemon/test_calibration_virtual.py does it on the virtual clock"
 SYSTEM = "needs root"
+OWN_DEVICE = "needs the page's own package; tests/daemon/test_own_device.py installs and runs it"
 
 INSTEAD = {
     "monstertruckd log view logs/run-000001-000.mcap": Instead(
@@ -64,6 +65,9 @@ INSTEAD = {
     "monstertruckd calibrate steering": Instead(None, MOVES),
     "monstertruckd calibrate steering --rough": Instead(None, MOVES),
     "monstertruckd calibrate compass": Instead(None, MOVES),
+    "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
+    "monstertruckd emulate sonar --link /tmp/sonar": Instead(None, OWN_DEVICE),
+    "monstertruckd probe sonar --port /tmp/sonar": Instead(None, OWN_DEVICE),
 }
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
