@@ -1,8 +1,8 @@
-"""Deformation: a route meets what the map does not know, with front steering and with both axles.
+"""Local planners: obstacles on a route that the map does not contain, with front steering and with both axles.
 
-A kinematic truck with a lidar drives each scenario with each deformer; all share window, follower and goal tolerance
-(0.2 m, 0.2 rad, the author's). A row is better than its published peer (same strategy; the author's for teb) if it
-arrives where that fails, or both arrive and it is not slower, and it touches nothing more often.
+A kinematic truck with a lidar drives each scenario with each local planner; all share window, follower and goal
+tolerance (0.2 m, 0.2 rad, the author's). A run is better than that of the published planner (same strategy; the
+author's for teb) if it arrives where that fails, or both arrive and it is not slower, and it has no more contacts.
 """
 
 import json
@@ -55,7 +55,7 @@ def run(options: Options) -> Part:
                 row |= {"scenario": scenario.name, "car": car, "method": name, "better": better(row, peer)}
                 rows.append(row | {"peer": {k: v for k, v in peer.items() if k != "cycles_ms"}})
                 print(
-                    f"{scenario.name:16} {car} {name:22} {told(row)} | published {told(peer)}"
+                    f"{scenario.name:16} {car} {name:22} {summary(row)} | published {summary(peer)}"
                     f"{'' if row['better'] else '   not better'}",
                     flush=True,
                 )
@@ -125,7 +125,7 @@ def better(row: dict, peer: dict) -> bool:
     return not peer["reached"] or row["time_s"] <= peer["time_s"]
 
 
-def told(row: dict) -> str:
+def summary(row: dict) -> str:
     what = f"{row['time_s']:5.1f} s" if row["reached"] else f"fails ({row['reason'] or 'time'})"
     hits = f", {row['contacts']} contacts" if row["contacts"] else ""
     return f"{what}, clearance {row['clearance_m']:.3f} m{hits}"

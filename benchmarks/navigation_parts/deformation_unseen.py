@@ -1,4 +1,4 @@
-"""Deformation where the rules were not developed: other measures, boxes, doors and people, drawn at random.
+"""Local planners in scenarios they were not developed on: other measures, boxes, doors and people, drawn at random.
 
 Same truck, lidar, follower and tolerance as in the part deformation, the published planner left out.
 """
@@ -10,7 +10,7 @@ import numpy as np
 
 from monstertruck_planners.local.config import LocalPlannerConfig, RsbandConfig, TebConfig
 from navigation_parts import Options, Part
-from navigation_parts.deformation import CARS, drive, told
+from navigation_parts.deformation import CARS, drive, summary
 from navigation_parts.deformation_world import unseen
 
 SEEDS = 8
@@ -27,7 +27,7 @@ def run(options: Options) -> Part:
                     row = drive(scenario, car, config)
                     row |= {"scenario": scenario.name, "seed": seed, "car": car, "method": name}
                     rows.append(row)
-                    print(f"{seed} {scenario.name:20} {car} {name:7} {told(row)}", flush=True)
+                    print(f"{seed} {scenario.name:20} {car} {name:7} {summary(row)}", flush=True)
     cycles = np.concatenate([row.pop("cycles_ms") for row in rows])
     part.add("rows", len(rows))
     part.add("cycle_p99_ms", float(np.percentile(cycles, 99)), 50.0)

@@ -56,9 +56,9 @@ class Scenario:
         """The route."""
         start, goal = (np.array(p) for p in (self.start, self.goal))
         if self.planned:
-            ground = RouteMap(DistanceField(grid(*self.known), RES))
+            route_map = RouteMap(DistanceField(grid(*self.known), RES))
             planner = HybridPlanner(vehicle, HybridConfig(margin=0.05, effort=20_000))
-            path = planner.plan(ground, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
+            path = planner.plan(route_map, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
             assert path is not None
             return PosePath.from_motion(path)
         x = np.arange(start[0], goal[0] + 0.04, 0.08)

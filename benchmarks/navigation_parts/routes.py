@@ -61,17 +61,17 @@ def run(options: Options) -> Part:
     rows = []
     for name, queries in setting["queries"].items():
         occupied, resolution = read(options.data / "maps" / f"{name}.yaml")
-        ground = RouteMap.from_cells(np.where(occupied, 100, 0).astype(np.int8), resolution)
+        route_map = RouteMap.from_cells(np.where(occupied, 100, 0).astype(np.int8), resolution)
         world = strict.World(occupied, resolution)
         for number, case in enumerate(queries):
             query = Query(name, tuple(case["start"]), tuple(case["goal"]), case["shortest_known_m"])
             if not rows:
                 for planner in planners.values():
-                    planner.plan(ground, query.start, query.goal, time.thread_time)
+                    planner.plan(route_map, query.start, query.goal, time.thread_time)
                 part.add("warm_up_s", time.thread_time() - begin)
             row = {"map": name, "query": number, "known_m": query.known}
             for kind, planner in planners.items():
-                result = planner.plan(ground, query.start, query.goal, time.thread_time)
+                result = planner.plan(route_map, query.start, query.goal, time.thread_time)
                 row |= {
                     f"{key}_{kind}": value for key, value in judged(result, world, planner, query, tolerance).items()
                 }
@@ -86,14 +86,14 @@ def run(options: Options) -> Part:
                 f"{row['faults_2ws'] + row['faults_4ws'] or 'valid'}",
                 flush=True,
             )
-        refuse(part, name, planners["2ws"], ground, query, world)
+        refuse(part, name, planners["2ws"], route_map, query, world)
         walled = RouteMap.from_cells(
             np.where(walled_in(occupied, resolution, query.goal), 100, 0).astype(np.int8), resolution
         )
         since = time.thread_time()
         result = planners["2ws"].plan(walled, query.start, query.goal, time.thread_time)
         part.add(f"unreachable_ms_{name}", (time.thread_time() - since) * 1e3, 2000.0)
-        part.add(f"unreachable_not_told_{name}", int(result.reason is not Reason.GOAL_UNREACHABLE), 0)
+        part.add(f"unreachable_not_reported_{name}", int(result.reason is not Reason.GOAL_UNREACHABLE), 0)
     sum_up(part, rows)
     (options.out / "routes.json").write_text(json.dumps(rows, indent=1))
     draw(options, rows)
@@ -127,7 +127,7 @@ def judged(result, world, planner, query: Query, tolerance) -> dict:  # noqa: AN
     }
 
 
-def refuse(part: Part, name: str, planner, ground, query: Query, world) -> None:  # noqa: ANN001
+def refuse(part: Part, name: str, planner, route_map, query: Query, world) -> None:  # noqa: ANN001
     """Bad goals: which reason, and after which time."""
     wall = np.array(middle_of_a_square(world))
     worst = 0.0
@@ -137,7 +137,7 @@ def refuse(part: Part, name: str, planner, ground, query: Query, world) -> None:
         ((float("nan"), 1.0, 0.0), {Reason.NOT_FINITE}),
     ):
         begin = time.thread_time()
-        result = planner.plan(ground, query.start, goal, time.thread_time)
+        result = planner.plan(route_map, query.start, goal, time.thread_time)
         worst = max(worst, time.thread_time() - begin)
         if result.reason not in reasons:
             part.add(f"wrong_reason_{name}_{result.reason.value}", 1, 0)

@@ -77,7 +77,7 @@ def faults(world: World, rule: Rule, start, goal, segments) -> list[str]:  # noq
             found.append(f"sideslip {sideslip:.4f}")
     off = poses[-1] - np.asarray(goal)
     if math.hypot(off[0], off[1]) > rule.position or abs(math.remainder(off[2], math.tau)) > rule.yaw:
-        found.append("ends beside the goal")
+        found.append("does not end at the goal")
     centres = np.concatenate(
         [poses[:, :2] + d * np.column_stack((np.cos(poses[:, 2]), np.sin(poses[:, 2]))) for d in rule.discs]
     )
