@@ -8,9 +8,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-import numpy as np
-
-from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
@@ -102,19 +99,6 @@ def invert(transform: Transform) -> Transform:
         translation=(-x, -y, -z),
         rotation=back,
     )
-
-
-def transform_points(transform: Transform, points: Array) -> Array:
-    """Points, shape (n, 3), of the child frame in the parent frame, m."""
-    x, y, z, w = transform.rotation
-    matrix = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return np.asarray(points @ matrix.T + np.array(transform.translation))
 
 
 def mount(child: str, position: Vector, rpy: Vector = (0.0, 0.0, 0.0), parent: str = "base") -> Transform:

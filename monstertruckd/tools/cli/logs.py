@@ -69,12 +69,12 @@ def list_command(
         right=("seconds", "messages", "MB"),
     )
     if any(log.state in {LogState.UNFINISHED, LogState.DAMAGED} for log in logs):
-        remark("`monstertruckd log recover FILE` finishes an unfinished log and mends a damaged one")
+        remark("`monstertruckd log recover FILE` repairs unfinished and damaged logs")
 
 
 @app.command("info")
 def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
-    """What a log holds: topics, counts, rates, attachments, damage."""
+    """Show what a log holds: topics, counts, rates, attachments, damage."""
     from monstertruckd.recorder.repair import in_use
     from monstertruckd.tools.logs.summary import info
 
@@ -85,8 +85,8 @@ def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     size = f"{summary['size'] / 1e6:.2f} MB"
     print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
     if summary["damage"]:
-        mend = "it is being written" if in_use(log) else "`monstertruckd log recover` repairs it"
-        print(f"damaged: {summary['damage']}; {mend}")
+        repair = "it is being written" if in_use(log) else "`monstertruckd log recover` repairs it"
+        print(f"damaged: {summary['damage']}; {repair}")
     rows = [
         (
             name,
@@ -121,10 +121,10 @@ def recover_command(
 @app.command("report")
 def report_command(
     log: LogArgument,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="HTML file; default: beside the log.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="HTML file; default: next to the log.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Write one HTML page about a log: way, states, events, signals, health, losses. It needs no network."""
+    """Write one HTML page about a log: path, states, events, signals, health, losses. It needs no network."""
     from monstertruckd.tools.logs.report import report
 
     with _reading("report", log) as done:
@@ -172,7 +172,7 @@ def view_command(
     start: StartOption = 0.0,
     end: EndOption = None,
 ) -> None:
-    """Show a log in the rerun viewer, laid out, without any network (extra `view`)."""
+    """Show a log in the rerun viewer, with a layout, without any network (extra `view`)."""
     from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
@@ -210,7 +210,7 @@ def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress]
 
 @contextmanager
 def needs_extra(name: str) -> Iterator[None]:
-    """Say which extra of the distribution brings a library that is missing.
+    """Name the extra of the distribution that contains a missing library.
 
     Raises:
         NotFoundError: an import inside failed.

@@ -1,4 +1,4 @@
-"""Commands on maps: build one from a log, look at it, take it from a robot, localise in it."""
+"""Commands on maps: build one from a log, show it, save a robot's, localise in it."""
 
 from collections import Counter
 from pathlib import Path
@@ -25,10 +25,10 @@ def build(
     log: Log,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
     png: Png = None,
-    front: Annotated[str, typer.Option(help="Scan front end: planar or kiss.")] = "planar",
+    front: Annotated[str, typer.Option(help="Scan matcher: planar or kiss.")] = "planar",
     json_output: JsonOption = False,
 ) -> None:
-    """A map from a log's scans, and its odometry where there is one."""
+    """Build a map from a log's scans, and its odometry if it has any."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_estimation.slam.worker_io import WorkerInput
@@ -55,7 +55,7 @@ def build(
 
 @app.command("show")
 def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
-    """What a saved map holds."""
+    """Show the facts of a saved map."""
     from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.map_files import FREE, OCCUPIED
 
@@ -79,12 +79,12 @@ def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> N
 
 @app.command("save")
 def save(
-    output: Annotated[Path, typer.Argument(help="YAML file; its PNG goes beside it.", show_default=False)],
+    output: Annotated[Path, typer.Argument(help="YAML file; its PNG is written next to it.", show_default=False)],
     robot: Annotated[str, typer.Option(help="Name in the keys.")] = "truck",
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the robot.")] = ENDPOINT,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the map.")] = 5.0,
 ) -> None:
-    """The map that a running robot has published, as map_server files."""
+    """Save the map of a running robot as map_server files."""
     from monstertruck_estimation.slam.storage import trinary
     from monstertruck_estimation.slam.worker_io import GridPatch
     from monstertruck_runtime.client import TruckClient
@@ -116,7 +116,7 @@ def load_command(
     config: Annotated[Path, typer.Option("--config", "-c", help="The robot's configuration.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
-    """A configuration with which the robot localises in a saved map."""
+    """Write a configuration with which the robot localises in a saved map."""
     from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import yaml_text
@@ -135,7 +135,7 @@ def load_command(
 
 @app.command("localise")
 def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
-    """Where a log's scans were taken in a saved map, without knowing where it begins."""
+    """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.storage import load
     from monstertruck_estimation.slam.worker import SlamWorker
@@ -155,7 +155,7 @@ def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption
 
 
 def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["SlamEstimate"]]:
-    """Every scan through the worker; what to tell of it, and the estimates."""
+    """Run every scan through the worker; returns facts to print, and the estimates."""
     from monstertruck_estimation.slam.worker_io import Start, WorkerInput
 
     first = log.scans[0].odom or (0.0, 0.0, 0.0)
@@ -193,8 +193,8 @@ def _print(facts: dict[str, Any], json_output: bool) -> None:
         print(f"{name.replace('_', ' '):18} {text}")
 
 
-def _draw(path: Path, saved: Any, way: Any = ()) -> None:
-    """The grid with the poses of its keyframes, or with another way."""
+def _draw(path: Path, saved: Any, places: Any = ()) -> None:
+    """The grid with the poses of its keyframes, or with another path."""
     import numpy as np
 
     from monstertruckd.tools.cli.kinematics import figure
@@ -202,12 +202,16 @@ def _draw(path: Path, saved: Any, way: Any = ()) -> None:
     grid = saved.grid
     shades = np.choose(grid.cells.astype(int) // 100 + 1, (0.8, 1.0, 0.0))
     (x0, y0), (width, height) = grid.origin, grid.size
-    poses = np.array(way).reshape(-1, 3) if len(way) or saved.graph is None else saved.graph.poses
+    poses = np.array(places).reshape(-1, 3) if len(places) or saved.graph is None else saved.graph.poses
     with figure(path, "x, m", "y, m") as axes:
         extent = (x0, x0 + width, y0, y0 + height)
         axes.imshow(shades, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
         axes.plot(
-            poses[:, 0], poses[:, 1], color="#e0482f", linewidth=1.2, label="localised" if len(way) else "keyframes"
+            poses[:, 0],
+            poses[:, 1],
+            color="#e0482f",
+            linewidth=1.2,
+            label="localised" if len(places) else "keyframes",
         )
         axes.legend(loc="upper right")
         axes.set_aspect("equal")

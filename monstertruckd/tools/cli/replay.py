@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.replay_check.result import Check
 
 CHECK = "Compute the log's outputs again from its sensors and compare them."
-CONFIG = "With --check: compute with this configuration and show what it would have changed."
+CONFIG = "With --check: compute with this configuration and show what it changes."
 TOLERANCE = "With --check: greatest difference that agrees, in m, rad and so on; 0 = equal bit for bit."
 
 ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise"
@@ -35,8 +35,8 @@ def replay(
 ) -> None:
     """Publish a log on Zenoh at its own times, for `status`, `echo` and any other subscriber; or check it.
 
-    Ctrl-C or SIGTERM end it like its last message does, with exit code 0. With --check nothing is published: what the
-    robot made of its sensors is computed once more and held against what it recorded.
+    Ctrl-C or SIGTERM end it, as its last message does, with exit code 0. With --check nothing is published: the outputs
+    are computed again from the recorded sensors and compared with the recorded ones.
     """
     if check:
         _check(log, config, tolerance, json_output=json_output)

@@ -17,7 +17,6 @@ from monstertruck_estimation.transforms import (
     quaternion_from_rpy,
     quaternion_from_yaw,
     rotate,
-    transform_points,
     wrap_angle,
     yaw_of,
 )
@@ -70,14 +69,6 @@ def test_there_and_back_is_nothing(x, y, z, roll, pitch, yaw):
     assert nothing.translation == pytest.approx((0, 0, 0), abs=1e-9)
     assert nothing.rotation == pytest.approx((0, 0, 0, 1), abs=1e-9)
     assert (nothing.parent, nothing.child) == ("base", "base")
-
-
-@given(metre, metre, angle, angle)
-@settings(max_examples=20)
-def test_points_go_the_same_way_as_vectors(x, y, roll, yaw):
-    transform = mount("lidar", (0.14, 0.0, 0.2), (roll, 0.1, yaw))
-    expected = np.add(rotate(transform.rotation, (x, y, 0.5)), transform.translation)
-    assert transform_points(transform, np.array([[x, y, 0.5]]))[0] == pytest.approx(expected)
 
 
 def tree():
