@@ -71,7 +71,7 @@ class OccupancyGrid:
         if self._mark > np.iinfo(np.uint16).max:
             self._marks[:] = 0
             self._mark = 1
-        _trace(
+        trace(
             self._odds.ravel(),
             self._marks.ravel(),
             self._odds.shape[1],
@@ -79,6 +79,7 @@ class OccupancyGrid:
             self._corner,
             self._mark,
             (self._hit, self._miss, self._limit),
+            len(points),
         )
 
     def patch(self) -> GridPatch:
@@ -177,12 +178,23 @@ def _cells(points, sensor, scale):  # type: ignore[no-untyped-def] # noqa: ANN00
 
 
 @njit(cache=True)
-def _trace(odds, marks, stride, ends, corner, mark, model):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Add one scan to the flat grids: its ends first, then what lies before them, every cell once."""
+def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
+    """Add one scan to a grid: first the cells in which beams end, then those they pass, every cell once.
+
+    Args:
+        odds: int16, flat; log odds of the cells.
+        marks: uint16, flat; number of the last scan that changed each cell.
+        stride: cells of a row.
+        ends: int32, shape (n + 1, 2), (column, row) of the sensor and of every beam's end; all inside the grid.
+        corner: (column, row) of the first cell.
+        mark: number of this scan.
+        model: log odds added by an end, by a pass (negative), and their limit.
+        hits: the first so many beams ended at something; the others only pass.
+    """
     hit, miss, limit = model
     x0, y0 = ends[0, 0] - corner[0], ends[0, 1] - corner[1]
     n = ends.shape[0]
-    for i in range(1, n):
+    for i in range(1, hits + 1):
         at = (ends[i, 1] - corner[1]) * stride + ends[i, 0] - corner[0]
         if marks[at] != mark:
             marks[at] = mark

@@ -1,18 +1,24 @@
-"""Local obstacle grid: a window that moves with the truck and is filled by the lidar. Loads numba."""
+"""Local obstacle grid: a window that moves with the truck and is filled by the lidar. Loads numba.
+
+It is an occupancy grid of which the newest scan decides: its cells are free (-1), unknown (0) or occupied (1).
+"""
 
 import math
 from typing import Annotated
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import binary_dilation
 
+from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
+
+_NEWEST_DECIDES = (2, -2, 1)
+"""Steps of a hit and of a pass, and the limit: one scan changes any cell to either."""
 
 
 class WindowConfig(Schema):
@@ -42,8 +48,9 @@ class Window:
     def __init__(self, config: WindowConfig | None = None) -> None:
         self.config = config or WindowConfig()
         count = round(self.config.size / self.config.resolution)
-        self.cells: NDArray[np.bool_] = np.zeros((count, count), np.bool_)
-        self.seen: NDArray[np.bool_] = np.zeros((count, count), np.bool_)
+        self._odds: NDArray[np.int16] = np.zeros((count, count), np.int16)
+        self._marks: NDArray[np.uint16] = np.zeros((count, count), np.uint16)
+        self._mark = 0
         self._corner: tuple[int, int] | None = None
 
     def add_scan(
@@ -64,9 +71,33 @@ class Window:
             raise InputError(f"scan of {ends.shape} ends, {hit.shape} hits: expected (n, 2) and (n,)")
         self._move(base)
         res = self.config.resolution
-        corner = np.array(self.corner)
-        start = (np.array(sensor) - corner) / res
-        _mark(self.cells, self.seen, start, (ends - corner) / res, hit, self.config.mark / res, self.config.clear / res)
+        corner, count = np.array(self.corner), len(self._odds)
+        start, beams = (np.array(sensor) - corner) / res, (ends - np.array(sensor)) / res
+        lengths = np.hypot(beams[:, 0], beams[:, 1])
+        if not ((start >= 0) & (start < count)).all():
+            return
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside = np.where(beams > 0, (count - start) / beams, -start / beams)
+        inside = np.where(beams == 0, np.inf, inside).min(axis=1)
+        near = hit & (lengths <= self.config.mark / res) & (inside > 1.0)
+        share = np.minimum(inside, self.config.clear / res / np.maximum(lengths, 1e-9))
+        tips = start + beams * np.where(near, 1.0, np.minimum(share, 1.0))[:, None]
+        cells = np.clip(np.floor(np.vstack((start, tips[near], tips[~near]))), 0, count - 1).astype(np.int32)
+        self._mark = self._mark % np.iinfo(np.uint16).max + 1
+        if self._mark == 1:
+            self._marks[:] = 0
+        odds, marks = self._odds.reshape(-1), self._marks.reshape(-1)
+        trace(odds, marks, count, cells, np.zeros(2, np.int64), self._mark, _NEWEST_DECIDES, np.count_nonzero(near))
+
+    @property
+    def cells(self) -> NDArray[np.bool_]:
+        """Where something was seen, shape (rows, columns), row 0 at the lowest y."""
+        return np.asarray(self._odds > 0)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which cells were seen, of the same shape."""
+        return np.asarray(self._odds != 0)
 
     @property
     def corner(self) -> tuple[float, float]:
@@ -95,15 +126,15 @@ class Window:
         return DistanceField(occupied, res, (x, y, 0.0))
 
     def _move(self, base: tuple[float, float]) -> None:
-        count = len(self.cells)
+        count = len(self._odds)
         corner = tuple(math.floor(v / self.config.resolution) - count // 2 for v in base)
         if self._corner is not None and corner != self._corner:
             columns, rows = corner[0] - self._corner[0], corner[1] - self._corner[1]
-            self.cells, self.seen = _moved(self.cells, rows, columns), _moved(self.seen, rows, columns)
+            self._odds = _moved(self._odds, rows, columns)
         self._corner = (corner[0], corner[1])
 
 
-def _moved(cells: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool_]:
+def _moved(cells: NDArray[np.int16], rows: int, columns: int) -> NDArray[np.int16]:
     """Cells of a window moved up by rows and right by columns."""
     count = len(cells)
     fresh = np.zeros_like(cells)
@@ -112,37 +143,3 @@ def _moved(cells: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool
         r, c = max(-rows, 0), max(-columns, 0)
         fresh[r : r + old.shape[0], c : c + old.shape[1]] = old
     return fresh
-
-
-@njit(cache=True)
-def _mark(
-    cells: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
-    start: Array,
-    ends: Array,
-    hit: NDArray[np.bool_],
-    mark: float,
-    clear: float,
-) -> None:
-    """Clear the cells along all beams, then mark those they hit; lengths in cells."""
-    rows, columns = cells.shape
-    for i in range(len(ends)):
-        dx, dy = ends[i, 0] - start[0], ends[i, 1] - start[1]
-        length = math.sqrt(dx * dx + dy * dy)
-        if length < 1e-9:
-            continue
-        far = min(length - (1.0 if hit[i] else 0.0), clear)
-        steps = int(2.0 * far)
-        for k in range(steps):
-            share = 0.5 * k / length
-            c, r = math.floor(start[0] + dx * share), math.floor(start[1] + dy * share)
-            if not (0 <= r < rows and 0 <= c < columns):
-                break
-            cells[r, c] = False
-            seen[r, c] = True
-    for i in range(len(ends)):
-        c, r = math.floor(ends[i, 0]), math.floor(ends[i, 1])
-        near = (ends[i, 0] - start[0]) ** 2 + (ends[i, 1] - start[1]) ** 2 <= mark * mark
-        if hit[i] and near and 0 <= r < rows and 0 <= c < columns:
-            cells[r, c] = True
-            seen[r, c] = True
