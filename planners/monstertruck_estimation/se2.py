@@ -1,8 +1,15 @@
-"""Planar poses (x, y, yaw) as arrays with a last axis of 3; m and rad; vectorised over the leading axes."""
+"""Planar poses (x, y, yaw) as arrays with a last axis of 3; m and rad; vectorised over the leading axes.
+
+Also ``SmoothedCorrection``: odom in map as published, which approaches corrections at a limited rate.
+"""
+
+import math
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
+
+Vector = tuple[float, float, float]
 
 
 def wrap(angle: Array | float) -> Array:
@@ -75,3 +82,50 @@ def between_jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
     by_origin = -by_target
     by_origin[0, 2], by_origin[1, 2] = y, -x
     return by_origin, by_target
+
+
+class SmoothedCorrection:
+    """Follows corrections at the robot's place, not at the origin of odom: a turn about a far origin would be a jump.
+
+    Args:
+        slew: greatest speed of the change, m/s and rad/s.
+        jump: corrections of the robot's place beyond this, m, count at once.
+        settle: time constant of the approach within that, s; 0 = none. Scans are deskewed by these poses: a correction
+            must not look like motion.
+    """
+
+    def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:
+        self._slew = slew
+        self._settle = settle
+        self._jump = jump
+        self._target = np.zeros(3)
+        self._shown = np.zeros(3)
+
+    @property
+    def value(self) -> Vector:
+        """Odom in map, m and rad."""
+        x, y, yaw = self._shown.tolist()
+        return x, y, yaw
+
+    def set_target(self, map_from_odom: Vector, *, at_once: bool = False) -> None:
+        """Take a new correction; ``at_once``: apply it without a transition."""
+        self._target = np.array(map_from_odom)
+        if at_once:
+            self._shown = self._target.copy()
+
+    def pose(self, odom: Vector, dt: float) -> Vector:
+        """Base in map for base in odom, ``dt`` seconds after the last call."""
+        base = np.array(odom)
+        now, then = compose(self._shown, base), compose(self._target, base)
+        off = between(now, then)
+        way, turn = math.hypot(off[0], off[1]), abs(float(off[2]))
+        share = min(self._slew[0] * dt / max(way, 1e-12), self._slew[1] * dt / max(turn, 1e-12))
+        if self._settle > 0:
+            share = min(share, -math.expm1(-dt / self._settle))
+        if way > self._jump or share >= 1.0:
+            now, self._shown = then, self._target.copy()
+        else:
+            now = compose(now, off * share)
+            self._shown = compose(now, inverse(base))
+        x, y, yaw = now.tolist()
+        return x, y, yaw

@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.se2 import between, interpolate
-from monstertruck_estimation.slam.worker_io import ScanInput, Vector
+from monstertruck_estimation.se2 import Vector, between, interpolate
+from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.filter import (
     MOVED_BY,
@@ -29,7 +28,7 @@ from monstertruck_estimation.fusion.filter import (
 )
 from monstertruck_estimation.fusion.slip import SlipChange, SlipDetector
 from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
-from monstertruck_estimation.se2 import compose, inverse
+from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array

@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, interpolate, transform
+from monstertruck_estimation.se2 import Vector, between, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch, Vector
+from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 

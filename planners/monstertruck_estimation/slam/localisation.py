@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse
+from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, correlate, merged
 from monstertruck_estimation.slam.mapping import LOST_AFTER, Mapper, MappingEvent, estimate, status_of
@@ -26,7 +26,7 @@ from monstertruck_estimation.slam.scan_matcher import (
 )
 from monstertruck_estimation.slam.scans import Scan, downsample_indices
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, surface_elements
-from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate, Vector
+from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError

@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.worker_io import ScanInput, Vector
+from monstertruck_estimation.se2 import Vector
+from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
 
 RANGE_NOISE: Final = 0.012

@@ -9,9 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.scan_tilt import AngleHistory, plane_slopes
-from monstertruck_estimation.se2 import between, interpolate
+from monstertruck_estimation.se2 import SmoothedCorrection, Vector, between, interpolate
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker_io import (
     GridPatch,
@@ -19,7 +18,6 @@ from monstertruck_estimation.slam.worker_io import (
     ScanInput,
     SlamEstimate,
     Start,
-    Vector,
     WorkerInput,
     WorkerOutput,
 )

@@ -7,12 +7,11 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.se2 import Vector
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.sensor import LaserScan
-
-Vector = tuple[float, float, float]
 
 UNKNOWN: Final = -1
 """Value of a cell nothing is known of."""
