@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
-from monstertruck_estimation.fusion.estimator import Fusion
-from monstertruck_estimation.fusion.service import FusionService
-from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryService
+from monstertruck_estimation.catalog import ODOMETRY
+from monstertruck_estimation.odometry import OdometryContext
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_planners.behave.stabiliser import StabiliserService
+from monstertruck_planners.behave.catalog import BEHAVIOURS
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.steps import STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
@@ -26,7 +25,7 @@ from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.roles import DeviceRole
-from monstertruck_schemas.topics import DRIVES, Writer
+from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.goals import build_goals
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import Tree
@@ -82,25 +81,9 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         yield slam
     if config.missing_actuators() is not None:
         return
-    yield _build_odometry(config, bus, clock, body.chassis)
-
-
-def _build_odometry(config: TruckConfig, bus: Bus, clock: Clock, chassis: Chassis) -> OdometryService:
-    odometry = config.odometry
-    ends: dict[str, Any] = {
-        "drives": [bus.subscribe(topic, latest()) for topic in DRIVES[: len(chassis.shafts)]],
-        "steering": bus.subscribe(topics.STEERING, latest()) if chassis.linkage is not None else None,
-        "compass": bus.subscribe(topics.COMPASS, latest()) if config.devices.compass is not None else None,
-        "odometry": bus.publisher(topics.ODOMETRY, Writer.ESTIMATION),
-        "pose": bus.publisher(topics.POSE, Writer.ESTIMATION) if config.slam is None else None,
-        "rate": odometry.rate,
-    }
-    if isinstance(odometry, OdometryConfig):
-        return OdometryService(DeadReckoning(odometry, chassis), clock, **ends)
-    used = config.slam is not None and odometry.scans is not None
-    scans = bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if used else None
-    health = bus.publisher(topics.FUSION, Writer.ESTIMATION)
-    return FusionService(Fusion(odometry, chassis), clock, scans=scans, health=health, events=bus.event_sink(), **ends)
+    compass, slam_runs = config.devices.compass is not None, config.slam is not None
+    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs)
+    yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
 
 
 def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
@@ -145,12 +128,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
         if config.planner is not None:
             yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
-        yield StabiliserService(
-            config.levelling,
-            clock,
-            bus.subscribe(topics.COMPASS, latest()),
-            bus.publisher(topics.PLAN_STABILISER, Writer.PLANNER),
-        )
+        yield BEHAVIOURS.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:
         yield MapService(
             config.map,

@@ -9,11 +9,12 @@ from pydantic import Field, model_validator
 from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.usb.config import UsbConfig
-from monstertruck_estimation.fusion.config import AnyOdometry
+from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_planners.behave.catalog import AnyLevelling
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
@@ -97,7 +98,7 @@ class TruckConfig(Schema):
     usb: UsbConfig = UsbConfig()
     machine: Path = Path("/")
     """Folder with the computer's proc, sys and dev; the simulated one's is elsewhere"""
-    levelling: StabiliserConfig = StabiliserConfig()
+    levelling: AnyLevelling = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
     odometry: AnyOdometry = OdometryConfig()

@@ -8,7 +8,7 @@ import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from struct import Struct
-from typing import Annotated, Final, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,9 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
-from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
@@ -85,12 +87,18 @@ class CompassConfig(Schema):
     """Headings averaged at the start to find north in the odom frame, unless the truck drives off earlier."""
 
 
-class OdometryConfig(Schema):
+class OdometrySettings(Schema):
+    """Base of the settings of every odometry."""
+
+    kind: str
+    rate: Annotated[float, Field(gt=0, le=200)] = 50.0
+    """Poses per second."""
+
+
+class OdometryConfig(OdometrySettings):
     """Dead reckoning: start and trust."""
 
     kind: Literal["reckoning"] = "reckoning"
-    rate: Annotated[float, Field(gt=0, le=200)] = 50.0
-    """Poses per second."""
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
     """Pose of base in odom at the start, m and rad."""
     distance_noise: Share = 0.02
@@ -351,3 +359,33 @@ def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
         age=estimate.age,
         sources=estimate.sources,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryContext:
+    """What an odometry is made for."""
+
+    chassis: Chassis
+    clock: Clock
+    bus: BusPort
+    compass: bool
+    """The robot has one."""
+    slam: bool
+    """SLAM publishes the pose in map and the motion between scans."""
+
+    def inputs(self) -> dict[str, Any]:
+        """Topics of an ``OdometryService``, by the names of its arguments."""
+        bus, shafts, steered = self.bus, len(self.chassis.shafts), self.chassis.linkage is not None
+        return {
+            "drives": [bus.subscribe(topic, latest()) for topic in topics.DRIVES[:shafts]],
+            "steering": bus.subscribe(topics.STEERING, latest()) if steered else None,
+            "compass": bus.subscribe(topics.COMPASS, latest()) if self.compass else None,
+            "odometry": bus.publisher(topics.ODOMETRY, topics.Writer.ESTIMATION),
+            "pose": None if self.slam else bus.publisher(topics.POSE, topics.Writer.ESTIMATION),
+        }
+
+
+def build_reckoning(config: OdometryConfig, context: OdometryContext) -> OdometryService:
+    """The service with its topics, for the catalog."""
+    reckoning = DeadReckoning(config, context.chassis)
+    return OdometryService(reckoning, context.clock, rate=config.rate, **context.inputs())

@@ -3,9 +3,11 @@
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, TypeVar
 
+from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import Topic, Writer
 
 M = TypeVar("M", bound=Message)
 M_co = TypeVar("M_co", bound=Message, covariant=True)
@@ -59,6 +61,26 @@ class EventSink(Protocol):
 
     def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
         """Publish one event."""
+        ...
+
+
+class BusPort(Protocol):
+    """The bus, for plug-ins that choose their topics themselves."""
+
+    def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
+        """The one write end of ``topic``.
+
+        Raises:
+            RuntimeError: ``writer`` is not the topic's writer, or the write end is taken.
+        """
+        ...
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """A read end of ``topic``; of a retained topic it holds the newest message at once."""
+        ...
+
+    def event_sink(self) -> EventSink:
+        """Where events go."""
         ...
 
 

@@ -1,10 +1,10 @@
 """Settings of the fusion; light, for the daemon's start."""
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
-from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_estimation.odometry import OdometrySettings
 from monstertruck_schemas.base import Pose2D, Schema
 
 Share = Annotated[float, Field(ge=0)]
@@ -77,12 +77,10 @@ class SlipConfig(Schema):
     """and rad/s."""
 
 
-class FusionConfig(Schema):
+class FusionConfig(OdometrySettings):
     """Odometry from wheels, compass and scans, whichever there are."""
 
     kind: Literal["fusion"]
-    rate: Annotated[float, Field(gt=0, le=200)] = 50.0
-    """Poses per second."""
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
     """Pose of base in odom at the start, m and rad."""
     max_speed: Positive = 0.6
@@ -108,14 +106,3 @@ class FusionConfig(Schema):
     scans: ScanTrust | None = ScanTrust()
     """Null leaves the scans out; they are used where `slam` matches them"""
     slip: SlipConfig = SlipConfig()
-
-
-def _kind(section: Any) -> Any:
-    """Which odometry a section means; dead reckoning if it does not say."""
-    return section.get("kind", "reckoning") if isinstance(section, dict) else getattr(section, "kind", None)
-
-
-AnyOdometry = Annotated[
-    Annotated[OdometryConfig, Tag("reckoning")] | Annotated[FusionConfig, Tag("fusion")], Discriminator(_kind)
-]
-"""The daemon's section `odometry`."""

@@ -1,17 +1,23 @@
 """Publishes the fused odometry."""
 
 from collections.abc import Sequence
+from typing import Final
 
+from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion, FusionStatus
-from monstertruck_estimation.odometry import OdometryService
+from monstertruck_estimation.odometry import OdometryContext, OdometryService
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
+from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import OdometryHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry, ScanMotion
+
+SCANS: Final = 16
+"""Motions between scans that may wait."""
 
 
 class FusionService(OdometryService):
@@ -101,3 +107,17 @@ class FusionService(OdometryService):
     def accepts_compass(self) -> bool:
         """Always: a heading can be the first measurement."""
         return True
+
+
+def build_fusion(config: FusionConfig, context: OdometryContext) -> FusionService:
+    """The service with its topics, for the catalog."""
+    bus, inputs = context.bus, context.inputs()
+    return FusionService(
+        Fusion(config, context.chassis),
+        context.clock,
+        scans=bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if context.slam and config.scans is not None else None,
+        health=bus.publisher(topics.FUSION, topics.Writer.ESTIMATION),
+        events=bus.event_sink(),
+        rate=config.rate,
+        **inputs,
+    )

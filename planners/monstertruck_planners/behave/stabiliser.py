@@ -24,11 +24,12 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
-from monstertruck_schemas.topics import COMPASS
+from monstertruck_schemas.topics import COMPASS, PLAN_STABILISER, Writer
 
 Positive = Annotated[float, Field(gt=0)]
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
@@ -198,3 +199,9 @@ class StabiliserService:
             joints = goals(tilt.tilt(now), joints, 1 / self._config.rate, self._config)
             seq = self._out.next_seq()
             self._out.put(StabiliserCommand(stamp=now, received=now, seq=seq, pitch=joints.pitch, roll=joints.roll))
+
+
+def build_stabiliser(config: StabiliserConfig, clock: Clock, bus: BusPort) -> StabiliserService:
+    """The service with its topics, for the catalog."""
+    out = bus.publisher(PLAN_STABILISER, Writer.PLANNER)
+    return StabiliserService(config, clock, bus.subscribe(COMPASS, latest()), out)

@@ -3,7 +3,8 @@ import asyncio
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from monstertruck_estimation.fusion.config import AnyOdometry, FusionConfig
+from monstertruck_estimation.catalog import AnyOdometry
+from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.service import FusionService
 from monstertruck_estimation.fusion.slip import SlipChange
 from monstertruck_estimation.odometry import OdometryConfig

@@ -1,0 +1,27 @@
+"""The kinds of odometry by ``kind``."""
+
+from typing import Annotated, Final
+
+from monstertruck_estimation.odometry import OdometrySettings
+from monstertruck_runtime.plugins import Catalog, Plugin
+
+ODOMETRY: Final = Catalog(
+    "monstertruck.odometry",
+    Plugin(
+        name="reckoning",
+        settings="monstertruck_estimation.odometry:OdometryConfig",
+        implementation="monstertruck_estimation.odometry:build_reckoning",
+        doc="Wheels along the steered arc, the heading held by the compass",
+    ),
+    Plugin(
+        name="fusion",
+        settings="monstertruck_estimation.fusion.config:FusionConfig",
+        implementation="monstertruck_estimation.fusion.service:build_fusion",
+        doc="Filter of wheels, compass and the motion between scans",
+    ),
+    base=OdometrySettings,
+)
+"""An odometry is a function that makes a ``Service`` from its settings and an ``OdometryContext``."""
+
+AnyOdometry = Annotated[OdometrySettings, ODOMETRY.section("reckoning")]
+"""The configuration's section `odometry`."""
