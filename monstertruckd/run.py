@@ -48,7 +48,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     except BaseExceptionGroup as group:
         if (busy := _first(group.subgroup(PortBusyError))) is not None:
             raise busy from None
-        log.exception("ended by a bug; the actuators were told to stop")
+        log.exception("ended by a bug; the actuators were stopped")
         return Reason.INTERNAL
     finally:
         listener.stop()

@@ -1,4 +1,4 @@
-"""Faults by typed words: from standard input of an emulator process, from tests, from drills."""
+"""Console commands of emulated devices: from standard input of an emulator process, from tests, from drills."""
 
 import asyncio
 import os
@@ -18,29 +18,29 @@ HELP = (
 
 
 class Commanded(Protocol):
-    """Something that obeys words."""
+    """Something that takes commands."""
 
     def command(self, words: list[str]) -> None:
-        """Obey one command.
+        """Carry out one command.
 
         Raises:
-            InputError: it is not understood; the text lists what is.
+            InputError: it is unknown; the text lists the known ones.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Emulated:
-    """An emulator and the port it hangs on."""
+    """An emulator and the port it is connected to."""
 
     emulator: Emulator
     port: EmulatedPort
 
     def command(self, words: list[str]) -> None:
-        """Obey one command.
+        """Carry out one command.
 
         Raises:
-            InputError: it is not understood; the text lists what is.
+            InputError: it is unknown; the text lists the known ones.
         """
         match words:
             case ["plug"]:
@@ -59,15 +59,15 @@ class Emulated:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedFiles:
-    """A part of the emulated computer; its faults are all it understands."""
+    """A part of the emulated computer; its only commands are its faults."""
 
     emulator: FileEmulator
 
     def command(self, words: list[str]) -> None:
-        """Obey one command.
+        """Carry out one command.
 
         Raises:
-            InputError: it is not understood; the text lists what is.
+            InputError: it is unknown; the text lists the known ones.
         """
         fault, *values = words or [""]
         self.emulator.inject(fault, *values)
@@ -106,21 +106,21 @@ class FaultConsole:
         self._say = say
 
     async def run(self) -> None:
-        """Obey lines until cancelled; the end of the input ends the commands, not the devices."""
-        if not _can_be_awaited(self._source):
+        """Carry out lines until cancelled; the end of the input ends the commands, not the devices."""
+        if not _pollable(self._source):
             await asyncio.Event().wait()
         reader = asyncio.StreamReader()
         loop = asyncio.get_running_loop()
         transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), self._source)
         try:
             while line := await reader.readline():
-                self.obey(line.decode(errors="replace"))
+                self.execute(line.decode(errors="replace"))
             await asyncio.Event().wait()
         finally:
             transport.close()
 
-    def obey(self, line: str) -> None:
-        """Obey one line; answers ``ok`` or what is wrong with it."""
+    def execute(self, line: str) -> None:
+        """Carry out one line; answers ``ok`` or an error."""
         words = line.split()
         if not words:
             return
@@ -139,7 +139,7 @@ class FaultConsole:
         raise InputError(f"name a device first: {', '.join(self._devices)}")
 
 
-def _can_be_awaited(source: TextIO) -> bool:
+def _pollable(source: TextIO) -> bool:
     """Pipes, sockets and terminals can; files, /dev/null and a closed input cannot."""
     try:
         mode = os.fstat(source.fileno()).st_mode

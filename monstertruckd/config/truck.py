@@ -72,7 +72,7 @@ class PathConfig(Schema):
 
 
 class PlacementConfig(Schema):
-    """Where the planners compute: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
+    """Where planners and tracker run: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
 
     planner: Literal["loop", "worker", "remote"] = "worker"
     """In the loop only for studies: it stands still meanwhile"""

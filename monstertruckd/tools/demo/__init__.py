@@ -1,1 +1,1 @@
-"""The demo: an operator's lap on the emulated truck, on the wall clock or the virtual one."""
+"""The demo: a lap of the emulated truck, on the wall clock or the virtual clock."""

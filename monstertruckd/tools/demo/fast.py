@@ -1,4 +1,4 @@
-"""The demo on the virtual clock: everything in one process, as fast as it computes, twice the same."""
+"""The demo on the virtual clock: one process, as fast as it computes, reproducible."""
 
 import gc
 from pathlib import Path
@@ -25,7 +25,7 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
     async def main(clock: VirtualClock) -> tuple[VirtualRig, Lap, float]:
         rig = VirtualRig(config, clock, tree)
         begin_wall, begin = wall.now(), clock.now()
-        gc.freeze()  # as the daemon's own start does: what is loaded stays
+        gc.freeze()  # as the daemon does at its start
         async with rig.running():
             lap = await drive_lap(LocalOperator(rig.daemon, clock), clock)
             await clock.sleep(1.0)

@@ -1,4 +1,4 @@
-"""What a demo run achieved, from the log and the world's truth."""
+"""Figures of a demo run, from the log and the true states of the truck."""
 
 from collections import Counter
 from dataclasses import dataclass, field

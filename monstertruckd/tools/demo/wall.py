@@ -1,4 +1,4 @@
-"""The demo on the wall clock: emulators behind ptys in one process, the daemon in another, the operator here."""
+"""The demo on the wall clock: emulators behind ptys in one process, the daemon in another, the operator in this one."""
 
 import asyncio
 import contextlib
@@ -89,9 +89,9 @@ async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]
 
 
 def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
-    """A configuration that includes ``config``, hangs its devices on ptys and puts all output into ``folder``.
+    """Write a configuration that includes ``config``, with its devices on ptys and all output in ``folder``.
 
-    Devices by hub and port stay there: their hubs are those of an emulated computer.
+    Devices by hub and port are kept: their hubs are those of the emulated computer.
     """
     given = load_tree(config).data
     here = folder.resolve()
@@ -116,7 +116,7 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on."""
+    """A loopback endpoint with a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -164,7 +164,7 @@ async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
 
 
 async def _appear(exists: Callable[[], bool], clock: Clock) -> None:
-    """Wait for a picture that a niced worker draws; without one the summary just does not list it."""
+    """Wait for the map, which a worker of low priority draws; without it the summary does not list it."""
     with contextlib.suppress(TimeoutError):
         async with clock.deadline(15.0):
             while not exists():

@@ -1,1 +1,1 @@
-"""The robot without a robot: device emulators tied to a simulated world. Never imported by the daemon."""
+"""Simulated robots: processes and rigs of device emulators in a simulated world. Never imported by the daemon."""

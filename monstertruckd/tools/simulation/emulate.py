@@ -1,4 +1,4 @@
-"""One emulated device alone on a pty, in the default world."""
+"""``monstertruckd emulate``: one emulated device on a pty, in the default world."""
 
 import asyncio
 from collections.abc import AsyncIterator

@@ -1,4 +1,4 @@
-"""The emulated robot as a process of its own: devices behind ptys, world truth kept for the judges."""
+"""``monstertruckd simulate``: the emulated robot as a process, its devices behind ptys."""
 
 import asyncio
 import signal
@@ -29,14 +29,14 @@ TRUTH_PERIOD = SECOND // 20
 
 
 class TruthLog:
-    """What really happened, sampled on an absolute schedule; for judges only, never for the daemon."""
+    """True state of the simulated truck, 20 times a second; for evaluation, never for the daemon."""
 
     COLUMNS = ("time", "x", "y", "yaw", "speed", "stuck")
 
     def __init__(self, world: World, clock: Clock) -> None:
         self._world = world
         self._clock = clock
-        self._rows = array("d")
+        self._samples = array("d")
 
     async def run(self) -> None:
         """Sample until cancelled."""
@@ -44,13 +44,13 @@ class TruthLog:
         while True:
             now = self._clock.now()
             state = self._world.truth(now)
-            self._rows.extend((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
+            self._samples.extend((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
             due += TRUTH_PERIOD
             await self._clock.sleep_until(due)
 
     def array(self) -> Array:
         """Shape (n, 6): ``COLUMNS``, s, m, m, rad, m/s, 0 or 1."""
-        return np.array(self._rows).reshape(-1, len(self.COLUMNS))
+        return np.array(self._samples).reshape(-1, len(self.COLUMNS))
 
 
 async def serve(clock: Clock, config: SimulatedTruckConfig, truth: Path | None) -> None:
@@ -59,15 +59,15 @@ async def serve(clock: Clock, config: SimulatedTruckConfig, truth: Path | None) 
     Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
 
     Raises:
-        InputError: the configuration has hubs or monitors, but names no place for the emulated computer.
+        InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer.
     """
-    with TemporaryDirectory(prefix="monstertruck-") as folder, _shown(config, Path(folder)):
+    with TemporaryDirectory(prefix="monstertruck-") as folder, _linked(config, Path(folder)):
         await _serve(clock, config, Path(folder), truth)
 
 
 @contextmanager
-def _shown(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
-    """Let ``machine`` lead to the emulated computer, where the daemon needs one."""
+def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
+    """Link ``machine`` to the folder of the emulated computer, where the daemon needs one."""
     if not hangs_by_hub(config.devices) and config.monitors == Monitors():
         yield
         return
@@ -108,7 +108,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         context = SimContext(config.sim, config.devices, robot, computer, clock)
         tasks.append(asyncio.create_task(FaultInjector(context, config.sim.drill, _say).run(), name="faults"))
     if robot.recorded is not None:
-        tasks.append(asyncio.create_task(_tell_end(robot.recorded), name="recording"))
+        tasks.append(asyncio.create_task(_report_end(robot.recorded), name="recording"))
     waiting = asyncio.create_task(stop.wait())
     settle()
     _say("ready")
@@ -123,7 +123,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
             raise result
 
 
-async def _tell_end(recorded: RecordedHokuyoEmulator) -> None:
+async def _report_end(recorded: RecordedHokuyoEmulator) -> None:
     await recorded.finished.wait()
     _say(f"recording sent, began {recorded.began}")
     await asyncio.Event().wait()
