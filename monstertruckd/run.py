@@ -13,6 +13,7 @@ from monstertruck_runtime.errors import PortBusyError
 from monstertruck_runtime.memory import settle
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
+from monstertruckd.assembly.catalogs import TABLES
 from monstertruckd.config.load import load_truck
 from monstertruckd.daemon import Daemon
 from monstertruckd.host.logging_queue import start_logging
@@ -32,6 +33,9 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     faulthandler.enable()
     listener = start_logging(verbose=verbose)
     log.info("calibration: %s", tree.calibration or f"none in {config.calibration_folder}")
+    for table in TABLES:
+        for broken in table.broken:
+            log.warning("plug-in left out: %s", broken)
 
     async def main(clock: Clock) -> None:
         stop = asyncio.Event()

@@ -56,6 +56,7 @@ app.command("run")(robot.run)
 app.command("check-config", hidden=True)(config.show)  # its name before there were others
 app.command("topics")(robot.topics)
 app.command("reasons")(robot.reasons)
+app.command("plugins")(robot.plugins)
 app.command("status")(live.status)
 app.command("echo")(live.echo)
 app.command("drive")(drive.drive)

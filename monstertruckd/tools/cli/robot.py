@@ -57,6 +57,27 @@ def topics(json_output: JsonOption = False) -> None:
     )
 
 
+def plugins(json_output: JsonOption = False) -> None:
+    """List the kinds that a configuration can choose, and the topics, with the distribution each comes from.
+
+    Those of other distributions are loaded to try them; the ones that are broken are named with the error.
+    """
+    from monstertruckd.assembly.catalogs import plugins
+
+    found = list(plugins())
+    if json_output:
+        print_json([row._asdict() for row in found])
+        return
+    print_table(
+        ("group", "name", "from", "what"),
+        [
+            (row.group.removeprefix("monstertruck."), row.name, row.origin, row.doc if row.error is None else row.error)
+            for row in found
+        ],
+        title="Plug-ins",
+    )
+
+
 def reasons(
     json_output: JsonOption = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="The table of docs/command-line.md.")] = False,
