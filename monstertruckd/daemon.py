@@ -33,9 +33,10 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners, calibration
-from monstertruckd.assembly.cabling import Cabling
-from monstertruckd.assembly.devices import build_drivers, of_duty
+from monstertruckd.assembly.description import description
+from monstertruckd.assembly.devices import Cabling, build_drivers, of_duty
+from monstertruckd.assembly.estimation import Body, build_estimation
+from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
@@ -110,7 +111,7 @@ class Daemon:
         self._remote_steps = RemoteWorkQueue(CODEC)
         self._actors = ActorFactory(clock, self._remote_steps)
         self.rpc = self._build_rpc()
-        self._attachments = self._describe()
+        self._attachments = description(config, self._body, tree)
         self.recorder = self._build_recorder()
         self.black_box = self._build_black_box()
         self._notify = notify_from(environment, clock, self.gate.ticks, config.gate.rate, self._status)
@@ -335,13 +336,3 @@ class Daemon:
             metadata={"robot": self.config.robot},
             offload=in_daemon_thread if self._seed is None else inline,
         )
-
-    def _describe(self) -> dict[str, Any]:
-        """What every log says about the robot and the run."""
-        origins = self._tree.origins if self._tree is not None else {}
-        return {
-            "config": resolved(self.config),
-            "calibration": calibration(self.config, self._body.chassis, self._tree),
-            "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
-            "versions": dict(running_versions()),
-        }

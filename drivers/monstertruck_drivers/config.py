@@ -84,7 +84,7 @@ class _Devices(Schema):
         """The devices that are configured, by role."""
         return dict(_present(self))
 
-    def shafts(self) -> "dict[str, Device[EposConfig]]":
+    def shafts(self) -> dict[str, Device[Any]]:
         """The controllers of the driven shafts, by role."""
         present = self.present()
         return {role: present[role] for role in SHAFTS if role in present}

@@ -1,11 +1,17 @@
-"""Builds the drivers of a configuration and gives each the ends of its role's topics."""
+"""Builds the drivers of a configuration: what each opens, and the ends of its role's topics."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from monstertruck_drivers.catalog import DEVICES, Duty, Role
-from monstertruck_drivers.computer import Computer
-from monstertruck_drivers.config import kind_of
+from monstertruck_drivers.computer import Computer, Machine
+from monstertruck_drivers.config import AnyPort, kind_of
+from monstertruck_drivers.link import BAUD, Port, SerialPort
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
+from monstertruck_drivers.usb.port import HubNode, HubPort, PortPower
+from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSource
+from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
 from monstertruck_estimation.scan_tilt import TiltStamper
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Delivery, latest
@@ -15,9 +21,83 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Writer
-from monstertruckd.assembly.cabling import Cabling
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
+
+
+class Cabling:
+    """Ports of all devices. Those by hub and port share one coordinator, and a service that watches the tree.
+
+    Args:
+        config: the ports.
+        computer: whose ports they are.
+        bus: where tree and events go.
+        given: ports by role that replace the configured ones.
+    """
+
+    def __init__(self, config: TruckConfig, computer: Computer, bus: Bus, given: Mapping[str, Port]) -> None:
+        self._ports: dict[str, AnyPort] = {role: device.port for role, device in config.devices.present().items()}
+        self._given = given
+        self._machine = computer.machine
+        self._events = bus.event_sink()
+        places = {
+            role: port for role, port in self._ports.items() if role not in given and isinstance(port, UsbPortConfig)
+        }
+        self.on_hubs = frozenset(places)
+        """Roles of the devices that hang by hub and port."""
+        self._hubs = HubCoordinator(config.usb, places, self._machine.clock, self._events)
+        self._power = PortPower(config.usb.power, self._machine, self._events)
+        self.service: UsbService | None = None
+        """Watches the tree; None where no device hangs by hub and port."""
+        if places:
+            out = bus.publisher(topics.USB, Writer.DAEMON)
+            self.service = UsbService(config.usb, self._machine, self._hubs, computer.watch(), out, self._events)
+
+    def port(self, role: str) -> Port:
+        """Serial port of a device."""
+        port = self._ports[role]
+        if role in self._given:
+            return self._given[role]
+        if isinstance(port, UsbPortConfig):
+            return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
+        return SerialPort(port.path, port.baud or BAUD)
+
+    def camera(self, role: str) -> FrameSource:
+        """Where a camera's pictures come from."""
+        port = self._ports[role]
+        if role in self._given:
+            return RenderedSource(self._given[role], self._machine.clock)
+        if isinstance(port, UsbPortConfig):
+            return HubCamera(HubNode(port, self._machine, self._hubs, role, "video4linux"), self._machine)
+        return PathSource(str(port.path), self._machine.clock)
+
+    def waiting(self, role: str) -> str | None:
+        """What the device of ``role`` waits for before it may start; None if it does not wait."""
+        return self._hubs.waits_for(role)
+
+
+class HubCamera:
+    """The camera at a hub's port, whatever its node is at the moment.
+
+    Args:
+        node: finds it.
+        machine: where it is.
+    """
+
+    def __init__(self, node: HubNode, machine: Machine) -> None:
+        self.name = node.name
+        self._node = node
+        self._machine = machine
+
+    async def open(self, mode: Mode, buffers: int) -> FrameStream:
+        """Wait for the camera's turn, find its node, start it; see ``FrameSource``."""
+        path = self._machine.dev / (await self._node.resolve()).name
+        port = self._machine.serial(path, BAUD)
+        if isinstance(port, SerialPort):
+            return await PathSource(str(path), self._machine.clock).open(mode, buffers)
+        # Only what is emulated in this process leads from a camera's node to a port.
+        return await RenderedSource(port, self._machine.clock).open(mode, buffers)
+
 
 RECENT = Delivery(16, counted=False)
 """Enough of the past for the tilt in the middle of a scan."""

@@ -182,7 +182,8 @@ class TruckConfig(Schema):
                     f"tracker.steering {self.tracker.steering}: impossible for body {self.body.kind}: {why}"
                 )
         for role, device in shafts.items():
-            self._check_braking(role, device.driver)
+            if isinstance(device.driver, EposConfig):
+                self._check_braking(role, device.driver)
 
     def _check_planner(self) -> None:
         planner = self.planner

@@ -25,8 +25,9 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.req import GoalControl, GoalRequest
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic
-from monstertruckd.assembly.autonomy import Body, build_estimation, build_planners
 from monstertruckd.assembly.devices import scan_publisher
+from monstertruckd.assembly.estimation import Body, build_estimation
+from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
 from monstertruckd.recorder.reader import LogMessage

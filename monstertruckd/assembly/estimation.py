@@ -1,0 +1,93 @@
+"""Builds transforms, odometry and SLAM of a configuration, each with its ends of the bus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Self
+
+from monstertruck_drivers.catalog import DEVICES
+from monstertruck_estimation.catalog import ODOMETRY
+from monstertruck_estimation.odometry import OdometryContext
+from monstertruck_estimation.slam.service import SlamService
+from monstertruck_estimation.transforms import TransformService, compose, invert, mount
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.service import Service
+from monstertruck_schemas import topics
+from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.topics import Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import TruckConfig
+
+SCANS: Final = 16
+"""Scans that may wait for the estimation worker."""
+ODOMETRIES: Final = 256
+"""Poses and angles that may wait for a scan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The robot's kinematics and outline, shared by gate, estimation and planners."""
+
+    chassis: Chassis
+    footprint: Footprint
+    points: ScanPoints
+    """Of the newest scan."""
+
+    @classmethod
+    def of(cls, config: TruckConfig) -> Self:
+        """Of a configured robot."""
+        lidar = config.devices.lidar
+        points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
+        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points)
+
+
+def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+    """Transforms always; odometry where the robot can drive and steer."""
+    mounts = {
+        role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
+        for role, m in ((role, device.mount) for role, device in config.devices.present().items())
+        if DEVICES.roles[role].frame
+    }
+    joints = mounts.pop(DeviceRole.STABILISER, None)
+    if joints is not None and DeviceRole.LIDAR in mounts:
+        lidar = mounts[DeviceRole.LIDAR]
+        mounts[DeviceRole.LIDAR] = compose(invert(joints), lidar)
+    slam = _build_slam(config, bus, clock)
+    yield TransformService(
+        list(mounts.values()),
+        clock,
+        bus.subscribe(topics.ODOMETRY, latest()),
+        bus.publisher(topics.TRANSFORMS, Writer.ESTIMATION),
+        joints=None if joints is None else (joints, bus.subscribe(topics.STABILISER, latest())),
+        localised=tuple if slam is None else slam.frames,
+    )
+    if slam is not None:
+        yield slam
+    if config.missing_actuators() is not None:
+        return
+    compass, slam_runs = config.devices.compass is not None, config.slam is not None
+    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs)
+    yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
+
+
+def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
+    devices = config.devices
+    if config.slam is None or devices.lidar is None:
+        return None
+    return SlamService(
+        config.slam,
+        devices.lidar.mount,
+        clock,
+        scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
+        odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
+        compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)) if devices.compass is not None else None,
+        joints=bus.subscribe(topics.STABILISER, fifo(ODOMETRIES)) if devices.stabiliser is not None else None,
+        pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+        whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
+        tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),
+        motion=bus.publisher(topics.SCAN_MOTION, Writer.ESTIMATION),
+        health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
+        events=bus.event_sink(),
+    )

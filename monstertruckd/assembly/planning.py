@@ -1,0 +1,168 @@
+"""Builds path source, tracker, goals, levelling and map picture of a configuration, each with its ends of the bus."""
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.behave.catalog import BEHAVIOURS
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.deform import Deformation
+from monstertruck_planners.goals.exchange import Setup
+from monstertruck_planners.goals.parts import Inputs, Outputs
+from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS, TRACKING
+from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.paths import PathService, load_path
+from monstertruck_planners.track.service import TrackerService, TrackSetup
+from monstertruck_runtime.actors.actor import ActorFactory
+from monstertruck_runtime.clock import Clock, VirtualClock
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import Publisher, Subscription
+from monstertruck_runtime.service import Service
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.topics import Writer
+from monstertruckd.assembly.estimation import Body
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.recorder.picture import MapService
+
+STEP_DEADLINE: Final = 5.0
+"""Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
+
+
+def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
+    """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
+    if config.tracker is not None:
+        paths, requests = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
+        frame = "odom" if config.slam is None else "map"
+        drawn = None
+        if config.path is not None:
+            drawn = load_path(config.path.file, closed=config.path.closed, frame=frame)
+        yield PathService(
+            drawn,
+            clock,
+            bus.subscribe(topics.REQ_PATH, fifo(4)),
+            bus.subscribe(topics.GATE, latest()),
+            paths,
+            bus.event_sink(),
+            config.gate.max_request_age,
+        )
+        yield _build_tracker(config, config.tracker, bus, clock, body, requests, actors)
+        if config.planner is not None:
+            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
+    if config.devices.stabiliser is not None and config.devices.compass is not None:
+        yield BEHAVIOURS.implementation(config.levelling)(config.levelling, clock, bus)
+    if config.map is not None and config.devices.lidar is not None:
+        yield MapService(
+            config.map,
+            config.devices.lidar.mount,
+            clock,
+            scan=bus.subscribe(topics.SCAN, latest()),
+            pose=bus.subscribe(topics.POSE, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            tracker=bus.subscribe(topics.TRACKER, fifo(256)),
+            events=bus.event_sink(),
+        )
+
+
+def _build_tracker(
+    config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, requests: Publisher[DriveRequest],
+    actors: ActorFactory,
+) -> Service:  # fmt: skip
+    lidar, placement = config.devices.lidar, config.placement.tracker
+    inputs: dict[str, Subscription[Any]] = {
+        "pose": bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
+        "path": bus.subscribe(topics.PATH, latest()),
+        "gate": bus.subscribe(topics.GATE, latest()),
+    }
+    if lidar is not None:
+        inputs["scan"] = bus.subscribe(topics.SCAN, latest())
+    if config.devices.compass is not None:
+        inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
+    actor = None
+    if placement != "loop":
+        actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
+    return TrackerService(
+        TrackSetup(tracker, body.chassis.bicycle, body.footprint, body.points.mount),
+        clock,
+        inputs=inputs,
+        drive=requests,
+        tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
+        events=bus.event_sink(),
+        actor=actor,
+        points=body.points,
+    )
+
+
+START_TIMEOUT: Final = 180.0
+"""Real seconds the worker may take to start: the first time it compiles."""
+
+
+def build_goals(
+    config: TruckConfig,
+    planner: PlannerConfig,
+    bus: Bus,
+    clock: Clock,
+    chassis: Chassis,
+    footprint: Footprint,
+    path: Publisher[Path],
+    planner_request: Publisher[DriveRequest],
+    actors: ActorFactory,
+) -> GoalService:
+    """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
+    lidar, mapped = config.devices.lidar, config.slam is not None
+    assert config.tracker is not None
+    planner = planner.model_copy(update={"map": None}) if mapped else planner
+    mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
+    setup = Setup(planner, chassis.bicycle, footprint, mount, timed=not isinstance(clock, VirtualClock))
+    return GoalService(
+        setup,
+        clock,
+        actors.actor(
+            config.placement.planner,
+            PLANNING,
+            STEPS[PLANNING],
+            latency=planner.latency,
+            deadline=planner.deadline,
+            start_timeout=START_TIMEOUT,
+        ),
+        deceleration=config.tracker.deceleration,
+        max_age=config.gate.max_request_age,
+        inputs=Inputs(
+            goals=bus.subscribe(topics.REQ_GOAL, fifo(4)),
+            controls=bus.subscribe(topics.REQ_GOAL_CONTROL, fifo(4)),
+            gate=bus.subscribe(topics.GATE, latest()),
+            pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
+            tracker=bus.subscribe(topics.TRACKER, latest()),
+            path=bus.subscribe(topics.PATH, latest()),
+            scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
+            grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
+        ),
+        outputs=Outputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
+        deformation=_deformation(config, setup, bus, clock, actors),
+    )
+
+
+def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, actors: ActorFactory) -> Deformation | None:
+    mapped, local = config.slam is not None, setup.config.local
+    if setup.config.deform is None or config.devices.lidar is None:
+        return None
+    return Deformation(
+        setup,
+        clock,
+        actors.actor(
+            config.placement.deformer,
+            DEFORMING,
+            STEPS[DEFORMING],
+            latency=local.latency,
+            deadline=local.deadline,
+            start_timeout=START_TIMEOUT,
+        ),
+        scan=bus.subscribe(topics.SCAN, latest()),
+        pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
+        grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
+        events=bus.event_sink(),
+    )
