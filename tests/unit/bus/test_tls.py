@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.client import VARIABLE, ClientTls, TruckClient, station_tls
+from monstertruck_runtime.client import TLS_VARIABLE, ClientTls, TruckClient, station_tls
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, TruckError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
@@ -87,7 +87,7 @@ async def test_a_command_finds_the_stations_certificate_by_itself(tmp_path: Path
         ca=tmp_path / "ca.pem", certificate=tmp_path / "truck.pem", key=tmp_path / "truck.key", pilots=("ann",)
     )
     endpoint = free_endpoint("tls")
-    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    monkeypatch.setenv(TLS_VARIABLE, str(tmp_path))
     async with running_robot(endpoint, tls=server) as robot, TruckClient(endpoint=endpoint, timeout=1.0) as client:
         robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
         assert await client.get_retained(GATE) == gate_state(1)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from monstertruck_runtime import station, wire
+from monstertruck_runtime import client, wire
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import BusyError, ConfigError
@@ -94,7 +94,7 @@ async def test_large_messages_take_no_shared_memory():
 
     before, got = shared(), []
     async with running_robot() as robot:
-        dial = json.dumps(station.session_config(robot.endpoint, 3.0, None))
+        dial = json.dumps(client.session_config(robot.endpoint, 3.0, None))
         with zenoh.open(zenoh.Config.from_json5(dial)) as reader:
             reader.declare_subscriber("mt/truck/state/map", got.append)
             await asyncio.sleep(0.1)
