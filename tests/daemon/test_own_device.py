@@ -54,6 +54,8 @@ def test_it_is_driven_and_recorded(project: Path, target: Path, tmp_path: Path):
 @pytest.mark.virtual
 def test_it_is_listed_and_checked(project: Path, target: Path):
     assert "sensor/sonar" in run_with(target, "topics")
+    listed = run_with(target, "plugins", "--json")
+    assert {"mb7360", "sensor/sonar"} <= {row["name"] for row in json.loads(listed) if "truck-sonar" in row["origin"]}
     shown = run_with(target, "config", "show", str(project / "robot.yaml"))
     assert "9600" in shown, "its own baud rate"
     bad = project / "bad.yaml"
