@@ -7,13 +7,13 @@ whether the bytes come from a tty, a pty or another coroutine.
 import asyncio
 import contextlib
 import errno
-import os
 import termios
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, Self
 
 import serial
+import serial_asyncio
 
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
 
@@ -305,15 +305,15 @@ class SerialPort:
             raise DeviceLostError(f"{self.name}: {error}") from error
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(tty.fileno(), termios.TCIOFLUSH)
-        return _Tty(self.name, tty).link
+        return _SerialProtocol(self.name, tty).link
 
     def _open_error(self, error: serial.SerialException) -> Exception:
         busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
         return PortBusyError(f"{self.name}: held by another process") if busy else DeviceLostError(str(error))
 
 
-class _Tty:
-    """Reads and writes at once what an open tty has and takes; what it does not take waits until it does.
+class _SerialProtocol(asyncio.Protocol):
+    """Feeds a ``Link`` from a pyserial-asyncio transport.
 
     Args:
         name: for error messages.
@@ -321,61 +321,12 @@ class _Tty:
     """
 
     def __init__(self, name: str, tty: serial.Serial) -> None:
-        self.link = Link(name, self._send, self._close)
-        self._tty = tty
-        self._fd = tty.fileno()
-        self._unsent = bytearray()
-        self._loop = asyncio.get_running_loop()
-        os.set_blocking(self._fd, False)
-        self._loop.add_reader(self._fd, self._readable)
+        transport = serial_asyncio.SerialTransport(asyncio.get_running_loop(), self, tty)
+        # abort(), never close(): close() with a stalled peer never ends.
+        self.link = Link(name, transport.write, transport.abort)
 
-    def _readable(self) -> None:
-        try:
-            data = os.read(self._fd, BUFFER_LIMIT)
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._lose(f"unplugged ({error})")
-            return
-        if data:
-            self.link.feed(data)
-        else:
-            self._lose("unplugged (hung up)")
+    def data_received(self, data: bytes) -> None:
+        self.link.feed(data)
 
-    def _send(self, data: bytes) -> None:
-        if not self._unsent:
-            try:  # noqa: SIM105  # four hundred times a second
-                data = data[os.write(self._fd, data) :]
-            except OSError:  # not even one byte now; a lost tty says so again when it is written to later
-                pass
-        if data:
-            if not self._unsent:
-                self._loop.add_writer(self._fd, self._writable)
-            self._unsent += data
-
-    def _writable(self) -> None:
-        try:
-            del self._unsent[: os.write(self._fd, self._unsent)]
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._lose(f"unplugged ({error})")
-            return
-        if not self._unsent:
-            self._loop.remove_writer(self._fd)
-
-    def _lose(self, why: str) -> None:
-        self._close()
-        self.link.lose(why)
-
-    def _close(self) -> None:
-        """Drop what was not sent; closing with a peer that reads nothing must not wait for it."""
-        if self._fd < 0:
-            return
-        self._loop.remove_reader(self._fd)
-        self._loop.remove_writer(self._fd)
-        with contextlib.suppress(OSError, termios.error):
-            termios.tcflush(self._fd, termios.TCIOFLUSH)
-        self._fd = -1
-        with contextlib.suppress(OSError, serial.SerialException):
-            self._tty.close()
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.link.lose(f"unplugged ({exc})" if exc else "unplugged")
