@@ -16,8 +16,7 @@ import numpy as np
 from monstertruck_drivers.catalog import Duty
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link import Port
-from monstertruck_planners.goals import rpc as goal_rpc
-from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.goals.service import GoalService, register_goal_calls
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
@@ -145,7 +144,7 @@ class Daemon:
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors):
                 self._start(planners, service)
                 if isinstance(service, GoalService):
-                    goal_rpc.register(self.rpc, service, self.clock)
+                    register_goal_calls(self.rpc, service, self.clock)
             if self._notify is not None:
                 self._notify.up()
             await stop.wait()

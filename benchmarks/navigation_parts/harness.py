@@ -19,8 +19,8 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
-from monstertruck_planners.goals.mission import apart
-from monstertruck_planners.goals.planning import PlanningStep
+from monstertruck_planners.goals.goal_run import apart
+from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.track.catalog import build_tracker
 from monstertruck_planners.track.config import LqrConfig
@@ -127,7 +127,7 @@ def trip(where: Place, rng: np.random.Generator) -> dict[str, Any]:
         if answer.reason is Reason.ROUTE_TIMEOUT:
             answer = where.steps[1].step(task)
         row["reason"] = answer.reason
-        if not answer.ok:
+        if answer.poses is None:
             break
         row["length"] = row.get("length", answer.length)
         pose, collided, seconds = drive(where, answer, pose)

@@ -7,9 +7,9 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.catalog import BEHAVIOURS
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.deform import Deformation
+from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import Setup
-from monstertruck_planners.goals.parts import Inputs, Outputs
+from monstertruck_planners.goals.path_publisher import Inputs, Outputs
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
@@ -146,11 +146,13 @@ def build_goals(
     )
 
 
-def _deformation(config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, actors: ActorFactory) -> Deformation | None:
+def _deformation(
+    config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, actors: ActorFactory
+) -> RouteDeformation | None:
     mapped, local = config.slam is not None, setup.config.local
     if setup.config.deform is None or config.devices.lidar is None:
         return None
-    return Deformation(
+    return RouteDeformation(
         setup,
         clock,
         actors.actor(

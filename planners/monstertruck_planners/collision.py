@@ -240,6 +240,28 @@ def swept_poses(steering: FourWheelSteering, front: float, rear: float, distance
     return np.column_stack(poses)
 
 
+def placed(poses: Array, at: tuple[float, float, float]) -> Array:
+    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
+    x, y, yaw = at
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.column_stack(
+        (x + c * poses[:, 0] - s * poses[:, 1], y + s * poses[:, 0] + c * poses[:, 1], yaw + poses[:, 2])
+    )
+
+
+def points_relative(points: Array, at: tuple[float, float, float]) -> Array:
+    """Points (n, 2) in the frame of ``at``, both given in one frame."""
+    x, y, yaw = at
+    c, s = math.cos(yaw), math.sin(yaw)
+    dx, dy = points[:, 0] - x, points[:, 1] - y
+    return np.column_stack((c * dx + s * dy, c * dy - s * dx))
+
+
+def poses_relative(poses: Array, at: tuple[float, float, float]) -> Array:
+    """Poses (n, 3) in the frame of ``at``, both given in one frame."""
+    return np.column_stack((points_relative(poses, at), poses[:, 2] - at[2]))
+
+
 def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:
     """Valid returns of a scan in the base frame.
 

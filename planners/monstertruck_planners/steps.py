@@ -14,8 +14,8 @@ DEFORMING: Final = "deforming"
 TRACKING: Final = "tracking"
 
 STEPS: Final = {
-    PLANNING: "monstertruck_planners.goals.planning_worker:PlanningWorker",
-    DEFORMING: "monstertruck_planners.goals.deforming_worker:DeformingWorker",
+    PLANNING: "monstertruck_planners.goals.plan_step:PlanningWorker",
+    DEFORMING: "monstertruck_planners.goals.deform_step:DeformingWorker",
     TRACKING: "monstertruck_planners.track.service:TrackingWorker",
 }
 """``module:factory`` by name."""

@@ -56,5 +56,6 @@ def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_
     plan, last = found["planning"][0][0], found["deforming"][0][0]
     assert isinstance(plan, PlanAnswer)
     assert isinstance(last, DeformAnswer)
-    assert (plan.ok, last.finding) == (True, "new")
+    assert plan.poses is not None
+    assert last.finding == "new"
     assert found["tracking"][0][-1].drive[0].speed > 0.0

@@ -37,7 +37,7 @@ class Book:
         """What the goal service is answered: the path that was driven, where there was one."""
         if driven is None or _same(computed, driven):
             return computed
-        self._computed[driven.name] = computed if computed.ok else NOTHING
+        self._computed[driven.name] = computed if computed.poses is not None else NOTHING
         poses = np.array(driven.poses).reshape(-1, 3)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return replace(

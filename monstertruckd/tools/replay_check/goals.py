@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from monstertruck_planners.goals.lead import SOURCE
+from monstertruck_planners.goals.path_publisher import SOURCE
 from monstertruck_planners.goals.service import REPORT
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import TruckError

@@ -1,4 +1,4 @@
-"""Settings of the way to a goal: route planner, map, recovery ladder. Light."""
+"""Settings of driving to goals: route planner, map, deformation, recovery behaviours; light, no planner is loaded."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -14,7 +14,7 @@ from monstertruck_schemas.plan import Steering
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0)]
 
-Rung = Literal["clear", "back_out", "wait", "replan"]
+Recovery = Literal["clear", "back_out", "wait", "replan"]
 
 DRIVEN: dict[Literal["2ws", "counter", "4ws"], tuple[Steering, ...]] = {
     "2ws": ("front",),
@@ -89,19 +89,19 @@ class PlannerConfig(Schema):
     unarmed_timeout: Positive = 300.0
     """Seconds a goal waits for the truck to be armed."""
     stuck: Positive = 4.0
-    """Seconds without progress after which the recovery ladder begins."""
+    """Seconds without progress after which the recovery behaviours begin."""
     progress: Positive = 0.03
     """Metres along the path that are progress."""
     look_ahead: Positive = 1.5
     """Way ahead that is compared with the newest scan, m."""
     sightings: Annotated[int, Field(ge=1)] = 3
     """Looks in a row that have to show the way blocked."""
-    ladder: Annotated[tuple[Rung, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
-    """What is tried in turn to get out of trouble, before the goal is given up"""
+    ladder: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
+    """Recovery behaviours, tried in turn before the goal is given up"""
     wait: Positive = 5.0
-    """Seconds of the step "wait"."""
+    """Seconds of the behaviour "wait"."""
     recovered: Positive = 0.5
-    """Metres nearer to the goal along the route than ever before, after which the ladder begins anew"""
+    """Metres nearer to the goal along the route than ever before, after which the recovery behaviours begin anew"""
     routes: Annotated[int, Field(ge=1)] = 30
     """Routes for one goal at most."""
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1

@@ -6,7 +6,6 @@ things differ. Speeds follow from the axle angles by the truck's kinematics, whe
 sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the way is checked as a whole.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,20 +103,3 @@ def _way(
     if (len(poses) - 1) * STEP < SHORTEST:
         return None
     return Escape(poses, direction, steering)
-
-
-def placed(poses: Array, at: tuple[float, float, float]) -> Array:
-    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
-    x, y, yaw = at
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack(
-        (x + c * poses[:, 0] - s * poses[:, 1], y + s * poses[:, 0] + c * poses[:, 1], yaw + poses[:, 2])
-    )
-
-
-def seen_from(points: Array, at: tuple[float, float, float]) -> Array:
-    """Points (n, 2) in the frame of ``at``."""
-    x, y, yaw = at
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = points[:, 0] - x, points[:, 1] - y
-    return np.column_stack((c * dx + s * dy, c * dy - s * dx))

@@ -1,4 +1,4 @@
-"""What goes to the planning step and what comes back; picklable, and light."""
+"""Inputs and outputs of the planning step and the deforming step; light, as the daemon's loop imports them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,7 @@ from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import Grid, Odometry
 
 Pose = tuple[float, float, float]
 Place = tuple[float, float, float | None]
@@ -54,12 +54,12 @@ class PlanTask:
 
 @dataclass(frozen=True, slots=True)
 class PlanAnswer:
-    """A way to drive, or why there is none."""
+    """A path to drive, or the reason why there is none."""
 
     reason: Reason
     text: str = ""
     poses: Array | None = None
-    """Shape (n, 3): of the base along the way."""
+    """Shape (n, 3): of the base along the path; None without one."""
     directions: Array | None = None
     """Shape (n,): +1 or -1."""
     steering: tuple[Steering, ...] = ()
@@ -72,11 +72,6 @@ class PlanAnswer:
     """It is the rest of the route before."""
     drivable: bool = True
     """Its poses follow from motions of the truck; else they only show where to go."""
-
-    @property
-    def ok(self) -> bool:
-        """Whether there is something to drive."""
-        return self.reason is Reason.OK and self.poses is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,3 +120,13 @@ class DeformAnswer:
     """The path leads to the route's end."""
     path: PlanAnswer | None = None
     """The new path."""
+
+
+def level(scan: LaserScan, config: PlannerConfig) -> bool:
+    """Whether a scan lay flat enough to tell of the way, as far as it is known."""
+    return scan.tilt is None or scan.tilt <= config.max_tilt
+
+
+def pose_of(odometry: Odometry) -> Pose:
+    """x, y (m), yaw (rad)."""
+    return odometry.pose.x, odometry.pose.y, odometry.pose.yaw

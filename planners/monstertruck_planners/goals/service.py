@@ -1,26 +1,33 @@
-"""Goals in the daemon: requests and facts to the state machine, its decisions to planner, tracker and events."""
+"""Goals as a service: requests and observations to the state machine, its decisions to planner, tracker and events."""
 
 import asyncio
 import math
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import scan_points
-from monstertruck_planners.goals import mission as machine
-from monstertruck_planners.goals.deform import Deformation, told_of
-from monstertruck_planners.goals.escape import placed
-from monstertruck_planners.goals.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup
-from monstertruck_planners.goals.lead import AT_REST, Lead
-from monstertruck_planners.goals.lookout import blocked, way_ahead
-from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
-from monstertruck_planners.goals.parts import Followed, Inputs, Outputs, goal_state, level, pose_of
+from monstertruck_planners.collision import placed, scan_points
+from monstertruck_planners.goals import goal_run
+from monstertruck_planners.goals.deformation import RouteDeformation, event_of
+from monstertruck_planners.goals.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup, level, pose_of
+from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
+from monstertruck_planners.goals.path_publisher import (
+    AT_REST,
+    FollowedPath,
+    Inputs,
+    Outputs,
+    PathPublisher,
+    path_blocked,
+    poses_ahead,
+)
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
-from monstertruck_runtime.ports import Ready
-from monstertruck_runtime.requests import Sequences, refusal
+from monstertruck_runtime.ports import Ready, RpcRegistry
+from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
@@ -30,13 +37,19 @@ from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 REPORT: Final = SECOND // 2
-"""Between two reports without news, ns."""
+"""Between two reports without a change, ns."""
+CHANGES: Final = ("phase", "outcome", "number", "routes", "recoveries")
+"""Fields of the report whose change is reported at once."""
+FIRST_ROUTE: Final = 4.0
+"""Seconds a remote call waits for the first route; the goal is pursued further."""
+
+R = TypeVar("R", bound=Request)
 
 
 class GoalService:
     """Drives to goals, one at a time; a new one takes the place of the old.
 
-    While it thinks and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
+    While a way is planned and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
 
     Args:
         setup: how, and the truck.
@@ -61,16 +74,16 @@ class GoalService:
         max_age: float,
         inputs: Inputs,
         outputs: Outputs,
-        deformation: Deformation | None = None,
+        deformation: RouteDeformation | None = None,
     ) -> None:
         self._setup, self._config, self._clock = setup, setup.config, clock
         self._in, self._out, self._max_age = inputs, outputs, max_age
         self._place, self._deformation = actor, deformation
         self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
-        self._mission: Mission | None = None
+        self._goal: GoalRun | None = None
         self._number = 0
-        self._lead = Lead(clock, inputs, outputs, deceleration)
-        self._told: GoalState | None = None
+        self._paths = PathPublisher(clock, inputs, outputs, deceleration)
+        self._reported: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
         self._actor: Actor | None = None
         self._tasks: asyncio.TaskGroup | None = None
@@ -87,7 +100,7 @@ class GoalService:
             async with asyncio.TaskGroup() as tasks:
                 self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
                 if self._deformation is not None:
-                    tasks.create_task(self._deformation.run(self._deformed))
+                    tasks.create_task(self._deformation.run(self._on_deformed))
                 self._report(self._clock.now())
                 ready()
                 await self._serve()
@@ -96,20 +109,21 @@ class GoalService:
         schedule = Schedule(self._clock, self._config.rate)
         while True:
             await schedule.next()
-            self._listen()
+            self._take_requests()
             self._tick(self._clock.now())
 
     # Requests
 
-    def _listen(self) -> None:
+    def _take_requests(self) -> None:
         for goal in self._in.goals.drain():
-            self._heed(lambda goal=goal: self.take(goal), goal, "goal")
+            self._answer(self.take, goal, "goal")
         for control in self._in.controls.drain():
-            self._heed(lambda control=control: self.control(control), control, control.order)
+            self._answer(self.control, control, control.order)
 
-    def _heed(self, what: Any, request: Request, name: str) -> None:
+    def _answer(self, handler: Callable[[R], object], request: R, name: str) -> None:
+        """What comes by topic is refused by an event."""
         try:
-            what()
+            handler(request)
         except RequestRefusedError as error:
             self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
 
@@ -128,11 +142,11 @@ class GoalService:
         goal = (request.goal.x, request.goal.y, request.goal.yaw)
         if not all(map(math.isfinite, goal)):
             raise RequestRefusedError(Reason.NOT_FINITE, "goal: expected finite numbers")
-        if self._mission is not None and self._mission.active:
-            self._do(machine.order(self._mission, GoalOrder.CANCEL, request.source, self._seconds()))
+        if self._goal is not None and self._goal.active:
+            self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
         self._number += 1
         via = tuple((place.x, place.y, place.yaw) for place in request.waypoints)
-        self._do(machine.begin(self._number, goal, request.source, self._seconds(), via))
+        self._do(goal_run.begin(self._number, goal, request.source, self._seconds(), via))
         return self._number
 
     def control(self, request: GoalControl) -> None:
@@ -142,9 +156,9 @@ class GoalService:
             RequestRefusedError: the sender may not, or there is no goal.
         """
         self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
-        if self._mission is None or not self._mission.active:
+        if self._goal is None or not self._goal.active:
             raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
-        self._do(machine.order(self._mission, request.order, request.source, self._seconds()))
+        self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
     async def settled(self, number: int) -> GoalState:
         """State of a goal once it is known whether a way leads there.
@@ -152,16 +166,11 @@ class GoalService:
         Raises:
             RequestRefusedError: none does.
         """
-        while self._told is None or (self._told.number == number and self._undecided(self._told)):
+        while (state := self._reported) is None or (state.number == number and _undecided(state)):
             await self._changed.wait()
-        state = self._told
         if state.number == number and state.routes == 0 and state.phase is GoalPhase.IDLE:
             raise RequestRefusedError(state.outcome, state.text)
         return state
-
-    @staticmethod
-    def _undecided(state: GoalState) -> bool:
-        return state.phase is GoalPhase.PLANNING and state.routes == 0 and state.recoveries == 0
 
     def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
         reason = refusal(
@@ -170,28 +179,29 @@ class GoalService:
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
 
-    # Facts
+    # Observations
 
     def _tick(self, now: int) -> None:
-        mission = self._mission
-        if mission is not None and mission.active:
-            if self._lead.displaced:
-                self._do(machine.displaced(mission, "another path is followed now"))
+        run = self._goal
+        if run is not None and run.active:
+            if self._paths.displaced:
+                self._do(goal_run.displaced(run, "another path is followed now"))
                 if self._deformation is not None:
                     self._deformation.end()
             else:
-                self._do(machine.tick(mission, self._facts(now), self._config))
-            self._stand_still(self._mission or mission)
+                self._do(goal_run.tick(run, self._observe(now), self._config))
+            if self._goal is not None and self._goal.active and self._goal.phase is not GoalPhase.PAUSED:
+                self._paths.stand_still()
         self._report(now)
 
-    def _facts(self, now: int) -> Facts:
-        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._lead.followed
+    def _observe(self, now: int) -> Observations:
+        odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._paths.followed
         answer = None
         if self._planning is not None and self._planning.done():
             answer, self._planning = self._planning.result(), None
-        report = None if followed is None else followed.told(self._in.tracker.latest)
+        report = None if followed is None else followed.report(self._in.tracker.latest)
         along = 0.0 if report is None else report.along
-        return Facts(
+        return Observations(
             now=now / SECOND,
             armed=gate is not None and gate.mode.active and odometry is not None,
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
@@ -203,9 +213,9 @@ class GoalService:
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
         )
 
-    def _left(self, followed: Followed | None, along: float) -> float:
+    def _left(self, followed: FollowedPath | None, along: float) -> float:
         """Metres of the route ahead; of none, infinitely many."""
-        if self._deformation is not None and self._deformation.up:
+        if self._deformation is not None and self._deformation.active:
             return self._deformation.left
         return math.inf if followed is None else max(float(followed.travelled[-1]) - along, 0.0)
 
@@ -218,15 +228,15 @@ class GoalService:
         on_the_way = self._deformation is not None and not self._deformation.complete
         return Reason.DRIVING if on_the_way and outcome is Reason.GOAL_REACHED else outcome
 
-    def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
-        if self._deformation is not None and self._deformation.up:
+    def _blocked(self, followed: FollowedPath, along: float, odometry: Odometry, now: int) -> bool:
+        if self._deformation is not None and self._deformation.active:
             return self._deformation.blocked(now)
         points = self._scan(now)
         if not len(points):
             return False
         pose = pose_of(odometry)
-        way = way_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, np.array(pose))
-        return blocked(self._setup.footprint, way, points, pose)
+        ahead = poses_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, pose)
+        return path_blocked(self._setup.footprint, ahead, points, pose)
 
     def _scan(self, now: int) -> Array:
         """Returns of the newest scan in base; none if it is old or tilted."""
@@ -240,14 +250,14 @@ class GoalService:
 
     # Decisions
 
-    def _do(self, step: tuple[Mission, tuple[Action, ...]]) -> None:
-        self._mission, actions = step
+    def _do(self, step: tuple[GoalRun, tuple[Action, ...]]) -> None:
+        self._goal, actions = step
         for action in actions:
             match action:
-                case Tell(reason, severity, text):
-                    self._out.events(reason, severity, self.name, text, goal=self._mission.number)
+                case Report(reason, severity, text):
+                    self._out.events(reason, severity, self.name, text, goal=self._goal.number)
                 case Plan():
-                    self._plan(self._mission, action)
+                    self._plan(self._goal, action)
                 case Follow(answer):
                     self._follow(answer)
                 case Halt():
@@ -255,7 +265,7 @@ class GoalService:
         if actions:
             self._report(self._clock.now())
 
-    def _plan(self, mission: Mission, plan: Plan) -> None:
+    def _plan(self, run: GoalRun, plan: Plan) -> None:
         now = self._clock.now()
         odometry = self._odometry(now)
         assert self._tasks is not None
@@ -268,13 +278,13 @@ class GoalService:
         task = PlanTask(
             plan.what,
             pose,
-            mission.goal,
+            run.goal,
             points,
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             clear=plan.clear,
             afresh=plan.afresh,
-            via=mission.via,
+            via=run.via,
         )
         self._fresh, self._sent_grid = False, grid
         self._planning = self._tasks.create_task(self._ask(task))
@@ -291,51 +301,45 @@ class GoalService:
         return answer
 
     def _follow(self, answer: PlanAnswer) -> None:
-        mission, deformation = self._mission, self._deformation
-        assert mission is not None
+        run, deformation = self._goal, self._deformation
+        assert run is not None
         if deformation is not None:
             deformation.end()
-            if mission.planned == "route":
+            if run.planned == "route":
                 deformation.begin(answer)
-        self._lead.follow(answer, f"goal-{self._number}")
+        self._paths.follow(answer, f"goal-{self._number}")
 
-    def _deformed(self, was: Finding, answer: DeformAnswer) -> None:
+    def _on_deformed(self, was: Finding, answer: DeformAnswer) -> None:
         """Drive what became of the route."""
-        followed, mission, deformation = self._lead.followed, self._mission, self._deformation
+        followed, run, deformation = self._paths.followed, self._goal, self._deformation
         assert deformation is not None
-        if followed is None or mission is None or mission.phase is GoalPhase.BACKING_OUT:
+        if followed is None or run is None or run.phase is GoalPhase.BACKING_OUT:
             return
         before, name = followed.before + followed.along(self._in.tracker.latest), f"goal-{self._number}"
         if answer.path is not None:
-            self._lead.follow(answer.path, f"{name}-deformed", before)
+            self._paths.follow(answer.path, f"{name}-deformed", before)
         elif answer.finding == "free" and was not in ("idle", "free"):
-            self._lead.follow(deformation.rest(), name, before)
+            self._paths.follow(deformation.rest(), name, before)
         elif answer.finding == "blocked" and was != "blocked":
-            self._lead.brake(f"{name}-held-up")
-        told = told_of(was, answer)
-        if told is not None:
-            self._out.events(*told[:2], self.name, f"goal {mission.number}: {told[2]}", goal=mission.number)
+            self._paths.brake(f"{name}-held-up")
+        if (event := event_of(was, answer)) is not None:
+            reason, severity, text = event
+            self._out.events(reason, severity, self.name, f"goal {run.number}: {text}", goal=run.number)
 
     def _halt(self) -> None:
         if self._deformation is not None:
             self._deformation.end()
-        self._lead.halt(f"halt-{self._number}")
-
-    def _stand_still(self, mission: Mission) -> None:
-        """Keep the truck armed while nothing is driven: a way is looked for, or what there was of one has ended."""
-        if mission.active and mission.phase is not GoalPhase.PAUSED:
-            self._lead.stand_still()
+        self._paths.halt(f"halt-{self._number}")
 
     def _report(self, now: int) -> None:
         left = 0.0 if self._deformation is None else self._deformation.left
-        state = goal_state(self._mission, now, self._lead.followed, self._in, left)
-        same = ("phase", "outcome", "number", "routes", "recoveries")
-        told = self._told
-        unchanged = told is not None and all(getattr(told, name) == getattr(state, name) for name in same)
-        if told is not None and unchanged and (now - told.stamp < REPORT or state.phase is GoalPhase.IDLE):
+        state = goal_state(self._goal, now, self._paths.followed, self._in, left)
+        before = self._reported
+        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
+        if before is not None and unchanged and (now - before.stamp < REPORT or state.phase is GoalPhase.IDLE):
             return
-        self._told = state.model_copy(update={"seq": self._out.state.next_seq()})
-        self._out.state.put(self._told)
+        self._reported = state.model_copy(update={"seq": self._out.state.next_seq()})
+        self._out.state.put(self._reported)
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
@@ -345,3 +349,64 @@ class GoalService:
 
 async def _known(answer: PlanAnswer) -> PlanAnswer:
     return answer
+
+
+def _undecided(state: GoalState) -> bool:
+    return state.phase is GoalPhase.PLANNING and state.routes == 0 and state.recoveries == 0
+
+
+def goal_state(
+    run: GoalRun | None, now: int, followed: FollowedPath | None, inputs: Inputs, left: float = 0.0
+) -> GoalState:
+    """The report on a goal, its sequence number still 0; ``left`` metres of the route are ahead at least."""
+    odometry = inputs.pose.latest
+    frame = "map" if odometry is None else odometry.frame
+    if run is None:
+        return GoalState(stamp=now, received=now, seq=0, frame=frame)
+    x, y, yaw = run.goal
+    remaining = 0.0
+    if followed is not None and run.active:
+        remaining = max(float(followed.travelled[-1]) - followed.along(inputs.tracker.latest), left, 0.0)
+    return GoalState(
+        stamp=now,
+        received=now,
+        seq=0,
+        frame=frame,
+        number=run.number,
+        source=run.source,
+        goal=Pose2D(x=x, y=y, yaw=yaw),
+        phase=run.phase,
+        outcome=run.outcome,
+        text=run.text,
+        waypoints=len(run.via) if run.active else 0,
+        remaining=remaining,
+        elapsed=run.elapsed,
+        routes=run.routes,
+        recoveries=run.recoveries,
+    )
+
+
+def register_goal_calls(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
+    """Serve ``goal`` and ``goal_control``; their payloads are a ``GoalRequest`` and a ``GoalControl``.
+
+    Args:
+        rpc: where.
+        service: what pursues goals.
+        clock: time.
+    """
+
+    async def goal(payload: dict[str, Any]) -> dict[str, Any]:
+        number = service.take(parse_request(GoalRequest, payload))
+        try:
+            async with clock.deadline(FIRST_ROUTE):
+                state = await service.settled(number)
+        except TimeoutError:
+            return {"number": number, "planned": False}
+        return {"number": number, "planned": True, "length": state.remaining}
+
+    async def control(payload: dict[str, Any]) -> dict[str, Any]:
+        service.control(parse_request(GoalControl, payload))
+        return {}
+
+    rpc.register("goal", goal)
+    rpc.register("goal_control", control)

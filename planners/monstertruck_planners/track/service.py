@@ -7,11 +7,9 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
+from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near, poses_relative
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
 from monstertruck_planners.track.segments import Progress, SegmentedPath
@@ -256,9 +254,7 @@ class TrackingStep:
 
     def _measure_clearance(self, scan: LaserScan, path: SegmentedPath, pose: Odometry) -> float:
         ahead = path.ahead(self._progress, self._config.reach, LOOKS)
-        c, s = math.cos(pose.pose.yaw), math.sin(pose.pose.yaw)
-        dx, dy = ahead[:, 0] - pose.pose.x, ahead[:, 1] - pose.pose.y
-        poses = np.column_stack((c * dx + s * dy, c * dy - s * dx, ahead[:, 2] - pose.pose.yaw))
+        poses = poses_relative(ahead, (pose.pose.x, pose.pose.y, pose.pose.yaw))
         near = points_near(self._points.of(scan), poses, self._near)
         return float(clearance_to_points(self._footprint, poses, near).min())
 

@@ -10,7 +10,7 @@ import pytest
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.deform import Deformation, told_of
+from monstertruck_planners.goals.deformation import RouteDeformation, event_of
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.clock import VirtualClock, run_virtual
@@ -59,7 +59,7 @@ class Stage:
         self.poses: Mailbox[Odometry] = Mailbox(latest())
         self.told: list[tuple[Finding, Finding]] = []
         self.events: list[Reason] = []
-        self.deformation = Deformation(
+        self.deformation = RouteDeformation(
             Setup(PlannerConfig(deform=RsbandConfig()), FourWheelSteering(), Footprint()),
             clock, self.actor, scan=self.scans, pose=self.poses, grid=None,
             events=lambda reason, *_, **__: self.events.append(reason),
@@ -126,7 +126,7 @@ def test_tilted_scans_say_nothing():
 def test_the_route_counts_as_blocked_after_a_while_without_a_way_round():
     async def story(stage: Stage) -> None:
         stage.deformation.begin(ROUTE)
-        assert not stage.deformation.up
+        assert not stage.deformation.active
         stage.actor.answer = BLOCKED
         await stage.scan(15)
         assert (stage.deformation.held_up, stage.deformation.blocked(stage.clock.now())) == (True, False)
@@ -136,7 +136,7 @@ def test_the_route_counts_as_blocked_after_a_while_without_a_way_round():
         assert not stage.deformation.blocked(stage.clock.now())
         stage.actor.answer = DeformAnswer(1, "kept", complete=True)
         await stage.scan(10)
-        assert not stage.deformation.up, "that was another route's"
+        assert not stage.deformation.active, "that was another route's"
 
     play(story)
 
@@ -172,5 +172,5 @@ def test_a_detour_without_end_is_blocked_too():
     ],
 )
 def test_changes_are_told_once(was: Finding, answer: DeformAnswer, reason: Reason | None):
-    told = told_of(was, answer)
+    told = event_of(was, answer)
     assert (None if told is None else told[0]) is reason

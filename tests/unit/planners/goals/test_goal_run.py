@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, clearance_to_points
-from monstertruck_planners.goals import mission as machine
+from monstertruck_planners.collision import Footprint, clearance_to_points, placed, points_relative
+from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
-from monstertruck_planners.goals.escape import blocked_sides, escape, placed, seen_from
+from monstertruck_planners.goals.escape import blocked_sides, escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
-from monstertruck_planners.goals.lookout import blocked, cut, way_ahead
-from monstertruck_planners.goals.mission import Action, Facts, Follow, Halt, Mission, Plan, Tell
-from monstertruck_planners.goals.planning import PlanningStep
+from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
+from monstertruck_planners.goals.path_publisher import kept_poses, path_blocked, poses_ahead
+from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
@@ -30,47 +30,47 @@ WAY = PlanAnswer(Reason.OK, poses=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), 
 
 
 class Story:
-    """A mission that is told facts; time passes by 0.1 s a fact."""
+    """A run that is told facts; time passes by 0.1 s a fact."""
 
     def __init__(self, config: PlannerConfig = CONFIG) -> None:
         self.config = config
         self.now = 0.0
-        self.mission, actions = machine.begin(1, GOAL, "tester", 0.0)
+        self.run, actions = goal_run.begin(1, GOAL, "tester", 0.0)
         self.done: list[Action] = list(actions)
 
-    def tell(self, count: int = 1, **facts: Any) -> tuple[Action, ...]:
+    def tell(self, count: int = 1, **observed: Any) -> tuple[Action, ...]:
         actions: list[Action] = []
         for _ in range(count):
             self.now += 0.1
-            known: dict[str, Any] = {"armed": True, "at_rest": True, "pose": (0.0, 0.0, 0.0), **facts}
-            self.mission, some = machine.tick(self.mission, Facts(now=self.now, **known), self.config)
+            known: dict[str, Any] = {"armed": True, "at_rest": True, "pose": (0.0, 0.0, 0.0), **observed}
+            self.run, some = goal_run.tick(self.run, Observations(now=self.now, **known), self.config)
             actions += some
         self.done += actions
         return tuple(actions)
 
     def order(self, what: GoalOrder) -> tuple[Action, ...]:
-        self.mission, actions = machine.order(self.mission, what, "tester", self.now)
+        self.run, actions = goal_run.order(self.run, what, "tester", self.now)
         return actions
 
     @property
     def phase(self) -> GoalPhase:
-        return self.mission.phase
+        return self.run.phase
 
 
 def told(actions: Iterable[Action]) -> list[Reason]:
-    return [action.reason for action in actions if isinstance(action, Tell)]
+    return [action.reason for action in actions if isinstance(action, Report)]
 
 
 def test_a_goal_is_planned_followed_and_reached():
     story = Story()
-    assert story.done == [Tell(Reason.GOAL_ACCEPTED, machine.Severity.INFO, story.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
+    assert story.done == [Report(Reason.GOAL_ACCEPTED, goal_run.Severity.INFO, story.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
     assert story.tell() == ()
     actions = story.tell(answer=WAY)
     assert (story.phase, actions[0], told(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
     assert story.tell(10, along=1.0, at_rest=False) == ()
     assert story.tell(outcome=Reason.GOAL_REACHED, at_rest=False, pose=GOAL) == (), "still rolling"
     actions = story.tell(outcome=Reason.GOAL_REACHED, pose=(1.95, 0.02, 0.05 + math.tau))
-    assert (story.mission.outcome, story.mission.active) == (Reason.GOAL_REACHED, False)
+    assert (story.run.outcome, story.run.active) == (Reason.GOAL_REACHED, False)
     assert (Halt() in actions, told(actions)) == (True, [Reason.GOAL_REACHED])
     assert story.tell(answer=WAY) == ()
 
@@ -79,18 +79,18 @@ def test_a_goal_is_planned_followed_and_reached():
 def test_a_goal_without_a_way_is_refused_at_once(reason: Reason):
     story = Story()
     story.tell(answer=PlanAnswer(reason, "why"))
-    assert (story.mission.outcome, story.mission.text, story.mission.recoveries) == (reason, "why", 0)
+    assert (story.run.outcome, story.run.text, story.run.recoveries) == (reason, "why", 0)
 
 
 def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
     story = Story()
-    for _ in range(machine.MISSES):
+    for _ in range(goal_run.MISSES):
         story.tell(answer=WAY)
         assert told(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
         assert story.phase is GoalPhase.PLANNING
     story.tell(answer=WAY)
     story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.3))
-    assert story.mission.outcome is Reason.GOAL_MISSED
+    assert story.run.outcome is Reason.GOAL_MISSED
 
 
 def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
@@ -98,7 +98,7 @@ def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
     for outcome in (Reason.DRIVING, Reason.GOAL_REACHED):
         story.tell(answer=WAY)
         story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.15))
-        assert story.mission.outcome is outcome
+        assert story.run.outcome is outcome
 
 
 def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
@@ -109,7 +109,7 @@ def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     assert (told(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
 
-def test_the_ladder_is_climbed_in_order_and_then_the_goal_is_given_up():
+def test_the_recovery_behaviours_are_tried_in_order_and_then_the_goal_is_given_up():
     story = Story()
     story.tell(answer=WAY)
     stuck = round(CONFIG.stuck / 0.1) + 2
@@ -124,22 +124,22 @@ def test_the_ladder_is_climbed_in_order_and_then_the_goal_is_given_up():
     assert story.phase is GoalPhase.WAITING
     assert Plan() in story.tell(round(CONFIG.wait / 0.1) + 2)
     story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
-    assert (story.phase, story.mission.recoveries) == (GoalPhase.PLANNING, 4)
+    assert (story.phase, story.run.recoveries) == (GoalPhase.PLANNING, 4)
     story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
-    assert (story.mission.outcome, story.mission.text) == (Reason.GOAL_UNREACHABLE, "walled in")
+    assert (story.run.outcome, story.run.text) == (Reason.GOAL_UNREACHABLE, "walled in")
 
 
-def test_the_ladder_begins_anew_once_the_truck_is_nearer_to_the_goal_than_ever():
+def test_the_recovery_behaviours_begin_anew_once_the_truck_is_nearer_to_the_goal_than_ever():
     story = Story()
     story.tell(answer=WAY)
     story.tell(round(CONFIG.stuck / 0.1) + 2, left=1.8)
     story.tell(answer=WAY)
-    assert story.mission.rung == 1
+    assert story.run.rung == 1
     for left in (1.9, 1.8, 1.35):
         story.tell(along=2.0 - left, left=left)
-        assert story.mission.rung == 1
+        assert story.run.rung == 1
     story.tell(along=0.75, left=1.25)
-    assert story.mission.rung == 0
+    assert story.run.rung == 0
 
 
 def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
@@ -150,10 +150,10 @@ def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
         story.tell(round(CONFIG.stuck / 0.1) + 2, along=2.0, left=1.0)
         if story.phase is GoalPhase.WAITING:
             story.tell(round(CONFIG.wait / 0.1) + 2)
-        elif story.mission.planned == "escape":
+        elif story.run.planned == "escape":
             story.tell(answer=PlanAnswer(Reason.STUCK))
             story.tell(round(CONFIG.wait / 0.1) + 2)
-    assert (story.mission.outcome, story.mission.recoveries) == (Reason.STUCK, 4)
+    assert (story.run.outcome, story.run.recoveries) == (Reason.STUCK, 4)
 
 
 def test_a_failed_escape_is_the_next_rung():
@@ -173,14 +173,14 @@ def test_time_counts_only_while_the_truck_could_drive():
     story = Story(PlannerConfig(timeout=5.0, unarmed_timeout=20.0))
     story.tell(answer=WAY)
     story.tell(190, armed=False)
-    assert story.mission.active
+    assert story.run.active
     for i in range(60):
         story.tell(along=0.05 * i)
-    assert story.mission.outcome is Reason.GOAL_TIMEOUT
+    assert story.run.outcome is Reason.GOAL_TIMEOUT
     waiting = Story(PlannerConfig(unarmed_timeout=20.0))
     waiting.tell(answer=WAY)
     waiting.tell(210, armed=False)
-    assert waiting.mission.outcome is Reason.DISARMED
+    assert waiting.run.outcome is Reason.DISARMED
 
 
 def test_orders_pause_resume_and_cancel():
@@ -192,13 +192,13 @@ def test_orders_pause_resume_and_cancel():
     assert Plan() in story.order(GoalOrder.RESUME)
     assert story.phase is GoalPhase.PLANNING
     assert Halt() in story.order(GoalOrder.CANCEL)
-    assert story.mission.outcome is Reason.CANCELLED
+    assert story.run.outcome is Reason.CANCELLED
     assert story.order(GoalOrder.CANCEL) == ()
 
 
 def test_somebody_elses_path_is_left_alone():
-    mission, _ = machine.begin(1, GOAL, "tester", 0.0)
-    ended, actions = machine.displaced(mission, "another path")
+    run, _ = goal_run.begin(1, GOAL, "tester", 0.0)
+    ended, actions = goal_run.displaced(run, "another path")
     assert (ended.outcome, Halt() in actions) == (Reason.CANCELLED, False)
 
 
@@ -207,8 +207,8 @@ def test_routes_are_limited():
     for _ in range(2):
         story.tell(answer=WAY)
         story.tell(outcome=Reason.PATH_LOST)
-    assert isinstance(story.mission, Mission)
-    assert story.mission.outcome is Reason.STUCK
+    assert isinstance(story.run, GoalRun)
+    assert story.run.outcome is Reason.STUCK
 
 
 # Backing out
@@ -262,21 +262,21 @@ def test_frames_there_and_back():
     at = (1.0, -2.0, 2.1)
     points = np.array([[0.3, 0.4], [-1.0, 2.0]])
     flat = np.column_stack((points, np.zeros(2)))
-    assert np.allclose(seen_from(placed(flat, at)[:, :2], at), points)
+    assert np.allclose(points_relative(placed(flat, at)[:, :2], at), points)
 
 
 def test_the_way_ahead_is_blocked_by_what_stands_on_it_only():
     poses = np.column_stack((np.linspace(1.0, 5.0, 81), np.ones(81), np.zeros(81)))
     travelled = poses[:, 0] - 1.0
     at = (2.0, 1.0, 0.0)
-    way = way_ahead(poses, travelled, 1.0, 1.5, np.array(at))
+    way = poses_ahead(poses, travelled, 1.0, 1.5, at)
     assert way[0].tolist() == list(at)
     assert way[-1, 0] == pytest.approx(3.5, abs=0.06)
-    assert blocked(BODY, way, np.array([[1.0, 0.1]]), at)
-    assert not blocked(BODY, way, np.array([[1.0, 0.3], [2.5, 0.0]]), at)
-    assert not blocked(BODY, way, np.empty((0, 2)), at)
-    assert travelled[cut(poses, travelled, 1.0, 0.2) - 1] == pytest.approx(1.2, abs=0.06)
-    assert cut(poses, travelled, 0.0, 0.0) == 2
+    assert path_blocked(BODY, way, np.array([[1.0, 0.1]]), at)
+    assert not path_blocked(BODY, way, np.array([[1.0, 0.3], [2.5, 0.0]]), at)
+    assert not path_blocked(BODY, way, np.empty((0, 2)), at)
+    assert travelled[kept_poses(travelled, 1.0, 0.2) - 1] == pytest.approx(1.2, abs=0.06)
+    assert kept_poses(travelled, 0.0, 0.0) == 2
 
 
 # Planning
@@ -307,7 +307,7 @@ def task(goal=(4.5, 1.5, 0.0), points=(), **fields: Any) -> PlanTask:
 def test_routes_round_what_the_scan_shows_until_that_is_forgotten(route):
     step = PlanningStep()
     straight = step.step(task(setup=setup(route=route), grid=hall()))
-    assert straight.ok
+    assert straight.poses is not None
     assert straight.length == pytest.approx(3.5, abs=0.05)
     post = [(2.75, y) for y in np.arange(1.3, 1.75, 0.05)]
     assert straight.poses is not None
@@ -365,27 +365,27 @@ def test_goals_without_a_way_and_what_is_missing():
 
 def test_a_truck_that_stands_within_the_margin_may_leave():
     step = PlanningStep()
-    assert step.step(task(setup=setup(), grid=hall(), pose=(1.0, 0.25, 0.0))).ok
+    assert step.step(task(setup=setup(), grid=hall(), pose=(1.0, 0.25, 0.0))).poses is not None
 
 
 def test_backing_out_sees_the_map_behind_the_truck_too():
     step = PlanningStep()
     wall = [(1.33, y) for y in np.arange(1.2, 1.8, 0.05)]
     out = step.step(task(what="escape", setup=setup(), grid=hall(), points=wall))
-    assert out.ok
+    assert out.poses is not None
     assert out.poses is not None
     assert np.allclose(out.poses[-1], (0.5, 1.5, 0.0), atol=0.03)
     near = step.step(task(what="escape", pose=(0.36, 1.5, 0.0), points=[(x - 0.65, y) for x, y in wall]))
-    assert (near.ok, near.reason) == (False, Reason.STUCK)
+    assert (near.poses, near.reason) == (None, Reason.STUCK)
 
 
 def test_waypoints_are_passed_one_by_one_and_asked_for_until_then():
     story = Story()
-    story.mission, _ = machine.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
+    story.run, _ = goal_run.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
     story.tell(answer=WAY)
     assert story.tell(pose=(0.5, 0.0, 0.0)) == ()
     assert told(story.tell(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
-    assert story.mission.via == ((1.5, 0.0, 0.0),)
+    assert story.run.via == ((1.5, 0.0, 0.0),)
     assert story.tell(pose=(1.0, 0.1, 0.0), along=1.0) == ()
 
 

@@ -1,6 +1,10 @@
-"""The planning step: map and newest scan in, a drivable way out. Compiled, for workers.
+"""The planning step: map and newest scan in, a drivable path out. For workers.
 
-It remembers the map, the obstacles that scans showed beside it, and the route, which is kept while it is good.
+It remembers the map, the obstacles that scans showed and the map does not hold, and the route, which is kept while it
+is good.
+
+An obstacle is kept until a scan sees through its place: a robot that looks ahead alone must not forget what stands
+behind it, so nothing is forgotten by age.
 """
 
 from typing import Final
@@ -9,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED, DistanceField, rectangle_distance
-from monstertruck_planners.goals.escape import escape, placed, seen_from
+from monstertruck_planners.collision import OCCUPIED, DistanceField, placed, points_relative, rectangle_distance
+from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
-from monstertruck_planners.goals.memory import ObstacleMemory
-from monstertruck_planners.route.api import Clock, RouteMap, Vehicle
+from monstertruck_planners.route.api import Clock, RouteMap, Vehicle, warm_up
 from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_runtime.clock import SECOND, WallClock
@@ -29,13 +33,84 @@ Cells = NDArray[np.int8]
 SAMPLE: Final = 0.05
 """Metres between two poses of an answer."""
 SQUARE: Final = 0.05
-"""Obstacles beside the map are remembered by squares of this size, m."""
+"""Obstacles the map does not hold are remembered by squares of this size, m."""
 NEARBY: Final = 1.5
 """Obstacles this near count when backing out, and are not forgotten, m."""
 
 
-class Ground:
-    """The map, and what the last scans showed beside it.
+BEAM_WIDTH: Final = 0.012
+"""Beams this near in bearing show a place, rad: two steps of a URG-04LX."""
+THROUGH: Final = 0.10
+"""Metres by which all of them must reach beyond it."""
+
+
+class ObstacleMemory:
+    """Places of obstacles in the map's frame, at most one for each square.
+
+    Args:
+        square: m.
+    """
+
+    def __init__(self, square: float) -> None:
+        self._square = square
+        self.places: Array = np.empty((0, 2))
+        """Shape (n, 2), m."""
+
+    def look(self, points: Array, sensor: Array) -> None:
+        """Forget what a scan saw through. A bearing without a return says nothing.
+
+        Args:
+            points: shape (n, 2), the scan's returns.
+            sensor: shape (2,), where it was taken.
+        """
+        self.places = self.places[~seen_through(self.places, points, sensor)]
+
+    def keep(self, points: Array) -> None:
+        """Remember places, shape (n, 2)."""
+        self.places = _one_per_square(np.vstack((self.places, points)), self._square)
+
+    def forget(self, where: NDArray[np.bool_]) -> None:
+        """Drop those places; shape (n,)."""
+        self.places = self.places[~where]
+
+
+def seen_through(places: Array, points: Array, sensor: Array) -> NDArray[np.bool_]:
+    """Whether each place is free as a scan shows it: all its returns in that direction lie beyond.
+
+    Args:
+        places: shape (n, 2).
+        points: shape (m, 2), the scan's returns.
+        sensor: shape (2,), where it was taken.
+
+    Returns:
+        Shape (n,).
+    """
+    if not len(places) or not len(points):
+        return np.zeros(len(places), dtype=np.bool_)
+    bearings, ranges = _polar(points - sensor)
+    order = np.argsort(bearings)
+    bearings, ranges = bearings[order], ranges[order]
+    # Once round on both sides, so that no window is cut at +-pi.
+    bearings = np.concatenate((bearings - 2 * np.pi, bearings, bearings + 2 * np.pi))
+    ranges = np.tile(ranges, 3)
+    towards, far = _polar(places - sensor)
+    first, last = (np.searchsorted(bearings, towards + side) for side in (-BEAM_WIDTH, BEAM_WIDTH))
+    nearest = np.minimum.reduceat(np.append(ranges, np.inf), np.column_stack((first, last)).ravel())[::2]
+    return np.asarray((last > first) & (nearest > far + THROUGH))
+
+
+def _polar(points: Array) -> tuple[Array, Array]:
+    return np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+
+
+def _one_per_square(points: Array, square: float) -> Array:
+    """The first point of each square."""
+    _, first = np.unique(np.floor(points / square).astype(np.int64), axis=0, return_index=True)
+    return np.asarray(points[np.sort(first)])
+
+
+class StaticMap:
+    """The map the robot was given or has made.
 
     Args:
         cells: shape (rows, columns), percent, -1 unknown; row 0 at the lowest y.
@@ -50,18 +125,18 @@ class Ground:
         self._walls = DistanceField(cells >= OCCUPIED, resolution, origin)
 
     @classmethod
-    def of(cls, grid: Grid) -> "Ground":
+    def of(cls, grid: Grid) -> "StaticMap":
         """Of a message."""
         cells = grid.cells.reshape(grid.height, grid.width)
         return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
 
-    def beside(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
+    def unexplained(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
         """Whether no obstacle of the map explains each point (n, 2): it is further than ``tolerance`` from all, m."""
         return np.asarray(self._walls.lookup(points) > tolerance + self.resolution / 2)
 
     def with_points(self, points: Array) -> Cells:
         """Cells with the points' ones occupied."""
-        column, row = (np.floor(v / self.resolution).astype(np.int64) for v in seen_from(points, self.origin).T)
+        column, row = (np.floor(v / self.resolution).astype(np.int64) for v in points_relative(points, self.origin).T)
         rows, columns = self.cells.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         cells = self.cells.copy()
@@ -73,7 +148,7 @@ class Ground:
         rows, columns = np.nonzero(cells >= OCCUPIED)
         centres = (np.column_stack((columns, rows)) + 0.5) * self.resolution
         flat = np.column_stack((centres, np.zeros(len(centres))))
-        there = seen_from(placed(flat, self.origin)[:, :2], pose)
+        there = points_relative(placed(flat, self.origin)[:, :2], pose)
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
 
 
@@ -82,7 +157,7 @@ class PlanningStep:
 
     def __init__(self) -> None:
         self._setup: Setup | None = None
-        self._ground: Ground | None = None
+        self._map: StaticMap | None = None
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
         self._now: Clock | None = None
@@ -98,16 +173,16 @@ class PlanningStep:
         if self._setup is None:
             raise InputError("planning: expected a setup before anything else")
         if task.grid is not None:
-            self._ground = Ground.of(task.grid)
-        if self._ground is None:
+            self._map = StaticMap.of(task.grid)
+        if self._map is None:
             return PlanAnswer(Reason.NO_MAP, "no map yet")
         places = [value for place in task.via for value in place if value is not None]
         if not np.isfinite((*task.pose, *task.goal, *places)).all():
             return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
         if task.clear or task.afresh:
             self._route = None
-        self._look(self._setup, self._ground, task)
-        return self._escape(self._ground, task) if task.what == "escape" else self._plan(self._ground, task)
+        self._observe(self._setup, self._map, task)
+        return self._escape(self._map, task) if task.what == "escape" else self._plan(self._map, task)
 
     def _set_up(self, setup: Setup) -> None:
         config = setup.config
@@ -122,27 +197,29 @@ class PlanningStep:
             self._now = lambda: clock.now() / SECOND
         if config.map is not None:
             world = load_map(config.map)
-            self._ground = Ground(world.cells, world.resolution, (*world.origin, 0.0))
+            self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
-    def _look(self, setup: Setup, ground: Ground, task: PlanTask) -> None:
+    def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
         """Take in a scan, and what has become of the map."""
         memory = self._memory
         if task.clear:
             memory.forget(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
         memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
         memory.keep(task.points)
-        memory.forget(~ground.beside(memory.places, setup.config.scan_tolerance))
+        memory.forget(~static_map.unexplained(memory.places, setup.config.scan_tolerance))
 
-    def _plan(self, ground: Ground, task: PlanTask) -> PlanAnswer:
+    def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         assert self._setup is not None
         points = self._memory.places
         if len(points):
             # What touches the truck where it stands would only keep it there; the gate watches that.
             pose = np.array([task.pose])
-            touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * ground.resolution
+            touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
-        cells = ground.with_points(points) if len(points) else ground.cells
-        route_map = RouteMap.from_cells(cells, ground.resolution, ground.origin, self._setup.config.route.unknown)
+        cells = static_map.with_points(points) if len(points) else static_map.cells
+        route_map = RouteMap.from_cells(
+            cells, static_map.resolution, static_map.origin, self._setup.config.route.unknown
+        )
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
         via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
@@ -160,11 +237,11 @@ class PlanningStep:
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
 
-    def _escape(self, ground: Ground, task: PlanTask) -> PlanAnswer:
+    def _escape(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         setup = self._setup
         assert setup is not None
         config = setup.config
-        near = ground.obstacles(ground.with_points(self._memory.places), task.pose, NEARBY)
+        near = static_map.obstacles(static_map.with_points(self._memory.places), task.pose, NEARBY)
         way = escape(
             config.escape,
             setup.geometry,
@@ -188,3 +265,12 @@ def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswe
     message = path.message(stamp=0, step=SAMPLE)
     poses, directions = np.array(message.poses).reshape(-1, 3), np.array(message.directions)
     return PlanAnswer(Reason.OK, "", poses, directions, message.steering, path.length, cost, kept=kept)
+
+
+class PlanningWorker(PlanningStep):
+    """The step as a worker's: its code is compiled when it is built."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for config in (HybridConfig(effort=200), LatticeConfig(effort=200)):
+            warm_up(make_planner(Vehicle.truck(), config))

@@ -8,7 +8,7 @@ import pytest
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.deforming import DeformStep
+from monstertruck_planners.goals.deform_step import DeformStep
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, Way
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.errors import InputError

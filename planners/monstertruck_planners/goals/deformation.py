@@ -1,4 +1,4 @@
-"""The route under deformation: every scan goes to the deforming step, and what comes of it is told."""
+"""The deformation of the route: every scan goes to the deforming step, its answers to the goal service."""
 
 from collections.abc import Callable
 from typing import Final
@@ -6,8 +6,16 @@ from typing import Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup, Way
-from monstertruck_planners.goals.parts import level, pose_of
+from monstertruck_planners.goals.exchange import (
+    DeformAnswer,
+    DeformTask,
+    Finding,
+    PlanAnswer,
+    Setup,
+    Way,
+    level,
+    pose_of,
+)
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
@@ -23,7 +31,7 @@ ONWARD: Final = 0.05
 """Metres along the route that are progress."""
 
 
-class Deformation:
+class RouteDeformation:
     """Keeps the route that is driven and what the deforming step said of it last.
 
     Args:
@@ -64,11 +72,11 @@ class Deformation:
         self._onward = 0
         """When the truck last came on along the route, ns."""
 
-    async def run(self, tell: Callable[[Finding, DeformAnswer], None]) -> None:
-        """Have every scan taken in until cancelled; while one is worked on, newer ones replace each other.
+    async def run(self, report: Callable[[Finding, DeformAnswer], None]) -> None:
+        """Pass every scan on until cancelled; while one is worked on, newer ones replace each other.
 
         Args:
-            tell: is given what had become of the present route, and what does now.
+            report: is given the finding before and the answer.
         """
         async with self._actor as actor:
             await actor.start()
@@ -86,7 +94,7 @@ class Deformation:
                 if self._route is not None and answer.number == self._number:
                     was = self._finding
                     self._note(answer)
-                    tell(was, answer)
+                    report(was, answer)
 
     def begin(self, route: PlanAnswer) -> None:
         """Another route is driven from now on."""
@@ -111,8 +119,8 @@ class Deformation:
         return self._finding not in ("idle", "free")
 
     @property
-    def up(self) -> bool:
-        """Whether it has a say about the present route."""
+    def active(self) -> bool:
+        """Whether it decides what is driven of the present route."""
         return self._answer is not None
 
     @property
@@ -183,8 +191,8 @@ class Deformation:
         self._answer = answer
 
 
-def told_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str] | None:
-    """What an event says when it comes to another finding; None if there is nothing new."""
+def event_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str] | None:
+    """Reason, severity and text of the event of a changed finding; None if it is the same."""
     text = answer.text or answer.reason.text
     match answer.finding:
         case "blocked" if was != "blocked":

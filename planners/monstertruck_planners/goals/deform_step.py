@@ -1,7 +1,7 @@
-"""The deforming step: a scan in, and what becomes of the route: free, or a path round what stands on it. Compiled.
+"""The deforming step: a scan in; out whether the route is free, or a path round what stands on it. For workers.
 
-While the route is free it is driven as it was planned: the deformer has a say only from the moment something comes into
-it until the truck is back on it.
+While the route is free it is driven as it was planned: the deformer is used only from the moment something stands on it
+until the truck is back on it.
 """
 
 from typing import Final
@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points
-from monstertruck_planners.goals.escape import placed, seen_from
+from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, placed, poses_relative, scan_points
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
-from monstertruck_planners.goals.planning import answer_of
+from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
+from monstertruck_planners.local.config import RsbandConfig, TebConfig
 from monstertruck_planners.local.core import nearest_pose
 from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
@@ -35,7 +35,7 @@ class DeformStep:
 
     def __init__(self) -> None:
         self._setup: Setup | None = None
-        self._known: DistanceField | None = None
+        self._walls: DistanceField | None = None
         self._way: Way | None = None
         self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
@@ -52,8 +52,8 @@ class DeformStep:
         if setup is None:
             raise InputError("deforming: expected a setup before anything else")
         if task.grid is not None:
-            self._known = DistanceField.from_grid(task.grid, unknown_blocks=False)
-        points = self._look(setup, task.scan, task.pose)
+            self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
+        points = self._observe(setup, task.scan, task.pose)
         if task.way is not None:
             self._begin(task.way)
         if self._way is None:
@@ -65,9 +65,9 @@ class DeformStep:
             return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
-        result = self._planner.plan(self._rest, self._window.field(self._known), here, self._state)
+        result = self._planner.plan(self._rest, self._window.field(self._walls), here, self._state)
         self._state = result.state
-        return self._told(result)
+        return self._answer(result)
 
     def _set_up(self, setup: Setup) -> None:
         config = setup.config
@@ -81,7 +81,7 @@ class DeformStep:
         self._window = Window()
         if config.map is not None:
             world = load_map(config.map)
-            self._known = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
+            self._walls = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
 
     def _begin(self, way: Way) -> None:
         self._way, self._place = way, 0
@@ -89,7 +89,7 @@ class DeformStep:
         self._travelled = self._guide.travelled
         self._rest, self._state = None, LocalPlannerState()
 
-    def _look(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
+    def _observe(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
         """Put a scan into the window; returns its points in base. Beams without a return say nothing."""
         points = scan_points(scan, setup.lidar)
         (sensor,) = placed(np.array([setup.lidar]), pose)
@@ -117,10 +117,10 @@ class DeformStep:
         end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
         way = np.vstack((here, guide.poses[at + 1 : end]))
         margin = local.clearance + (local.rejoin if deformed else 0.0)
-        relative = np.column_stack((seen_from(moved(way, -self._vehicle.reference)[:, :2], pose), way[:, 2] - pose[2]))
+        relative = poses_relative(moved(way, -self._vehicle.reference), pose)
         return first_contact(setup.footprint, relative, points, margin) is None
 
-    def _told(self, result: LocalPlan) -> DeformAnswer:
+    def _answer(self, result: LocalPlan) -> DeformAnswer:
         assert self._way is not None
         number, path = self._way.number, result.path
         if path is not None and path.length < SHORTEST and self._place == len(self._guide.poses) - 1:
@@ -132,3 +132,16 @@ class DeformStep:
             return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
         answer = answer_of(path, cost=path.length)
         return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
+
+
+class DeformingWorker(DeformStep):
+    """The step as a worker's: its code is compiled when it is built."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        cells = np.zeros((100, 100), np.bool_)
+        cells[45:55, 45:55] = True
+        poses = np.column_stack((np.linspace(0.5, 3.5, 31), np.full(31, 2.0), np.zeros(31)))
+        guide, surroundings = PosePath(poses, np.ones(31)), DistanceField(cells, 0.04)
+        for config in (RsbandConfig(effort=200), TebConfig(effort=200)):
+            make_local_planner(Vehicle.truck(), config).plan(guide, surroundings, poses[0], LocalPlannerState())

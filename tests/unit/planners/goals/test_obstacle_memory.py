@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monstertruck_planners.goals.memory import BESIDE, THROUGH, ObstacleMemory, seen_through
+from monstertruck_planners.goals.plan_step import BEAM_WIDTH, THROUGH, ObstacleMemory, seen_through
 
 HERE = np.zeros(2)
 
@@ -47,7 +47,7 @@ def test_it_agrees_with_looking_at_every_pair(places: list[tuple[float, float]],
         near = [
             math.hypot(*point)
             for point in points
-            if abs(math.remainder(math.atan2(point[1], point[0]) - math.atan2(y, x), math.tau)) < BESIDE
+            if abs(math.remainder(math.atan2(point[1], point[0]) - math.atan2(y, x), math.tau)) < BEAM_WIDTH
         ]
         expected.append(bool(near) and min(near) > math.hypot(x, y) + THROUGH)
     assert seen_through(np.array(places), np.array(points), HERE).tolist() == expected

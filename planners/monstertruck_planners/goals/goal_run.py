@@ -1,0 +1,318 @@
+"""The pursuit of one goal: a pure state machine. Equal observations give equal decisions.
+
+It plans, has the route followed, plans anew when something stands on it or the truck left it, and tries the recovery
+behaviours in turn when that does not help. Every decision is reported with its reason.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.exchange import Place, PlanAnswer, Pose
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import GoalPhase
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder
+
+REFUSED: Final = frozenset(
+    {
+        Reason.GOAL_OUTSIDE,
+        Reason.GOAL_BLOCKED,
+        Reason.GOAL_UNREACHABLE,
+        Reason.ROUTE_TIMEOUT,
+        Reason.NOT_FINITE,
+        Reason.BAD_INPUT,
+        Reason.NO_MAP,
+    }
+)
+"""Why a goal is refused if its first route fails; later on these may be passing trouble."""
+
+MISSES: Final = 5
+"""Routes that may end beside the goal."""
+
+BLOCKS: Final = 2
+"""Times a route may be blocked again before the truck has got on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Ask for a route or a way out."""
+
+    what: Literal["route", "escape"] = "route"
+    clear: bool = False
+    """Forget older obstacles and the route so far..."""
+    afresh: bool = False
+    """...or only the latter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Follow:
+    """Have this driven."""
+
+    answer: PlanAnswer
+
+
+@dataclass(frozen=True, slots=True)
+class Halt:
+    """Come to rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """An event."""
+
+    reason: Reason
+    severity: Severity
+    text: str
+
+
+Action = Plan | Follow | Halt | Report
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """What is known at one instant."""
+
+    now: float
+    """Seconds."""
+    armed: bool
+    """The gate lets the truck move."""
+    at_rest: bool
+    pose: Pose | None
+    """Of the base, in the goal's frame."""
+    answer: PlanAnswer | None = None
+    """The newest plan, once."""
+    outcome: Reason | None = None
+    """What the tracker says of the present path; None before it says something."""
+    along: float = 0.0
+    """Metres driven on it."""
+    left: float = math.inf
+    """Metres of the route ahead."""
+    blocked: bool = False
+    """The newest scan shows something on the way ahead."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalRun:
+    """One goal and how far it has come."""
+
+    number: int
+    goal: Pose
+    source: str
+    now: float
+    via: tuple[Place, ...] = ()
+    """Still to be passed."""
+    phase: GoalPhase = GoalPhase.PLANNING
+    outcome: Reason = Reason.DRIVING
+    text: str = ""
+    planned: Literal["route", "escape"] = "route"
+    """What is being planned."""
+    since: float = 0.0
+    """Begin of the phase, s."""
+    elapsed: float = 0.0
+    unarmed: float = 0.0
+    """Seconds it has waited for the truck to be armed."""
+    best: float = 0.0
+    """Metres of the present path driven when progress was last observed."""
+    moved: float = 0.0
+    """When progress was last seen, s."""
+    sightings: int = 0
+    """Looks in a row that showed the way blocked."""
+    blocks: int = 0
+    nearest: float = math.inf
+    """Least that was left of any route, m..."""
+    recovery_distance: float = math.inf
+    """...and when the last recovery behaviour began."""
+    misses: int = 0
+    next_recovery: int = 0
+    """Index of the recovery behaviour to be tried next."""
+    routes: int = 0
+    recoveries: int = 0
+
+    @property
+    def active(self) -> bool:
+        """Whether it is still pursued."""
+        return self.phase is not GoalPhase.IDLE
+
+
+Step = tuple[GoalRun, tuple[Action, ...]]
+
+
+def begin(number: int, goal: Pose, source: str, now: float, via: tuple[Place, ...] = ()) -> Step:
+    """Take on a goal."""
+    run = GoalRun(number, goal, source, now, via, since=now, moved=now)
+    x, y, yaw = goal
+    through = f" by way of {len(via)} waypoints" if via else ""
+    text = f"goal {number} of {source}: ({x:.2f}, {y:.2f}, {yaw:.2f}){through}"
+    return run, (Report(Reason.GOAL_ACCEPTED, Severity.INFO, text), Plan(clear=True))
+
+
+def order(run: GoalRun, what: GoalOrder, source: str, now: float) -> Step:
+    """Pause, resume or cancel; what does not fit is passed over."""
+    by = f"goal {run.number}, by {source}"
+    if what is GoalOrder.CANCEL and run.active:
+        return _end(run, Reason.CANCELLED, f"cancelled by {source}", Severity.INFO)
+    if what is GoalOrder.PAUSE and run.active and run.phase is not GoalPhase.PAUSED:
+        paused = _enter(replace(run, now=now), GoalPhase.PAUSED)
+        return paused, (Halt(), Report(Reason.PAUSED, Severity.INFO, by))
+    if what is GoalOrder.RESUME and run.phase is GoalPhase.PAUSED:
+        resumed = _enter(replace(run, now=now, planned="route"), GoalPhase.PLANNING)
+        return resumed, (Report(Reason.RESUMED, Severity.INFO, by), Plan())
+    return run, ()
+
+
+def displaced(run: GoalRun, text: str) -> Step:
+    """Somebody else's path is followed now: end without touching it."""
+    ended, actions = _end(run, Reason.CANCELLED, text, Severity.WARNING)
+    return ended, tuple(action for action in actions if not isinstance(action, Halt))
+
+
+def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
+    """One look at the observed."""
+    passed, run = observed.now - run.now, replace(run, now=observed.now)
+    if run.phase in (GoalPhase.IDLE, GoalPhase.PAUSED):
+        return run, ()
+    if observed.armed or run.phase is GoalPhase.PLANNING:
+        run = replace(run, elapsed=run.elapsed + passed, unarmed=0.0)
+    else:
+        run = replace(run, unarmed=run.unarmed + passed, moved=observed.now)
+    if run.elapsed > config.timeout:
+        return _end(run, Reason.GOAL_TIMEOUT, f"not reached within {config.timeout:g} s")
+    if run.unarmed > config.unarmed_timeout:
+        return _end(run, Reason.DISARMED, f"not armed for {config.unarmed_timeout:g} s")
+    match run.phase:
+        case GoalPhase.PLANNING:
+            return (run, ()) if observed.answer is None else _planned(run, observed, observed.answer, config)
+        case GoalPhase.WAITING:
+            return _plan(run, config) if observed.now - run.since >= config.wait else (run, ())
+        case _:
+            return _drive(run, observed, config)
+
+
+def _planned(run: GoalRun, observed: Observations, answer: PlanAnswer, config: PlannerConfig) -> Step:
+    if run.planned == "escape":
+        if answer.poses is None:
+            return _recover(run, answer.reason, f"no way to back out: {answer.text}", config)
+        report = Report(Reason.RECOVERING, Severity.INFO, f"goal {run.number}: backs out {answer.length:.2f} m")
+        return _set_off(run, GoalPhase.BACKING_OUT), (Follow(answer), report)
+    if answer.poses is None:
+        if run.routes == 0 and answer.reason in REFUSED:
+            return _end(run, answer.reason, answer.text)
+        return _recover(run, answer.reason, answer.text, config)
+    kind = "the rest of the route before" if answer.kept else "a new route"
+    text = f"goal {run.number}: {kind}, {answer.length:.2f} m"
+    run = replace(_set_off(run, GoalPhase.DRIVING), routes=run.routes + 1)
+    if math.isinf(run.recovery_distance):
+        run = replace(run, nearest=answer.length, recovery_distance=answer.length)
+    return run, (Follow(answer), Report(Reason.ROUTE_FOUND, Severity.INFO, text))
+
+
+def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
+    """Driving, or backing out."""
+    if not observed.armed:
+        return run, ()
+    backing = run.phase is GoalPhase.BACKING_OUT
+    if _at_waypoint(run, observed.pose, config):
+        left = len(run.via) - 1
+        report = Report(Reason.WAYPOINT_PASSED, Severity.INFO, f"goal {run.number}: waypoint passed, {left} left")
+        return replace(run, via=run.via[1:]), (report,)
+    if observed.outcome is Reason.GOAL_REACHED and observed.at_rest:
+        return _plan(run, config) if backing else _arrived(run, observed, config)
+    if observed.outcome is Reason.PATH_LOST:
+        report = Report(Reason.PATH_LOST, Severity.WARNING, f"goal {run.number}: plans anew")
+        return _with(_plan(run, config), report)
+    if observed.along > run.best + config.progress:
+        run = replace(run, best=observed.along, moved=observed.now)
+    if not backing:
+        run = _progressed(run, observed.left, config)
+    run = replace(run, sightings=run.sightings + 1 if observed.blocked else 0)
+    if run.sightings >= config.sightings and not backing:
+        text = "the newest scan shows something on the route"
+        run = replace(run, blocks=run.blocks + 1, sightings=0)
+        if run.blocks > BLOCKS:
+            return _recover(run, Reason.PATH_BLOCKED, text, config)
+        report = Report(Reason.PATH_BLOCKED, Severity.WARNING, f"goal {run.number}: {text}; plans anew")
+        return _with(_plan(run, config), report)
+    if observed.now - run.moved > config.stuck:
+        return _recover(run, Reason.STUCK, f"no progress for {config.stuck:g} s", config)
+    return run, ()
+
+
+def _progressed(run: GoalRun, left: float, config: PlannerConfig) -> GoalRun:
+    """What begins anew as the truck makes progress.
+
+    The recovery behaviours do so only nearer to the goal than when the last one began: driving to and fro between two
+    routes that are both blocked is no progress.
+    """
+    run = replace(run, nearest=min(run.nearest, left))
+    if run.best > config.recovered:
+        run = replace(run, blocks=0)
+    return replace(run, next_recovery=0) if run.nearest < run.recovery_distance - config.recovered else run
+
+
+def _at_waypoint(run: GoalRun, pose: Pose | None, config: PlannerConfig) -> bool:
+    return bool(run.via) and pose is not None and math.dist(pose[:2], run.via[0][:2]) < config.waypoint_radius
+
+
+def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
+    """The end of the route: is it the goal?"""
+    assert observed.pose is not None
+    away, turned = apart(observed.pose, run.goal)
+    off = f"{away:.3f} m and {turned:.3f} rad away"
+    error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
+    if error <= (config.aim if run.misses < config.corrections else 1.0):
+        return _end(run, Reason.GOAL_REACHED, off, Severity.INFO)
+    if run.misses >= MISSES:
+        return _end(run, Reason.GOAL_MISSED, off)
+    run = replace(run, misses=run.misses + 1)
+    report = Report(Reason.GOAL_MISSED, Severity.WARNING, f"goal {run.number}: {off}; plans anew")
+    return _with(_plan(run, config, afresh=True), report)
+
+
+def _recover(run: GoalRun, reason: Reason, text: str, config: PlannerConfig) -> Step:
+    """Start the next recovery behaviour."""
+    if run.next_recovery >= len(config.ladder):
+        return _end(run, reason, text or reason.text)
+    behaviour = config.ladder[run.next_recovery]
+    run = replace(run, next_recovery=run.next_recovery + 1, recoveries=run.recoveries + 1)
+    run = replace(run, recovery_distance=run.nearest)
+    why = f"{reason.text}{f' ({text})' if text else ''}"
+    report = Report(Reason.RECOVERING, Severity.WARNING, f"goal {run.number}: {why}: {behaviour.replace('_', ' ')}")
+    match behaviour:
+        case "wait":
+            return _enter(run, GoalPhase.WAITING), (report, Halt())
+        case "back_out":
+            planning = _enter(replace(run, planned="escape"), GoalPhase.PLANNING)
+            return planning, (report, Halt(), Plan("escape"))
+        case _:
+            return _with(_plan(run, config, clear=behaviour == "clear"), report, Halt())
+
+
+def _plan(run: GoalRun, config: PlannerConfig, *, clear: bool = False, afresh: bool = False) -> Step:
+    if run.routes >= config.routes:
+        return _end(run, Reason.STUCK, f"{run.routes} routes did not lead there")
+    return _enter(replace(run, planned="route"), GoalPhase.PLANNING), (Plan(clear=clear, afresh=afresh),)
+
+
+def _set_off(run: GoalRun, phase: GoalPhase) -> GoalRun:
+    return replace(_enter(run, phase), moved=run.now, best=0.0, sightings=0)
+
+
+def _enter(run: GoalRun, phase: GoalPhase) -> GoalRun:
+    return replace(run, phase=phase, since=run.now)
+
+
+def _with(step: Step, *before: Action) -> Step:
+    run, actions = step
+    return run, (*before, *actions)
+
+
+def _end(run: GoalRun, reason: Reason, text: str, severity: Severity = Severity.WARNING) -> Step:
+    ended = replace(_enter(run, GoalPhase.IDLE), outcome=reason, text=text)
+    return ended, (Halt(), Report(reason, severity, f"goal {run.number}: {text}"))
+
+
+def apart(a: Pose, b: Pose) -> tuple[float, float]:
+    """Distance, m, and angle, rad, between two poses."""
+    return math.dist(a[:2], b[:2]), abs(math.remainder(a[2] - b[2], math.tau))

@@ -1,0 +1,212 @@
+"""Paths for the tracker: published, checked against scans, ended early; and standstill without disarming."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import Footprint, first_contact, placed, poses_relative
+from monstertruck_planners.goals.exchange import PlanAnswer, Pose, pose_of
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Subscription
+from monstertruck_schemas.plan import GoalState, Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest, Role
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import GateState, Grid, Odometry
+
+SOURCE: Final = "goals"
+AT_REST: Final = 0.01
+"""Speed of a truck at rest, m/s."""
+LEASE: Final = 0.25
+"""Lease of the request to stand still, s."""
+STUB: Final = 0.01
+"""Length of a path that leads nowhere, m."""
+CHECK_STEP: Final = 0.05
+"""Metres between two poses of a path check."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What the goal service reads."""
+
+    goals: Mailbox[GoalRequest]
+    controls: Mailbox[GoalControl]
+    gate: Subscription[GateState]
+    pose: Subscription[Odometry]
+    """In the paths' frame."""
+    tracker: Subscription[TrackerState]
+    path: Subscription[Path]
+    scan: Subscription[LaserScan] | None
+    grid: Subscription[Grid] | None
+    """None = the configured map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What it writes."""
+
+    path: Publisher[Path]
+    planner_request: Publisher[DriveRequest]
+    state: Publisher[GoalState]
+    events: EventSink
+
+
+@dataclass(frozen=True)
+class FollowedPath:
+    """The path the tracker was given."""
+
+    message: Path
+    poses: Array
+    """Shape (n, 3): of the base."""
+    travelled: Array
+    """Shape (n,), metres from its start."""
+    before: float = 0.0
+    """Metres driven on the paths that it was deformed from."""
+
+    def report(self, newest: TrackerState | None) -> TrackerState | None:
+        """What the tracker says of it; None while that speaks of another path."""
+        return newest if newest is not None and newest.path == self.message.name else None
+
+    def along(self, newest: TrackerState | None) -> float:
+        """Metres driven on it."""
+        report = self.report(newest)
+        return 0.0 if report is None else report.along
+
+
+class PathPublisher:
+    """Publishes paths and remembers the one that is followed.
+
+    Args:
+        clock: time.
+        inputs: topics read.
+        outputs: topics written.
+        deceleration: with which the tracker brakes, m/s^2.
+    """
+
+    def __init__(self, clock: Clock, inputs: Inputs, outputs: Outputs, deceleration: float) -> None:
+        self._clock, self._in, self._out, self._deceleration = clock, inputs, outputs, deceleration
+        self._paths = 0
+        self.followed: FollowedPath | None = None
+
+    @property
+    def driving(self) -> bool:
+        """Whether the tracker is on its way along what is followed."""
+        report = None if self.followed is None else self.followed.report(self._in.tracker.latest)
+        return report is not None and report.outcome is Reason.DRIVING
+
+    @property
+    def displaced(self) -> bool:
+        """Whether somebody else's path is followed."""
+        return self.followed is not None and self._in.path.latest is not self.followed.message
+
+    def follow(self, answer: PlanAnswer, name: str, before: float = 0.0) -> None:
+        """Have a path driven.
+
+        Args:
+            answer: the path.
+            name: of it; a number is added.
+            before: metres driven already on the route that it is part of.
+        """
+        assert answer.poses is not None
+        assert answer.directions is not None
+        steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
+        self._publish(answer.poses, answer.directions, steering, name, before)
+
+    def brake(self, name: str) -> None:
+        """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands."""
+        odometry, followed = self._in.pose.latest, self.followed
+        if odometry is None or followed is None:
+            return
+        speed, report = abs(odometry.twist.vx), followed.report(self._in.tracker.latest)
+        driven = followed.before + followed.along(report)
+        if speed > AT_REST and report is not None:
+            rest = speed * speed / (2 * self._deceleration) + STUB
+            count = kept_poses(followed.travelled, report.along, rest)
+            steering = followed.message.steering[:count]
+            self._publish(followed.poses[:count], followed.message.directions[:count], steering, name, driven)
+        else:
+            ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
+            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven)
+
+    def halt(self, name: str) -> None:
+        """Brake, and follow nothing."""
+        self.brake(name)
+        self.followed = None
+
+    def stand_still(self) -> None:
+        """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
+        gate, now = self._in.gate.latest, self._clock.now()
+        if self.driving or gate is None or not gate.mode.active:
+            return
+        self._out.planner_request.put(
+            DriveRequest(
+                stamp=now,
+                received=now,
+                seq=self._out.planner_request.next_seq(),
+                source=SOURCE,
+                role=Role.TRACKER,
+                lease=LEASE,
+                nonce=gate.nonce,
+                gate_stamp=gate.stamp,
+                speed=0.0,
+                front=0.0,
+                rear=0.0,
+            )
+        )
+
+    def _publish(self, poses: Array, directions: Array, steering: tuple[Any, ...], name: str, before: float) -> None:
+        now, odometry = self._clock.now(), self._in.pose.latest
+        assert odometry is not None
+        self._paths += 1
+        message = Path(
+            stamp=now,
+            received=now,
+            seq=self._out.path.next_seq(),
+            frame=odometry.frame,
+            poses=np.ascontiguousarray(poses).ravel(),
+            directions=np.array(directions),
+            steering=steering,
+            name=f"{name}.{self._paths}",
+        )
+        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        self.followed = FollowedPath(message, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
+        self._out.path.put(message)
+
+
+def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose: Pose) -> Array:
+    """The truck's pose, then the path's poses from ``along`` to ``along + reach``, one every few centimetres.
+
+    Args:
+        poses: shape (n, 3), of the base.
+        travelled: shape (n,), metres from the path's start.
+        along: where the truck is, m.
+        reach: m.
+        pose: the truck's own.
+    """
+    first, last = np.searchsorted(travelled, (along, along + reach), side="right")
+    chosen = poses[first : last + 1]
+    if len(chosen) > 2:
+        length = max(travelled[min(last, len(poses) - 1)] - along, CHECK_STEP)
+        spacing = max(round(CHECK_STEP * (len(chosen) - 1) / length), 1)
+        chosen = np.vstack((chosen[:-1:spacing], chosen[-1]))
+    return np.vstack((np.array(pose), chosen))
+
+
+def path_blocked(footprint: Footprint, poses: Array, points: Array, at: Pose) -> bool:
+    """Whether the footprint driven along ``poses`` (m, 3) comes upon a point of a scan.
+
+    Args:
+        footprint: the truck.
+        poses: in the map's frame, the truck's own first.
+        points: shape (n, 2), returns in the base frame.
+        at: pose of the base in the map's frame.
+    """
+    return first_contact(footprint, poses_relative(poses, at), points) is not None
+
+
+def kept_poses(travelled: Array, along: float, rest: float) -> int:
+    """How many of a path's poses are kept if it is to end ``rest`` metres behind ``along``; two at least."""
+    return max(int(np.searchsorted(travelled, along + rest)) + 1, 2)
