@@ -49,7 +49,7 @@ class PlanTask:
     afresh: bool = False
     """Forget the route so far."""
     via: tuple[Place, ...] = ()
-    """ActorFactory of the base to be passed before the goal."""
+    """Places of the base to be passed before the goal."""
 
 
 @dataclass(frozen=True, slots=True)

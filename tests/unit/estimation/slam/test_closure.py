@@ -1,4 +1,4 @@
-"""ActorFactory of which only a part was seen before, found again at the end of a run."""
+"""Places of which only a part was seen before, found again at the end of a run."""
 
 import math
 

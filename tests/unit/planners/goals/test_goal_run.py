@@ -134,12 +134,12 @@ def test_the_recovery_behaviours_begin_anew_once_the_truck_is_nearer_to_the_goal
     story.tell(answer=WAY)
     story.tell(round(CONFIG.stuck / 0.1) + 2, left=1.8)
     story.tell(answer=WAY)
-    assert story.run.rung == 1
+    assert story.run.next_recovery == 1
     for left in (1.9, 1.8, 1.35):
         story.tell(along=2.0 - left, left=left)
-        assert story.run.rung == 1
+        assert story.run.next_recovery == 1
     story.tell(along=0.75, left=1.25)
-    assert story.run.rung == 0
+    assert story.run.next_recovery == 0
 
 
 def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
