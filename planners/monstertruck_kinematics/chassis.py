@@ -18,25 +18,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from monstertruck_kinematics.elementary import clip
-from monstertruck_kinematics.errors import KinematicsError
-from monstertruck_kinematics.families import (
-    Ackermann,
-    Bicycle,
-    Differential,
-    Drive,
-    IndependentSteer,
-    Synchro,
-    Tricycle,
-    Twist,
-    mecanum,
-    omni,
-)
-from monstertruck_kinematics.families.four_wheel import WHEEL_NAMES
+from monstertruck_kinematics.drive import Drive, Twist
+from monstertruck_kinematics.elementary import KinematicsError, clip
 from monstertruck_kinematics.motion import moved_point
 from monstertruck_kinematics.polynomials import AxlePolynomials, PolynomialSet, SteeringPolynomials
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.steered import WHEEL_NAMES, Ackermann, Bicycle, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import STEEPEST, DriveTrain, FourWheelSteering
+from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 Freedom = Literal["both", "front", "parallel"]
 Speeds = tuple[float, ...]

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, Real, require_finite, require_positive
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import Array, KinematicsError, Real, require_finite, require_positive
 from monstertruck_kinematics.truck import FourWheelSteering
 
 

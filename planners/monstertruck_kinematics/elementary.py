@@ -9,12 +9,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.errors import KinematicsError
-
 Array = NDArray[np.float64]
 """Floats, of the shape that is stated where it is used."""
 Real = TypeVar("Real", float, Array)
 """A float, or an array of any shape; every argument of one call is of one kind or broadcasts."""
+
+
+class KinematicsError(ValueError):
+    """An argument, wheel or parameter that no robot can have; the text names it, its value and what was expected."""
 
 
 def sin(x: Real) -> Real:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import Array, KinematicsError
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, require_positive
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import Array, KinematicsError, require_positive
 from monstertruck_kinematics.fitting import Fit, least_squares, minimax
 from monstertruck_kinematics.motion import integrate, to_body
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.unsteered import SkidSteer
 
 MAX_SLIP_RATIO = 1.15
 MAX_ICR = 3.0

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from monstertruck_kinematics.elementary import (
+    KinematicsError,
     Real,
     asin,
     atan,
@@ -24,7 +25,6 @@ from monstertruck_kinematics.elementary import (
     sin,
     sqrt,
 )
-from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 
 _NEWTON_STEPS = 50

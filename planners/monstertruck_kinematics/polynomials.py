@@ -12,8 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Real, atan, clip, polynomial, require_within, tan
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError, Real, atan, clip, polynomial, require_within, tan
 
 Coefficients = tuple[float, ...]
 PolynomialSet = Literal["corrected", "as_published", "2016"]

@@ -6,9 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, require_finite, require_positive
-from monstertruck_kinematics.errors import KinematicsError
-from monstertruck_kinematics.families.base import Drive
+from monstertruck_kinematics.drive import Drive
+from monstertruck_kinematics.elementary import Array, KinematicsError, require_finite, require_positive
 from monstertruck_kinematics.motion import integrate
 
 

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from monstertruck_kinematics.elementary import (
+    KinematicsError,
     Real,
     any_zero,
     asin,
@@ -31,11 +32,7 @@ from monstertruck_kinematics.elementary import (
     smaller,
     tan,
 )
-from monstertruck_kinematics.errors import KinematicsError
 from monstertruck_kinematics.motion import integrate
-from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
-
-__all__ = ["AxlePolynomials", "DriveTrain", "FourWheelSteering", "Mode", "SteeringPolynomials", "integrate"]
 
 Mode = Literal["front", "rear", "counter", "crab", "spot"]
 

@@ -43,7 +43,7 @@ def refusals() -> Iterator[None]:
     Raises:
         InputError: for any KinematicsError of the block.
     """
-    from monstertruck_kinematics.errors import KinematicsError
+    from monstertruck_kinematics.elementary import KinematicsError
     from monstertruck_runtime.errors import InputError
 
     try:
@@ -94,8 +94,8 @@ def show_command(
     json_output: JsonOption = False,
 ) -> None:
     """The drive families, or one of them: inputs, parameters, mobility."""
-    from monstertruck_kinematics.catalog import FAMILIES, build_drive, parameters_of
-    from monstertruck_kinematics.mobility import analyse
+    from monstertruck_kinematics.families import FAMILIES, build_drive, parameters_of
+    from monstertruck_kinematics.wheels import analyse
 
     with refusals():
         drives = {kind: build_drive(kind, **_parsed(settings)) for kind in ([family] if family else FAMILIES)}
@@ -138,8 +138,8 @@ def mobility_command(
     json_output: JsonOption = False,
 ) -> None:
     """Degrees of mobility, steerability and manoeuvrability, and the turning centre."""
-    from monstertruck_kinematics.catalog import build_drive
-    from monstertruck_kinematics.mobility import analyse
+    from monstertruck_kinematics.families import build_drive
+    from monstertruck_kinematics.wheels import analyse
 
     with refusals():
         if wheels is not None:
@@ -233,9 +233,9 @@ def linkage_command(
     """
     import numpy as np
 
-    from monstertruck_kinematics.families import Ackermann
     from monstertruck_kinematics.linkage import SteeringLinkage, reachable_servo
     from monstertruck_kinematics.polynomials import SteeringPolynomials
+    from monstertruck_kinematics.steered import Ackermann
 
     with refusals():
         linkage = SteeringLinkage(pitman, drag_link, arm, math.radians(arm_angle), king_pins, arms)  # type: ignore[arg-type]
@@ -385,7 +385,7 @@ def _fit_paper(models: "list[SkidModel]", png: Path | None, *, json_output: bool
         fit_circles,
         unexplained_spread,
     )
-    from monstertruck_kinematics.skid_steer import SkidSteer
+    from monstertruck_kinematics.unsteered import SkidSteer
 
     ideal = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)
     errors = {"ideal": 100.0 * circle_errors(ideal, PUBLISHED_CIRCLES)}

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near, poses_relative
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker

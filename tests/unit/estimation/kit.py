@@ -6,7 +6,8 @@ import numpy as np
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_kinematics.polynomials import SteeringPolynomials
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
 

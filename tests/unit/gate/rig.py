@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, SteeringPolynomials
+from monstertruck_kinematics.polynomials import SteeringPolynomials
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction

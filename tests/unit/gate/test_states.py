@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from monstertruck_kinematics.truck import AxlePolynomials, SteeringPolynomials
+from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError

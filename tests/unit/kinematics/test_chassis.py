@@ -20,7 +20,7 @@ from monstertruck_kinematics.chassis import (
     tricycle_chassis,
     truck_chassis,
 )
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import STEEPEST, DriveTrain
 
 DRIVETRAIN = DriveTrain()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.dynamics import SingleTrack
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 
 NEUTRAL = SingleTrack()

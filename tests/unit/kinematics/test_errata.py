@@ -5,10 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.families import Ackermann
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
-from monstertruck_kinematics.mobility import analyse
 from monstertruck_kinematics.polynomials import (
     F_CORRECTED,
     F_PRINTED,
@@ -18,8 +16,10 @@ from monstertruck_kinematics.polynomials import (
     polynomial,
     round_trip_error,
 )
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.steered import Ackermann
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_kinematics.unsteered import SkidSteer
+from monstertruck_kinematics.wheels import analyse
 
 LINKAGE = SteeringLinkage(arms="forward")
 GEOMETRY = FourWheelSteering(cg_split=0.4)
@@ -305,7 +305,7 @@ def test_k_straight_and_locked_speeds():
 
 
 def test_m_synchro_drive_is_holonomic_for_its_point_only():
-    from monstertruck_kinematics.families import Synchro
+    from monstertruck_kinematics.steered import Synchro
 
     found = analyse(Synchro().wheels((1.0, 0.2)))
     assert found.robot_class == (1, 1)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.linkage import SteeringLinkage, common_motion, dragged_speeds, reachable_servo
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering

@@ -5,20 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.errors import KinematicsError
-from monstertruck_kinematics.families import (
-    Ackermann,
-    Bicycle,
-    Differential,
-    FourWheelSteer,
-    IndependentSteer,
-    Synchro,
-    Tricycle,
-    mecanum,
-    omni,
-)
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.profiles import CubicProfile, CubicRamp, Move, TrapezoidalProfile, drive_move
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
+from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 ARCS = (Move.arc(1.0, 0.8), Move.arc(-1.0, -0.5), Move.straight(0.6))
 ROBOTS = {

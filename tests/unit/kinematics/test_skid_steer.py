@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.fitting import least_squares, minimax
 from monstertruck_kinematics.identification import (
     MODEL_NAMES,
@@ -20,7 +20,7 @@ from monstertruck_kinematics.identification import (
     unexplained_spread,
 )
 from monstertruck_kinematics.motion import integrate, moved_point
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.unsteered import SkidSteer
 
 IDEAL = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)
 

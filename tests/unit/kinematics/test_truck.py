@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 
 SPLITS = (0.0, 0.3, 0.5, 0.8, 1.0)

@@ -5,25 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.errors import KinematicsError
-from monstertruck_kinematics.families import (
-    Ackermann,
-    Bicycle,
-    Differential,
-    FourWheelSteer,
-    IndependentSteer,
-    Synchro,
-    Tricycle,
-    mecanum,
-    omni,
-)
-from monstertruck_kinematics.mobility import analyse
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
+from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 from monstertruck_kinematics.wheels import (
     CasterWheel,
     FixedWheel,
     SteeredWheel,
     SwedishWheel,
+    analyse,
     body_velocity,
     checked,
     rolling_matrix,

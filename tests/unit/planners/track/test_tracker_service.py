@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.config import PurePursuitConfig

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_kinematics.motion import integrate
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.kinematics import app
 

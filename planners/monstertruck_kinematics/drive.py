@@ -10,8 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, Real, larger, require_finite, require_within
-from monstertruck_kinematics.errors import KinematicsError
+from monstertruck_kinematics.elementary import Array, KinematicsError, Real, larger, require_finite, require_within
 from monstertruck_kinematics.motion import integrate
 from monstertruck_kinematics.wheels import Wheel
 
@@ -47,7 +46,7 @@ class Drive(Protocol):
         ...
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
-        """The wheels at a command's steering angles, for ``mobility.analyse``."""
+        """The wheels at a command's steering angles, for ``wheels.analyse``."""
         ...
 
 

@@ -4,21 +4,11 @@ import inspect
 import math
 from collections.abc import Callable
 
-from monstertruck_kinematics.errors import KinematicsError
-from monstertruck_kinematics.families import (
-    Ackermann,
-    Bicycle,
-    Differential,
-    Drive,
-    FourWheelSteer,
-    IndependentSteer,
-    Synchro,
-    Tricycle,
-    mecanum,
-    omni,
-)
-from monstertruck_kinematics.skid_steer import SkidSteer
+from monstertruck_kinematics.drive import Drive
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 
 def _four_wheel_steer(

@@ -1,0 +1,511 @@
+"""Drives that steer: bicycle, tricycle, car, four-wheel steering, independently steered wheels, synchro drive."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from monstertruck_kinematics.drive import TWIST, Twist, refuse, require_limit, scaled_to, stacked, unpacked
+from monstertruck_kinematics.elementary import (
+    Array,
+    KinematicsError,
+    Real,
+    atan2,
+    clip,
+    cos,
+    hypot,
+    require_positive,
+    require_within,
+    secant,
+    sign,
+    sin,
+    tan,
+)
+from monstertruck_kinematics.motion import to_world
+from monstertruck_kinematics.truck import STEEPEST, FourWheelSteering, Mode
+from monstertruck_kinematics.wheels import FixedWheel, SteeredWheel, Wheel
+
+
+@dataclass(frozen=True)
+class Bicycle:
+    """One steered front wheel, one fixed rear wheel, either of them driven.
+
+    Front-driven: xdot = u cos(th) cos(phi), thdot = u sin(phi)/l; rear-driven: xdot = u cos(th), thdot = u tan(phi)/l.
+
+    Args:
+        wheelbase: l, m.
+        driven: wheel whose speed u is the input.
+        radius: of the wheels, m.
+        max_steer: of the front wheel, rad: below pi/2 if rear-driven, up to pi/2 if front-driven (turns on the spot).
+        max_speed: of the driven wheel, m/s.
+
+    Raises:
+        KinematicsError: a length is not above 0, or a limit out of range.
+    """
+
+    wheelbase: float = 0.32
+    driven: Literal["front", "rear"] = "rear"
+    radius: float = 0.075
+    max_steer: float = 0.6
+    max_speed: float = math.inf
+
+    inputs = ("speed", "steer")
+
+    def __post_init__(self) -> None:
+        require_positive("wheelbase", self.wheelbase)
+        require_positive("radius", self.radius)
+        if self.driven not in ("front", "rear"):
+            raise KinematicsError(f"driven is {self.driven!r}: expected front or rear")
+        require_limit("max_steer", self.max_steer, math.pi / 2.0 if self.driven == "front" else STEEPEST)
+        require_limit("max_speed", self.max_speed)
+
+    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+        """Twist of the rear axle's middle from (speed of the driven wheel, steering angle)."""
+        speed, steer = unpacked(command, self.inputs)
+        if self.driven == "front":
+            return speed * cos(steer), 0.0 * speed, speed * sin(steer) / self.wheelbase
+        require_within("steer", steer, -STEEPEST, STEEPEST)
+        return speed + 0.0 * steer, 0.0 * speed, speed * tan(steer) / self.wheelbase
+
+    def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
+        """(speed, steer) for a twist without side speed; turning on the spot needs front drive."""
+        vx, vy, wz = unpacked(twist, TWIST)
+        refuse("vy", vy, vx, "the rear wheel cannot move sideways")
+        facing = sign(vx)
+        aside = facing * wz * self.wheelbase
+        steer = atan2(aside, abs(vx))
+        if self.driven == "front":
+            return facing * hypot(vx, aside), steer
+        require_within("steer that vx, wz need", steer, -STEEPEST, STEEPEST)
+        return vx, steer
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """Steering angle clipped, speed of the driven wheel clipped: same path unless it is too tight."""
+        speed, steer = unpacked(command, self.inputs)
+        return clip(speed, -self.max_speed, self.max_speed), clip(steer, -self.max_steer, self.max_steer)
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """By (speed, steer)."""
+        speed, steer = unpacked(command, self.inputs)
+        zero = 0.0 * (speed + steer)
+        c, s = cos(steer), sin(steer)
+        if self.driven == "front":
+            return stacked(
+                [[c, -speed * s], [zero, zero], [s / self.wheelbase, speed * c / self.wheelbase]],
+            )
+        return stacked(
+            [[zero + 1.0, zero], [zero, zero], [s / c / self.wheelbase, speed / (c * c * self.wheelbase)]],
+        )
+
+    def radius_of(self, steer: Real) -> Real:
+        """Turning radius at the rear axle's middle, R = l tan(pi/2 - steer), left positive; not for steer = 0."""
+        return self.wheelbase * tan(math.pi / 2.0 - steer)
+
+    def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
+        """The two wheels."""
+        _, steer = unpacked(command, self.inputs)
+        return (
+            FixedWheel("rear", 0.0, 0.0, self.radius),
+            SteeredWheel("front", self.wheelbase, 0.0, self.radius, steer),
+        )
+
+
+@dataclass(frozen=True)
+class Tricycle(Bicycle):
+    """Steered and driven front wheel, odometers on the two rear wheels.
+
+    Args:
+        wheelbase: d, from the rear axle to the front wheel, m.
+        driven: front for the lecture's tricycle.
+        radius: of the wheels, m.
+        max_steer: rad.
+        max_speed: of the front wheel, m/s.
+        track: between the rear wheels, m.
+    """
+
+    driven: Literal["front", "rear"] = "front"
+    max_steer: float = 1.4
+    track: float = 0.26
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("track", self.track)
+
+    def rear_rates(self, command: Sequence[Real]) -> tuple[Real, Real]:
+        """Rates of the rear wheels (left, right), rad/s, that a command causes."""
+        vx, _, wz = self.forward(command)
+        lean = wz * (0.5 * self.track)
+        return (vx - lean) / self.radius, (vx + lean) / self.radius
+
+    def odometry(self, left: Real, right: Real) -> Twist[Real]:
+        """Twist measured by the two rear odometers (rates in rad/s), without knowing the steering angle."""
+        return (0.5 * self.radius) * (left + right), 0.0 * left, (self.radius / self.track) * (right - left)
+
+    def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
+        """The three wheels."""
+        _, steer = unpacked(command, self.inputs)
+        half = self.track / 2.0
+        return (
+            FixedWheel("rear left", 0.0, half, self.radius),
+            FixedWheel("rear right", 0.0, -half, self.radius),
+            SteeredWheel("front", self.wheelbase, 0.0, self.radius, steer),
+        )
+
+
+@dataclass(frozen=True)
+class Ackermann:
+    """Car with ideal Ackermann steering (thesis eqs. 2.9-2.26), reference point in the middle of the rear axle.
+
+    Args:
+        wheelbase: L, m.
+        track: w, m.
+        radius: of the wheels, m.
+        max_steer: of the front axle's bicycle angle, rad.
+        max_speed: of the reference point, m/s.
+
+    Raises:
+        KinematicsError: a length is not above 0, or a limit out of range.
+    """
+
+    wheelbase: float = 0.32
+    track: float = 0.26
+    radius: float = 0.075
+    max_steer: float = 0.4
+    max_speed: float = math.inf
+
+    inputs = ("speed", "steer")
+
+    def __post_init__(self) -> None:
+        require_positive("radius", self.radius)
+        require_limit("max_steer", self.max_steer, STEEPEST)
+        require_limit("max_speed", self.max_speed)
+        _ = self.geometry
+
+    @property
+    def geometry(self) -> FourWheelSteering:
+        """The body with its reference point on the rear axle."""
+        return FourWheelSteering(self.wheelbase, self.track, cg_split=1.0)
+
+    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+        """Twist from (speed, equivalent bicycle angle): R = L / tan(steer) (2.13)."""
+        speed, steer = unpacked(command, self.inputs)
+        return self.geometry.body_twist(speed, steer, 0.0 * steer)
+
+    def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
+        """(speed, steer) for a twist without side speed."""
+        vx, vy, wz = unpacked(twist, TWIST)
+        refuse("vy", vy, vx, "the rear wheels cannot move sideways")
+        speed, steer, _ = self.geometry.steer_for_twist(vx, 0.0 * vx, wz)
+        return speed, steer
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """Angle clipped, speed scaled."""
+        speed, steer = unpacked(command, self.inputs)
+        return speed * scaled_to((speed,), self.max_speed), clip(steer, -self.max_steer, self.max_steer)
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """By (speed, steer)."""
+        return Bicycle(self.wheelbase).jacobian(command)
+
+    def front_angles(self, steer: Real) -> tuple[Real, Real]:
+        """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R tells which is inner."""
+        left, right, _, _ = self.geometry.wheel_angles(steer, 0.0 * steer)
+        return left, right
+
+    def wheel_rates(self, command: Sequence[Real]) -> tuple[Real, Real, Real, Real]:
+        """Rates of all four wheels, rad/s (2.18-2.26): front left, front right, rear left, rear right."""
+        speed, steer = unpacked(command, self.inputs)
+        fl, fr, rl, rr = self.geometry.wheel_speeds(speed, steer, 0.0 * steer)
+        return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
+
+    def steer_from_wheels(self, left: Real, right: Real) -> Real:
+        """Bicycle angle of two ideal front wheels: cot d = (cot d_l + cot d_r)/2 (2.13), defined at 0 too."""
+        tan_l, tan_r = tan(left), tan(right)
+        half = 0.5 * self.track / self.wheelbase
+        return atan2(0.5 * (tan_l / (1.0 + half * tan_l) + tan_r / (1.0 - half * tan_r)), 1.0 + 0.0 * tan_l)
+
+    def defect(self, left: Real, right: Real) -> Real:
+        """How far two front wheels are from Ackermann's condition cot d_r - cot d_l = w/L (2.12): 0 if ideal.
+
+        Multiplied out, tan d_l - tan d_r - (w/L) tan d_l tan d_r, so that straight ahead is no special case.
+        """
+        tan_l, tan_r = tan(left), tan(right)
+        return tan_l - tan_r - (self.track / self.wheelbase) * tan_l * tan_r
+
+    def radius_at(self, steer: float, l_r: float) -> float:
+        """Turning radius of a point on the middle line l_r before the rear axle: sqrt(R^2 + l_r^2) (2.14)."""
+        return math.inf if steer == 0.0 else math.hypot(self.wheelbase / math.tan(steer), l_r)
+
+    def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
+        """The four wheels."""
+        _, steer = unpacked(command, self.inputs)
+        left, right = self.front_angles(steer)
+        half = self.track / 2.0
+        return (
+            SteeredWheel("front left", self.wheelbase, half, self.radius, left),
+            SteeredWheel("front right", self.wheelbase, -half, self.radius, right),
+            FixedWheel("rear left", 0.0, half, self.radius),
+            FixedWheel("rear right", 0.0, -half, self.radius),
+        )
+
+
+WHEEL_NAMES = ("front left", "front right", "rear left", "rear right")
+
+
+@dataclass(frozen=True)
+class FourWheelSteer:
+    """The truck as a drive: speed of its reference point and the bicycle angles of both axles.
+
+    Args:
+        geometry: wheelbase, track and reference point.
+        radius: of the wheels, m.
+        max_steer: of either axle, rad.
+        max_speed: of the reference point, m/s.
+
+    Raises:
+        KinematicsError: a field is out of range.
+    """
+
+    geometry: FourWheelSteering = field(default_factory=FourWheelSteering)
+    radius: float = 0.075
+    max_steer: float = 0.4
+    max_speed: float = math.inf
+
+    inputs = ("speed", "front", "rear")
+
+    def __post_init__(self) -> None:
+        require_positive("radius", self.radius)
+        require_limit("max_steer", self.max_steer, STEEPEST)
+        require_limit("max_speed", self.max_speed)
+
+    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+        """Twist from (speed, front, rear): see ``FourWheelSteering.body_twist``."""
+        speed, front, rear = unpacked(command, self.inputs)
+        return self.geometry.body_twist(speed, front, rear)
+
+    def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
+        """(speed, front, rear) through the common turning centre."""
+        vx, vy, wz = unpacked(twist, TWIST)
+        return self.geometry.steer_for_twist(vx, vy, wz)
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """Angles within the limit that keep the curvature, then the sideslip; speed clipped."""
+        speed, front, rear = unpacked(command, self.inputs)
+        front_kept, rear_kept = self.geometry.limit_keeping_curvature(front, rear, self.max_steer)
+        return clip(speed, -self.max_speed, self.max_speed), front_kept, rear_kept
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """By (speed, front, rear)."""
+        speed, front, rear = unpacked(command, self.inputs)
+        vx, vy, wz = self.geometry.body_twist(speed, front, rear)
+        length = self.geometry.wheelbase
+        tan_f, tan_r = tan(front), tan(rear)
+        tan_b = self.geometry.tan_sideslip(tan_f, tan_r)
+        cos_b = 1.0 / secant(tan_b)
+        columns = [(cos_b, cos_b * tan_b, cos_b * (tan_f - tan_r) / length)]
+        for tangent, share, side in ((tan_f, self.geometry.l_r, 1.0), (tan_r, self.geometry.l_f, -1.0)):
+            slope = 1.0 + tangent * tangent
+            lean = slope * share / length
+            fading = -tan_b * cos_b * cos_b * lean
+            columns.append((vx * fading, vy * fading + vx * lean, wz * fading + side * vx * slope / length))
+        return stacked(list(zip(*columns, strict=True)))
+
+    def steering(self, mode: Mode, angle: Real) -> tuple[Real, Real]:
+        """Axle angles (front, rear) of a steering mode; ``angle`` is the front one, for rear steering the rear one.
+
+        Raises:
+            KinematicsError: the mode is spot, or unknown.
+        """
+        zero = 0.0 * angle
+        if mode == "front":
+            return angle, zero
+        if mode == "rear":
+            return zero, angle
+        if mode == "counter":
+            return angle, -angle
+        if mode == "crab":
+            return angle, angle
+        raise KinematicsError(f"mode {mode!r}: expected front, rear, counter or crab")
+
+    def wheel_rates(self, command: Sequence[Real]) -> tuple[Real, Real, Real, Real]:
+        """Rates of the four wheels, rad/s (2.47-2.50)."""
+        speed, front, rear = unpacked(command, self.inputs)
+        fl, fr, rl, rr = self.geometry.wheel_speeds(speed, front, rear)
+        return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
+
+    def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
+        """The four wheels at their angles through the common turning centre."""
+        _, front, rear = unpacked(command, self.inputs)
+        angles = self.geometry.wheel_angles(front, rear)
+        return tuple(
+            SteeredWheel(name, x, y, self.radius, angle)
+            for name, (x, y), angle in zip(WHEEL_NAMES, self.geometry.wheel_positions, angles, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class IndependentSteer:
+    """Every wheel steered and driven alone: any twist, turning on the spot (R = 0) included.
+
+    The command is all steering angles, then all wheel speeds (m/s). Angles stay within +-90 deg, a wheel that would
+    have to look back rolls backwards instead. Forward takes the least-squares twist if the wheels contradict.
+
+    Args:
+        positions: (x, y) of the wheels, m; at least two at different places.
+        radius: of the wheels, m.
+        max_speed: of a wheel, m/s.
+
+    Raises:
+        KinematicsError: fewer than two places, or a field out of range.
+    """
+
+    positions: tuple[tuple[float, float], ...] = ((0.16, 0.13), (0.16, -0.13), (-0.16, 0.13), (-0.16, -0.13))
+    radius: float = 0.075
+    max_speed: float = math.inf
+    _solver: Array = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        require_positive("radius", self.radius)
+        require_limit("max_speed", self.max_speed)
+        if len(set(self.positions)) < 2:
+            raise KinematicsError(f"positions has {len(set(self.positions))} places: expected two or more")
+        rows = [row for x, y in self.positions for row in ([1.0, 0.0, -y], [0.0, 1.0, x])]
+        object.__setattr__(self, "_solver", np.linalg.pinv(np.array(rows)))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """All steering angles, then all speeds."""
+        count = range(1, len(self.positions) + 1)
+        return (*(f"steer {i}" for i in count), *(f"speed {i}" for i in count))
+
+    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+        """Least-squares twist of the wheels' velocities; exact if they agree."""
+        values = unpacked(command, self.inputs)
+        count = len(self.positions)
+        total = [0.0 * values[0], 0.0 * values[0], 0.0 * values[0]]
+        for i, (steer, speed) in enumerate(zip(values[:count], values[count:], strict=True)):
+            ahead, aside = speed * cos(steer), speed * sin(steer)
+            for k in range(3):
+                total[k] = total[k] + float(self._solver[k, 2 * i]) * ahead + float(self._solver[k, 2 * i + 1]) * aside
+        return total[0], total[1], total[2]
+
+    def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
+        """Angle and speed of every wheel; a wheel that stands (at the turning centre) keeps angle 0."""
+        vx, vy, wz = unpacked(twist, TWIST)
+        angles: list[Real] = []
+        speeds: list[Real] = []
+        for x, y in self.positions:
+            ahead, aside = vx - wz * y, vy + wz * x
+            facing = sign(ahead)
+            angles.append(atan2(facing * aside, abs(ahead)))
+            speeds.append(facing * hypot(ahead, aside))
+        return tuple(angles + speeds)
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """All speeds scaled alike: same path, slower."""
+        values = list(unpacked(command, self.inputs))
+        angles, speeds = values[: len(self.positions)], values[len(self.positions) :]
+        factor = scaled_to(speeds, self.max_speed)
+        return tuple(angles + [speed * factor for speed in speeds])
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """By all angles, then all speeds."""
+        values = unpacked(command, self.inputs)
+        count = len(self.positions)
+        rows: list[list[Real]] = []
+        for k in range(3):
+            by_angle: list[Real] = []
+            by_speed: list[Real] = []
+            for i, (steer, speed) in enumerate(zip(values[:count], values[count:], strict=True)):
+                ahead, aside = float(self._solver[k, 2 * i]), float(self._solver[k, 2 * i + 1])
+                c, s = cos(steer), sin(steer)
+                by_angle.append(speed * (aside * c - ahead * s))
+                by_speed.append(ahead * c + aside * s)
+            rows.append(by_angle + by_speed)
+        return stacked(rows)
+
+    def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
+        """The wheels at the command's angles."""
+        values = unpacked(command, self.inputs)
+        return tuple(
+            SteeredWheel(f"wheel {i + 1}", x, y, self.radius, steer)
+            for i, ((x, y), steer) in enumerate(zip(self.positions, values, strict=False))
+        )
+
+
+@dataclass(frozen=True)
+class Synchro:
+    """Synchro drive; its posture is (x, y, direction of the wheels), its twist is in the wheels' own frame.
+
+    In those terms it moves like a unicycle: xdot = v cos th, ydot = v sin th, thdot = omega. ``platform_twist`` tells
+    what the platform, which never turns, does.
+
+    Args:
+        wheel_radius: m.
+        circle: radius of the circle (an equilateral triangle) on which the three wheels stand, m.
+        max_rate: of the wheels, rad/s.
+        max_turn: of the wheels' direction, rad/s.
+
+    Raises:
+        KinematicsError: a field is not above 0.
+    """
+
+    wheel_radius: float = 0.05
+    circle: float = 0.2
+    max_rate: float = math.inf
+    max_turn: float = math.inf
+
+    inputs = ("roll", "turn")
+
+    def __post_init__(self) -> None:
+        require_positive("wheel_radius", self.wheel_radius)
+        require_positive("circle", self.circle)
+        require_limit("max_rate", self.max_rate)
+        require_limit("max_turn", self.max_turn)
+
+    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+        """(v, 0, omega) in the wheels' frame from the rolling rate and the turning rate, rad/s."""
+        roll, turn = unpacked(command, self.inputs)
+        return roll * self.wheel_radius, 0.0 * roll, turn + 0.0 * roll
+
+    def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
+        """Rates for a twist in the wheels' frame."""
+        vx, vy, wz = unpacked(twist, TWIST)
+        refuse("vy", vy, vx, "the wheels cannot move sideways")
+        return vx / self.wheel_radius, wz
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """Both rates scaled alike: same path, slower."""
+        roll, turn = unpacked(command, self.inputs)
+        factor = scaled_to((roll / self.max_rate, turn / self.max_turn), 1.0)
+        return roll * factor, turn * factor
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """Constant."""
+        roll, _ = unpacked(command, self.inputs)
+        zero = 0.0 * roll
+        return stacked([[zero + self.wheel_radius, zero], [zero, zero], [zero, zero + 1.0]])
+
+    def platform_twist(self, command: Sequence[Real], direction: Real) -> Twist[Real]:
+        """Twist of the platform when its wheels point along ``direction`` in its frame: it translates only."""
+        speed, zero, _ = self.forward(command)
+        vx, vy = to_world(direction, speed, zero)
+        return vx, vy, zero
+
+    def wheels(self, command: Sequence[float], direction: float = 0.0) -> tuple[Wheel, ...]:
+        """Three steered wheels on one belt."""
+        unpacked(command, self.inputs)
+        corners = [2.0 * math.pi * i / 3.0 for i in range(3)]
+        return tuple(
+            SteeredWheel(
+                f"wheel {i + 1}",
+                self.circle * math.cos(a),
+                self.circle * math.sin(a),
+                self.wheel_radius,
+                direction,
+                group="belt",
+            )
+            for i, a in enumerate(corners)
+        )
