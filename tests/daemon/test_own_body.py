@@ -30,10 +30,6 @@ def test_it_drives_its_bend(project: Path, target: Path, tmp_path: Path):
     assert figures["outcome"].strip() == "path driven to its end"
     assert float(figures["cross-track RMS"].split()[0]) < 3.0
     assert {"sensor/drive", "sensor/drive_2"} <= {line.split()[0] for line in out.splitlines() if line.strip()}
-    wheels = project / "wheels.yaml"
-    wheels.write_text((project / "robot.yaml").read_text().replace("steering_ratio: 1.65", "steering_ratio: 3.0"))
-    out = run_with(target, "demo", "--fast", "-c", str(wheels), "-o", str(tmp_path / "other"))
-    assert out.splitlines()[-1] != figures, "the world's body counts"
 
 
 def test_it_is_listed_and_its_settings_are_checked(project: Path, target: Path):
