@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array, KinematicsError, Real, larger, require_finite, require_within
-from monstertruck_kinematics.motion import integrate
 from monstertruck_kinematics.wheels import Wheel
 
 Twist = tuple[Real, Real, Real]
@@ -48,17 +47,6 @@ class Drive(Protocol):
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The wheels at a command's steering angles, for ``wheels.analyse``."""
         ...
-
-
-def rolled(drive: Drive, pose: tuple[Real, Real, Real], command: Sequence[Real], dt: float) -> tuple[Real, Real, Real]:
-    """Pose after holding the command for dt: exact, on an arc."""
-    return integrate(pose, *drive.forward(command), dt)
-
-
-def turning_centre(twist: Sequence[float]) -> tuple[float, float] | None:
-    """Turning centre (x, y) of a twist in the body frame, m; None if it only translates or stands."""
-    vx, vy, wz = twist
-    return None if wz == 0.0 else (-vy / wz, vx / wz)
 
 
 def scaled_to(values: Sequence[Real], limit: float) -> Real:

@@ -44,13 +44,6 @@ class SingleTrack:
         if not self.blend_to > self.blend_from:
             raise KinematicsError(f"blend_to is {self.blend_to}: expected more than blend_from, {self.blend_from}")
 
-    @property
-    def understeer_gradient(self) -> float:
-        """K in the steady turn w = v_x (d_f - d_r)/(L + K v_x^2), small angles, s^2/m; above 0 understeers."""
-        front, rear = self.front_stiffness, self.rear_stiffness
-        geometry = self.geometry
-        return self.mass * (geometry.l_r * rear - geometry.l_f * front) / (geometry.wheelbase * front * rear)
-
     def rates(self, vx: Array, vy: Array, wz: Array, front: Array, rear: Array) -> tuple[Array, Array]:
         """(dv_y/dt, dw_z/dt) of the tyre model alone, forward or backward; not for v_x = 0."""
         fast, facing = np.abs(vx), np.sign(vx)
@@ -113,15 +106,3 @@ class SingleTrack:
             vy + constant * rate_y + linear * (a11 * rate_y + a12 * rate_w),
             wz + constant * rate_w + linear * (a21 * rate_y + a22 * rate_w),
         )
-
-    def rolling_acceleration(self, force: Real, speed: Real, curvature: Real, curvature_rate: Real) -> Real:
-        """Acceleration along the path without slip: (m + I_z k^2) dv/dt + I_z k dk/dt v = F.
-
-        Args:
-            force: driving force along the path, N.
-            speed: m/s.
-            curvature: k, 1/m.
-            curvature_rate: dk/dt, 1/(m s).
-        """
-        inertia = self.mass + self.yaw_inertia * curvature * curvature
-        return (force - self.yaw_inertia * curvature * curvature_rate * speed) / inertia

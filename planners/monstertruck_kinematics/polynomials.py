@@ -23,7 +23,6 @@ SERVO_LIMIT = math.pi / 4.0
 F_PRINTED: Coefficients = (-0.0082, -0.0162, -0.00605, -0.0192, 0.6691, 0.0)
 F_CORRECTED: Coefficients = (-0.0082, -0.0162, -0.0605, -0.0192, 0.6691, 0.0)
 G_PRINTED: Coefficients = (0.0126, -0.0432, 0.0067, -0.0851, 0.9997, 0.0035)
-H_PRINTED: Coefficients = (0.5334, 0.2997, 0.2857, 0.0556, 1.4951, 0.0)
 
 _NEWTON_STEPS = 30
 
@@ -38,12 +37,6 @@ def derivative(coefficients: Coefficients) -> Coefficients:
     """Coefficients of the derivative, highest power first."""
     top = len(coefficients) - 1
     return tuple(c * (top - i) for i, c in enumerate(coefficients[:-1]))
-
-
-def round_trip_error(there: Coefficients, back: Coefficients, limit: float) -> float:
-    """Largest |back(there(x)) - x| for |x| up to ``limit``, rad: how well two fitted directions agree."""
-    x = np.linspace(-limit, limit, 2001)
-    return float(np.abs(polynomial(back, polynomial(there, x)) - x).max())
 
 
 @dataclass(frozen=True)
@@ -193,7 +186,3 @@ class SteeringPolynomials:
     def servo_from_axles(self, front: Real, rear: Real) -> tuple[Real, Real]:
         """Servo angles (front, rear) for the two axle angles."""
         return self.front.servo_from_axle(front), self.rear.servo_from_axle(rear)
-
-    def axles_from_servo(self, front: Real, rear: Real) -> tuple[Real, Real]:
-        """Axle angles (front, rear) at the two servo angles."""
-        return self.front.axle_from_servo(front), self.rear.axle_from_servo(rear)

@@ -24,7 +24,7 @@ from monstertruck_kinematics.elementary import (
     tan,
 )
 from monstertruck_kinematics.motion import to_world
-from monstertruck_kinematics.truck import STEEPEST, FourWheelSteering, Mode
+from monstertruck_kinematics.truck import STEEPEST, FourWheelSteering
 from monstertruck_kinematics.wheels import FixedWheel, SteeredWheel, Wheel
 
 
@@ -99,10 +99,6 @@ class Bicycle:
             [[zero + 1.0, zero], [zero, zero], [s / c / self.wheelbase, speed / (c * c * self.wheelbase)]],
         )
 
-    def radius_of(self, steer: Real) -> Real:
-        """Turning radius at the rear axle's middle, R = l tan(pi/2 - steer), left positive; not for steer = 0."""
-        return self.wheelbase * tan(math.pi / 2.0 - steer)
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The two wheels."""
         _, steer = unpacked(command, self.inputs)
@@ -132,12 +128,6 @@ class Tricycle(Bicycle):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive("track", self.track)
-
-    def rear_rates(self, command: Sequence[Real]) -> tuple[Real, Real]:
-        """Rates of the rear wheels (left, right), rad/s, that a command causes."""
-        vx, _, wz = self.forward(command)
-        lean = wz * (0.5 * self.track)
-        return (vx - lean) / self.radius, (vx + lean) / self.radius
 
     def odometry(self, left: Real, right: Real) -> Twist[Real]:
         """Twist measured by the two rear odometers (rates in rad/s), without knowing the steering angle."""
@@ -234,10 +224,6 @@ class Ackermann:
         tan_l, tan_r = tan(left), tan(right)
         return tan_l - tan_r - (self.track / self.wheelbase) * tan_l * tan_r
 
-    def radius_at(self, steer: float, l_r: float) -> float:
-        """Turning radius of a point on the middle line l_r before the rear axle: sqrt(R^2 + l_r^2) (2.14)."""
-        return math.inf if steer == 0.0 else math.hypot(self.wheelbase / math.tan(steer), l_r)
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The four wheels."""
         _, steer = unpacked(command, self.inputs)
@@ -311,23 +297,6 @@ class FourWheelSteer:
             fading = -tan_b * cos_b * cos_b * lean
             columns.append((vx * fading, vy * fading + vx * lean, wz * fading + side * vx * slope / length))
         return stacked(list(zip(*columns, strict=True)))
-
-    def steering(self, mode: Mode, angle: Real) -> tuple[Real, Real]:
-        """Axle angles (front, rear) of a steering mode; ``angle`` is the front one, for rear steering the rear one.
-
-        Raises:
-            KinematicsError: the mode is spot, or unknown.
-        """
-        zero = 0.0 * angle
-        if mode == "front":
-            return angle, zero
-        if mode == "rear":
-            return zero, angle
-        if mode == "counter":
-            return angle, -angle
-        if mode == "crab":
-            return angle, angle
-        raise KinematicsError(f"mode {mode!r}: expected front, rear, counter or crab")
 
     def wheel_rates(self, command: Sequence[Real]) -> tuple[Real, Real, Real, Real]:
         """Rates of the four wheels, rad/s (2.47-2.50)."""

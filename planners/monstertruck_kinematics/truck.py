@@ -59,22 +59,6 @@ class DriveTrain:
         require_positive("ratio", self.ratio)
         require_positive("wheel_radius", self.wheel_radius)
 
-    @classmethod
-    def from_teeth(
-        cls,
-        gearbox: float = 66.0,
-        pinion: int = 46,
-        spur: int = 81,
-        transfer: float = 1.68,
-        axle: float = 3.3,
-        wheel_radius: float = 0.075,
-    ) -> "DriveTrain":
-        """Ratio from its stages: gearbox x spur/pinion x transfer case x axle differential (644.31 for the truck)."""
-        for name, value in (("gearbox", gearbox), ("pinion", pinion), ("spur", spur), ("transfer", transfer)):
-            require_positive(name, value)
-        require_positive("axle", axle)
-        return cls(gearbox * spur / pinion * transfer * axle, wheel_radius)
-
     def speed(self, motor_rate: Real) -> Real:
         """Ground speed of the wheels, m/s, at a motor rate in rad/s."""
         return motor_rate * (self.wheel_radius / self.ratio)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -125,14 +125,6 @@ class SkidSteer:
         """No slip at all: a differential drive of half track c (eqs. 10, 11)."""
         return cls(radius, half_track, -half_track)
 
-    def with_centre_of_mass(self, x: float, y: float) -> "SkidSteer":
-        """The same robot about a reference point (x, y), m, off the present one (eq. 7)."""
-        return replace(self, icr_left=self.icr_left - y, icr_right=self.icr_right - y, icr_x=self.icr_x - x)
-
-    def with_effective_radius(self, factor: float) -> "SkidSteer":
-        """The same robot with both sides' effective radius scaled."""
-        return replace(self, gain_left=self.gain_left * factor, gain_right=self.gain_right * factor)
-
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist from the wheel rates (left, right)."""
         left, right = unpacked(command, self.inputs)
@@ -169,19 +161,6 @@ class SkidSteer:
                 [zero - by_left, zero + by_right],
             ]
         )
-
-    def turning_radius(self, ratio: Real) -> Real:
-        """Signed radius of the path, m, when the right wheels turn ``ratio`` times as fast as the left ones.
-
-        Ideal: c (k + 1)/(k - 1). Only the lateral part, v_x/omega; not for ratio = gain_left/gain_right (straight).
-        """
-        fast = ratio * (self.gain_right / self.gain_left)
-        return (fast * self.icr_left - self.icr_right) / (fast - 1.0)
-
-    def side_slip(self, twist: Sequence[Real], half_length: float) -> tuple[Real, Real]:
-        """Sideways speeds v_F and v_B of the wheels half_length before and behind the reference point (eqs. 8, 9)."""
-        _, vy, wz = unpacked(twist, TWIST)
-        return vy + half_length * wz, vy - half_length * wz
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """Four fixed wheels where the sides' centres lie: without slip they could only go straight."""

@@ -166,40 +166,6 @@ def sliding_matrix(wheels: Sequence[Wheel]) -> Array:
     return np.array([row for row in rows if row is not None]).reshape(-1, 3)
 
 
-def body_velocity(wheels: Sequence[Wheel], rates: Sequence[float], tolerance: float = 1e-6) -> Array:
-    """Body velocity (3,) at which every wheel rolls at its rate and none slips sideways.
-
-    Args:
-        wheels: the robot.
-        rates: of each wheel about its own axle, rad/s.
-        tolerance: m/s by which a wheel may miss.
-
-    Raises:
-        KinematicsError: the wheels contradict each other (the worst is named), or leave the velocity undetermined.
-    """
-    wheels = checked(wheels)
-    if len(rates) != len(wheels):
-        raise KinematicsError(f"rates has {len(rates)} entries: expected one for each of the {len(wheels)} wheels")
-    for wheel, rate in zip(wheels, rates, strict=True):
-        require_finite(f"wheel {wheel.name}: rate", rate)
-    rolling = np.array([wheel.rolling_row for wheel in wheels if not isinstance(wheel, CasterWheel)])
-    speeds = [w.rolling_gain * rate for w, rate in zip(wheels, rates, strict=True) if not isinstance(w, CasterWheel)]
-    names = [w.name for w in wheels if not isinstance(w, CasterWheel)]
-    names += [w.name for w in wheels if w.sliding_row is not None]
-    rows = np.vstack([rolling.reshape(-1, 3), sliding_matrix(wheels)])
-    wanted = np.concatenate([speeds, np.zeros(len(rows) - len(speeds))])
-    twist, _, rank, _ = np.linalg.lstsq(rows, wanted, rcond=1e-9)
-    if rank < 3:
-        raise KinematicsError(f"wheels {', '.join(names)}: they leave the body's velocity undetermined")
-    misses = np.abs(rows @ twist - wanted)
-    worst = int(misses.argmax())
-    if misses[worst] > tolerance:
-        raise KinematicsError(
-            f"wheel {names[worst]} contradicts the others: it misses by {misses[worst]:.3g} m/s, allowed {tolerance:g}"
-        )
-    return np.asarray(twist)
-
-
 RANK_TOLERANCE = 1e-9
 """Singular value, relative to the largest, up to which rows count as dependent."""
 

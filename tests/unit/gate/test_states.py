@@ -195,7 +195,8 @@ def test_reversing_has_its_own_limit():
 
 def test_servo_angles_belong_to_the_axle_angles():
     rig = Rig().driving(front=0.2, rear=-0.1)
-    axles = SteeringPolynomials().axles_from_servo(rig.out.front_servo, rig.out.rear_servo)
+    linkage = SteeringPolynomials()
+    axles = linkage.front.axle_from_servo(rig.out.front_servo), linkage.rear.axle_from_servo(rig.out.rear_servo)
     assert axles == pytest.approx((0.2, -0.1))
 
 

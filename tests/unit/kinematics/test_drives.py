@@ -5,13 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.drive import rolled, turning_centre
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.motion import integrate, integration_jacobians, moved_point, to_body, to_world
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, SwedishDrive, mecanum, omni
-from monstertruck_kinematics.wheels import SwedishWheel, body_velocity
+from monstertruck_kinematics.wheels import SwedishWheel, analyse, rolling_matrix, sliding_matrix
 
 STATES = 100_000
 
@@ -189,16 +188,17 @@ def test_differential_textbook_values():
     v_x, _, omega = drive.forward((1.0, 3.0))
     assert (v_x, omega) == pytest.approx((0.2, 0.5))
     radius = 0.4 / 2 * (0.3 + 0.1) / (0.3 - 0.1)
-    assert turning_centre((v_x, 0.0, omega)) == pytest.approx((0.0, radius))
-    assert turning_centre((1.0, 0.0, 0.0)) is None
+    assert v_x / omega == pytest.approx(radius)
 
 
 def test_tricycle_odometry_equals_its_motion(rng):
     drive = Tricycle(track=0.3)
     command = (rng.uniform(-1, 1, 100), rng.uniform(-1.4, 1.4, 100))
-    measured = drive.odometry(*drive.rear_rates(command))
-    np.testing.assert_allclose(measured, drive.forward(command), atol=1e-14)
-    assert drive.radius_of(math.pi / 4) == pytest.approx(drive.wheelbase)
+    twist = np.array(drive.forward(command))
+    rates = rolling_matrix(drive.wheels((0.0, 0.0))[:2]) @ twist
+    np.testing.assert_allclose(drive.odometry(*rates), twist, atol=1e-14)
+    vx, _, wz = drive.forward((0.2, math.pi / 4))
+    assert vx / wz == pytest.approx(drive.wheelbase)
 
 
 def test_car_like_constraints_hold_at_both_axles(rng):
@@ -214,17 +214,11 @@ def test_car_like_constraints_hold_at_both_axles(rng):
             np.testing.assert_allclose(x_rate, speed * np.cos(heading) * np.cos(steer), atol=1e-15)
 
 
-def test_steering_modes_are_their_own_turning_centres():
+def test_single_axle_steering_turns_about_the_straight_axle():
     truck = FourWheelSteer()
-    expected = {"front": (0.3, 0.0), "rear": (0.0, 0.3), "counter": (0.3, -0.3), "crab": (0.3, 0.3)}
-    for mode, angles in expected.items():
-        assert truck.steering(mode, 0.3) == angles
-    x, y = turning_centre(truck.forward((0.2, *truck.steering("front", 0.3))))
-    assert (x, y) == pytest.approx((-0.16, 0.32 / math.tan(0.3)))
-    x, y = turning_centre(truck.forward((0.2, *truck.steering("rear", 0.3))))
-    assert (x, y) == pytest.approx((0.16, -0.32 / math.tan(0.3)))
-    with pytest.raises(KinematicsError, match="mode 'spot'"):
-        truck.steering("spot", 0.3)
+    front, rear = (analyse(truck.wheels((0.2, *angles))).icr for angles in ((0.3, 0.0), (0.0, 0.3)))
+    assert front == pytest.approx((-0.16, 0.32 / math.tan(0.3)))
+    assert rear == pytest.approx((0.16, -0.32 / math.tan(0.3)))
 
 
 @pytest.mark.parametrize(("drive", "command"), [(FourWheelSteer(), (0.2, 0.3, -0.2)), (Ackermann(), (0.2, 0.3))])
@@ -238,8 +232,8 @@ def test_synchro_platform_keeps_its_heading():
     drive = Synchro(wheel_radius=0.1)
     twist = drive.platform_twist((5.0, 0.7), math.pi / 6)
     assert twist == pytest.approx((0.5 * math.cos(math.pi / 6), 0.25, 0.0))
-    assert rolled(drive, (0.0, 0.0, 0.0), (0.0, 0.5), 2.0) == pytest.approx((0.0, 0.0, 1.0))
-    assert rolled(drive, (0.0, 0.0, 0.0), (2.0, 0.0), 3.0) == pytest.approx((0.6, 0.0, 0.0))
+    assert integrate((0.0, 0.0, 0.0), *drive.forward((0.0, 0.5)), 2.0) == pytest.approx((0.0, 0.0, 1.0))
+    assert integrate((0.0, 0.0, 0.0), *drive.forward((2.0, 0.0)), 3.0) == pytest.approx((0.6, 0.0, 0.0))
 
 
 def test_mecanum_textbook_rates():
@@ -301,8 +295,7 @@ def test_wheels_belong_to_the_family(name, rng):
     wheels = drive.wheels(command)
     if name in ("synchro", "skid steer"):
         return  # the twist lives in the wheels' frame; skidding wheels slip by nature
-    rates = [float(w.rolling_row @ twist) / w.rolling_gain for w in wheels]
-    np.testing.assert_allclose(body_velocity(wheels, rates), twist, atol=1e-9)
+    np.testing.assert_allclose(sliding_matrix(wheels) @ twist, 0.0, atol=1e-12)
 
 
 # Motion
@@ -313,9 +306,9 @@ def test_integration_equals_many_small_steps(name, rng):
     drive, twists = FAMILIES[name]
     command = drive.inverse(tuple(float(c[0]) for c in twists(rng, 1)))
     pose = exact = (0.3, -0.2, 0.7)
-    exact = rolled(drive, exact, command, 1.5)
+    exact = integrate(exact, *drive.forward(command), 1.5)
     for _ in range(3000):
-        half = rolled(drive, pose, command, 0.00025)
+        half = integrate(pose, *drive.forward(command), 0.00025)
         vx, vy, wz = drive.forward(command)
         x_rate, y_rate = to_world(half[2], vx, vy)
         pose = (pose[0] + x_rate * 0.0005, pose[1] + y_rate * 0.0005, pose[2] + wz * 0.0005)

@@ -7,19 +7,19 @@ import pytest
 
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
+from monstertruck_kinematics.motion import moved_point
 from monstertruck_kinematics.polynomials import (
     F_CORRECTED,
     F_PRINTED,
     G_PRINTED,
-    H_PRINTED,
     SteeringPolynomials,
     polynomial,
-    round_trip_error,
 )
-from monstertruck_kinematics.steered import Ackermann
+from monstertruck_kinematics.steered import Ackermann, Synchro
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_kinematics.wheels import analyse
+from tests.unit.kinematics.kit import H_PRINTED, round_trip_error
 
 LINKAGE = SteeringLinkage(arms="forward")
 GEOMETRY = FourWheelSteering(cg_split=0.4)
@@ -35,22 +35,9 @@ def cot(x):
 
 
 def test_2_1_spur_has_81_teeth_not_84():
-    assert round(DriveTrain.from_teeth(spur=84).ratio) == 668
-    assert round(DriveTrain.from_teeth().ratio) == round(DriveTrain().ratio) == 644
-    assert round(66 * 1.76 * 1.68 * 3.3) == 644
-
-
-def test_rotation_speeds_are_rounded_down_in_print():
-    first, second, third, fourth = 18000 / np.cumprod([66, 1.76, 1.68, 3.3])
-    assert (round(first, 2), round(second, 2)) == (272.73, 154.96)
-    assert round(first, 2) != 272.72
-    assert (round(third, 2), round(fourth, 2)) == (92.24, 27.95)
-
-
-def test_lidar_step_is_not_0_36_degrees():
-    assert 360 / 1024 == 0.3515625
-    assert round(240 / (360 / 1024)) == 683
-    assert round(240 / 0.36) == 667
+    ratio = DriveTrain().ratio
+    assert ratio == round(66 * 81 / 46 * 1.68 * 3.3) == round(66 * 1.76 * 1.68 * 3.3)
+    assert ratio != round(66 * 84 / 46 * 1.68 * 3.3)
 
 
 # Thesis, linkage
@@ -185,9 +172,9 @@ def test_2_14_words_exchange_the_centre_of_mass_distances():
     car = Ackermann()
     moved = FourWheelSteering(cg_split=l_f / 0.32)
     radius = 1.0 / moved.curvature(steer, 0.0)
-    assert car.radius_at(steer, l_r) == pytest.approx(radius)
-    assert car.radius_at(steer, l_f) != pytest.approx(radius, rel=1e-3)
-    assert car.radius_at(0.0, l_r) == math.inf
+    rear_axle = 1.0 / car.geometry.curvature(steer, 0.0)
+    assert math.hypot(rear_axle, l_r) == pytest.approx(radius)
+    assert math.hypot(rear_axle, l_f) != pytest.approx(radius, rel=1e-3)
 
 
 @each_state
@@ -206,17 +193,17 @@ def test_2_33_needs_a_minus_between_its_terms(front, rear):
 
 
 def test_2_33_as_printed_in_symmetric_counter_steer_is_zero():
-    fl, fr, rl, rr = FourWheelSteering().wheel_angles(0.3, -0.3)
+    centred = FourWheelSteering()
+    fl, fr, rl, rr = centred.wheel_angles(0.3, -0.3)
     assert 1 / (cot(fr) - cot(fl)) + 1 / (cot(rr) - cot(rl)) == pytest.approx(0.0, abs=1e-12)
-    assert round(0.32 / 0.26, 2) == 1.23
+    assert 1 / (cot(fr) - cot(fl)) - 1 / (cot(rr) - cot(rl)) == pytest.approx(centred.wheelbase / centred.track)
 
 
 def test_2_37_with_magnitudes_has_no_counter_steer():
     angle = math.radians(20)
     centred = FourWheelSteering()
-    assert math.tan(abs(angle)) - math.tan(abs(-angle)) == 0.0
     assert round(1 / centred.curvature(angle, -angle), 2) == 0.44
-    assert centred.curvature(angle, angle) == 0.0
+    assert centred.curvature(abs(angle), abs(-angle)) == 0.0  # as printed
 
 
 @each_state
@@ -248,22 +235,20 @@ def test_2_52_has_the_wrong_sign_and_2_54_2_55_square_the_wrong_thing(front, rea
 
 # Skid-steer paper
 
-ROBOT = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK).with_centre_of_mass(0.004, 0.01)
+ROBOT = SkidSteer(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK - 0.01, -PUBLISHED_HALF_TRACK - 0.01, icr_x=-0.004)
 
 
 def test_k5_turning_centre_has_both_signs_turned():
     vx, vy, wz = ROBOT.forward((0.5, 1.5))
     d_cx, d_cy = vy / wz, -vx / wz  # eq. 4: vx/(-d_Cy) = vy/d_Cx = omega
-    icr = np.array([-vy / wz, vx / wz])
-    np.testing.assert_allclose(icr, [-d_cx, -d_cy])
-    assert abs(icr[1] - d_cy) > 0.05  # as printed, +d_Cy
-    assert vx / icr[1] == pytest.approx(-vy / icr[0]) == pytest.approx(wz)
+    assert moved_point(vx, vy, wz, -d_cx, -d_cy) == pytest.approx((0.0, 0.0, wz))
+    assert moved_point(vx, vy, wz, -d_cx, d_cy)[0] == pytest.approx(2.0 * vx)  # as printed, +d_Cy
 
 
 def test_k8_front_and_back_are_exchanged_in_print():
     vx, vy, wz = ROBOT.forward((0.5, 1.5))
     a = b = 0.0305
-    front, back = ROBOT.side_slip((vx, vy, wz), 0.0305)
+    front, back = moved_point(vx, vy, wz, b, 0.0)[1], moved_point(vx, vy, wz, -a, 0.0)[1]
     assert front == pytest.approx((b - ROBOT.icr_x) * wz)
     assert back == pytest.approx((-a - ROBOT.icr_x) * wz)
     assert front != pytest.approx((-a - ROBOT.icr_x) * wz, rel=0.1)
@@ -276,23 +261,16 @@ def test_k9_needs_the_velocity_vector():
     matrix = np.array([[1, -c], [1, c], [0, b - x_icr], [0, -a - x_icr]])
     left, right, front, back = matrix @ [vx, wz]
     assert (left, right) == pytest.approx((0.5 * robot.radius, 1.5 * robot.radius))
-    assert (front, back) == pytest.approx(robot.side_slip((vx, vy, wz), 0.0305))
+    assert front == pytest.approx(moved_point(vx, vy, wz, b, 0.0)[1])
+    assert back == pytest.approx(moved_point(vx, vy, wz, -a, 0.0)[1])
 
 
-def test_k_table_deviations_and_drifts_recomputed():
+def test_k_table_deviations_recomputed():
     ideal = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)
     recomputed = [100 * (c.speed / ideal.forward((c.left, c.right))[0] - 1) for c in PUBLISHED_CIRCLES[:6]]
     assert np.round(recomputed, 1).tolist() == [10.4, 13.3, 10.5, 11.5, 6.9, 14.0]
     printed = [12.34, 13.19, 9.39, 11.87, 6.85, 13.69]
     assert np.abs(np.array(printed) - recomputed).max() > 1.9
-    drifts = [
-        (-0.000901, -0.000128), (-0.000071, -0.000273), (-0.000025, -0.000163),
-        (-0.000869, -0.000301), (-0.000132, -0.0000967), (-0.0000415, -0.0000759),
-    ]  # fmt: skip
-    sizes = [100 * math.hypot(*drift) for drift in drifts]
-    assert np.round(sizes, 4).tolist() == [0.091, 0.0282, 0.0165, 0.092, 0.0164, 0.0087]
-    assert abs(sizes[4] - 0.0179) > 0.001  # row 5 as printed
-    assert sizes[0] == pytest.approx(0.91 / 10, abs=1e-3)  # the conclusion prints it ten times larger
 
 
 def test_k_straight_and_locked_speeds():
@@ -305,8 +283,6 @@ def test_k_straight_and_locked_speeds():
 
 
 def test_m_synchro_drive_is_holonomic_for_its_point_only():
-    from monstertruck_kinematics.steered import Synchro
-
     found = analyse(Synchro().wheels((1.0, 0.2)))
     assert found.robot_class == (1, 1)
     assert found.non_holonomic  # the lecture calls it holonomic

@@ -1,6 +1,7 @@
 """Skid steer: the models, the paper's table, identification from a trajectory."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,7 +31,9 @@ def model(name, **options):
 
 
 def test_ideal_radii_and_speeds_as_tabled():
-    assert [round(100 * IDEAL.turning_radius(k), 2) for k in (2.0, 3.0)] == [15.75, 10.5]
+    for ratio, radius in ((2.0, 15.75), (3.0, 10.5)):
+        vx, _, wz = IDEAL.forward((1.0, ratio))
+        assert round(100 * vx / wz, 2) == radius
     speeds = [100.0 * IDEAL.forward((c.left, c.right))[0] for c in PUBLISHED_CIRCLES]
     assert np.round(speeds, 3).tolist() == [2.473, 1.969, 1.638, 2.198, 1.75, 1.456, 1.649]
     locked = IDEAL.forward((0.0, 1.57))
@@ -42,17 +45,17 @@ def test_ideal_radii_and_speeds_as_tabled():
 def test_offset_centre_is_the_same_robot_seen_elsewhere(rng):
     command = tuple(rng.uniform(-2.0, 2.0, 2).tolist())
     x, y = 0.01, -0.02
-    seen = IDEAL.with_centre_of_mass(x, y).forward(command)
+    seen = SkidSteer(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK - y, -PUBLISHED_HALF_TRACK - y, -x).forward(command)
     assert seen == pytest.approx(moved_point(*IDEAL.forward(command), x, y))
-    faster = IDEAL.with_effective_radius(1.1)
+    faster = replace(IDEAL, gain_left=1.1, gain_right=1.1)
     assert faster.forward(command) == pytest.approx(tuple(1.1 * v for v in IDEAL.forward(command)))
 
 
 def test_slip_of_front_and_rear_wheels():
     robot = SkidSteer(0.021, 0.06, -0.06, icr_x=0.01)
     twist = robot.forward((1.0, 2.0))
-    front, rear = robot.side_slip(twist, 0.03)
-    assert (front, rear) == pytest.approx(((0.03 - 0.01) * twist[2], (-0.03 - 0.01) * twist[2]))
+    slip = moved_point(*twist, 0.03, 0.0)[1], moved_point(*twist, -0.03, 0.0)[1]
+    assert slip == pytest.approx(((0.03 - 0.01) * twist[2], (-0.03 - 0.01) * twist[2]))
     with pytest.raises(KinematicsError, match=r"vy is 0\.1"):
         robot.inverse((0.1, 0.1, 0.0))
 

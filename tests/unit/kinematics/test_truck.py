@@ -21,10 +21,6 @@ def test_drivetrain():
     assert train.motor_rate(train.speed(100.0)) == pytest.approx(100.0)
     assert train.motor_angle(train.distance(12.0)) == pytest.approx(12.0)
     assert train.distance(644.0 * math.tau) == pytest.approx(0.075 * math.tau)
-    exact = DriveTrain.from_teeth()
-    assert round(exact.ratio, 2) == 644.31
-    stages = 18000.0 / np.cumprod([66.0, 81.0 / 46.0, 1.68, 3.3])
-    assert np.round(stages, 2).tolist() == [272.73, 154.88, 92.19, 27.94]
     np.testing.assert_allclose(train.speed(np.array([1.0, 2.0])), [0.075 / 644.0, 0.15 / 644.0])
 
 
@@ -32,10 +28,6 @@ def test_drivetrain():
 def test_impossible_drivetrains(bad):
     with pytest.raises(KinematicsError, match=next(iter(bad))):
         DriveTrain(**bad)
-    with pytest.raises(KinematicsError, match="spur"):
-        DriveTrain.from_teeth(spur=0)
-    with pytest.raises(KinematicsError, match="axle"):
-        DriveTrain.from_teeth(axle=-1.0)
 
 
 @pytest.mark.parametrize("split", SPLITS)
