@@ -111,9 +111,9 @@ class Gate:
         nonce: str,
         latched: bool = False,
     ) -> None:
-        if config.angle > chassis.reach:
+        if config.angle > chassis.max_axle_angle:
             msg = (
-                f"gate.angle {config.angle} rad: expected at most {chassis.reach:.4f} rad, "
+                f"gate.angle {config.angle} rad: expected at most {chassis.max_axle_angle:.4f} rad, "
                 "which the steering linkage reaches"
             )
             raise ConfigError(msg)

@@ -182,7 +182,7 @@ class SensorMonitor:
         if self._speed is None or self._speed[0] != now:
             drives = self._fresh_drives(now)
             rolling = tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in drives])
-            self._speed = now, self._chassis.travel(rolling) if rolling else None
+            self._speed = now, self._chassis.fastest_wheel_speed(rolling) if rolling else None
         return self._speed[1]
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:

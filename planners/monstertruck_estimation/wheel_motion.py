@@ -32,7 +32,7 @@ class WheelIncrement:
     way: float
     """Of the fastest shaft, m, not negative."""
     pace: Speeds
-    """What the family makes of its shafts, see ``Chassis.pace``."""
+    """What the family makes of its shafts, see ``Chassis.input_speeds``."""
     angles: tuple[float, float]
     """Mean axle angles, rad."""
     lost: bool = False
@@ -102,7 +102,7 @@ class WheelMotion:
         if max(map(abs, rolled)) > self._max_speed * dt:
             self._pace = (0.0,) * len(self._pace)
             return WheelIncrement(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
-        self._pace = self._chassis.pace(tuple(way / dt for way in rolled), *angles)
+        self._pace = self._chassis.input_speeds(tuple(way / dt for way in rolled), *angles)
         way = max(map(abs, self._pace)) * dt
         return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), way, self._pace, angles)
 

@@ -1,16 +1,16 @@
-"""A drive family behind its actuators: what gate, odometry and plant need of any robot.
+"""A robot body with its actuators: what gate, odometry and simulation need of any drive family.
 
-Requests, gate and trackers speak of one equivalent bicycle about the base point: its speed along the direction of
-travel and the angles of its two axles. A chassis turns that into speeds of the driven shafts and servo angles, and
-measured shaft speeds and servo angles back into the base's twist. How much of the bicycle a body can do is its
-``freedom``; for one without axles the bicycle is imagined, its length being the body's reference length:
+Requests, gate and trackers use one equivalent bicycle about the base point: its speed along the direction of travel
+and the angles of its two axles. A chassis converts these to speeds of the driven shafts and servo angles, and measured
+shaft speeds and servo angles to the base's twist. ``freedom`` is the set of axle angles that a body can take; for a
+body without axles the bicycle is virtual, its wheelbase being the body's reference length:
 
 - ``both``: any pair of angles (truck, independent, omni, mecanum).
 - ``front``: the rear angle is 0. A car's base lies between its axles; a differential or skid-steer drive is the
-  bicycle whose rear axle stands at its turning centres, curvature tan(front) / length.
+  bicycle whose rear axle lies on the line of its ICRs, curvature tan(front) / length.
 - ``parallel``: both angles are equal, the body never turns (synchro).
 
-Speeds of shafts are those of the wheels' treads over ground, m/s, forward positive.
+Shaft speeds are those of the wheels' treads over ground, m/s, forward positive.
 """
 
 import math
@@ -20,10 +20,10 @@ from typing import Final, Literal
 
 from monstertruck_kinematics.drive import Drive, Twist
 from monstertruck_kinematics.elementary import KinematicsError, clip
-from monstertruck_kinematics.motion import moved_point
+from monstertruck_kinematics.motion import twist_at
 from monstertruck_kinematics.polynomials import AxlePolynomials, PolynomialSet, SteeringPolynomials
 from monstertruck_kinematics.steered import WHEEL_NAMES, Ackermann, Bicycle, IndependentSteer, Synchro, Tricycle
-from monstertruck_kinematics.truck import STEEPEST, DriveTrain, FourWheelSteering
+from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, DriveTrain, FourWheelSteering
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 Freedom = Literal["both", "front", "parallel"]
@@ -44,8 +44,8 @@ class Chassis(ABC):
         bicycle: the equivalent bicycle about the base point.
         drivetrain: motor to wheel, the same for every shaft.
         shafts: names of the driven shafts, in the order of their devices.
-        freedom: which axle angles of the bicycle it can do.
-        linkage: servo to axle; None = nothing is steered.
+        freedom: which axle angles of the bicycle it can take.
+        linkage: servo to axle; None = no steering.
     """
 
     bicycle: FourWheelSteering
@@ -59,27 +59,27 @@ class Chassis(ABC):
         """Speed of every shaft for a motion of the bicycle."""
 
     @abstractmethod
-    def pace(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
-        """What the shafts make of the family's own inputs, m/s; lasts while the steering changes."""
+    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+        """Speeds of the drive family's own inputs, m/s, from the shaft speeds; they hold while the steering changes."""
 
     @abstractmethod
-    def twist(self, pace: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
         """Velocity (vx, vy, wz) of the base at axle angles."""
 
-    def travel(self, shaft_speeds: Speeds) -> float:
+    def fastest_wheel_speed(self, shaft_speeds: Speeds) -> float:
         """Speed of the fastest wheel, m/s, negative when the body goes backwards."""
         if len(shaft_speeds) == 1:
             return shaft_speeds[0]
         fastest = max(map(abs, shaft_speeds))
-        return math.copysign(fastest, self.twist(self.pace(shaft_speeds, 0.0, 0.0), 0.0, 0.0)[0])
+        return math.copysign(fastest, self.twist(self.input_speeds(shaft_speeds, 0.0, 0.0), 0.0, 0.0)[0])
 
     # Steering
 
     @property
-    def reach(self) -> float:
-        """Greatest axle angle either way that the linkage allows, rad."""
+    def max_axle_angle(self) -> float:
+        """Largest axle angle to either side that the linkage allows, rad."""
         if self.linkage is None:
-            return STEEPEST
+            return MAX_AXLE_ANGLE
         steered = (self.linkage.front, self.linkage.rear) if self.freedom == "both" else (self.linkage.front,)
         return min(abs(end) for axle in steered for end in axle.axle_limits)
 
@@ -99,11 +99,11 @@ class Chassis(ABC):
         return front, self._rear(front)
 
     def servos(self, front: float, rear: float) -> tuple[float, float]:
-        """Servo angles for axle angles; 0 where nothing is steered."""
+        """Servo angles for axle angles; 0 for axles that are not steered."""
         return (0.0, 0.0) if self.linkage is None else self.linkage.servo_from_axles(front, rear)
 
     def axles(self, front_servo: float, rear_servo: float) -> tuple[float, float]:
-        """Axle angles at servo angles, which are cut to what the linkage takes."""
+        """Axle angles at servo angles, which are clamped to the linkage's range."""
         if self.linkage is None:
             return 0.0, 0.0
         front = _axle(self.linkage.front, front_servo)
@@ -122,21 +122,21 @@ class TruckChassis(Chassis):
     """The truck: one motor that turns with the mean of four wheels, two steered axles."""
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
-        """What the motor sees of the base's speed."""
+        """Speed at the motor for the base's speed."""
         return (self.bicycle.drive_speed(speed, front, rear),)
 
-    def pace(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
         """The base's speed along its direction of travel."""
         return (shaft_speeds[0] / self.bicycle.drive_speed(1.0, front, rear),)
 
-    def twist(self, pace: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
         """See ``FourWheelSteering.body_twist``."""
-        return self.bicycle.body_twist(pace[0], front, rear)
+        return self.bicycle.body_twist(inputs[0], front, rear)
 
 
 @dataclass(frozen=True)
 class FamilyChassis(Chassis):
-    """Any drive family whose inputs are its shafts and, behind them, the angle of a steered front wheel.
+    """Any drive family whose inputs are its shafts, followed by the angle of a steered front wheel if it has one.
 
     Args:
         family: the drive.
@@ -154,19 +154,19 @@ class FamilyChassis(Chassis):
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
         """The family's inverse."""
-        twist = moved_point(*self.bicycle.body_twist(speed, front, rear), self.origin, 0.0)
+        twist = twist_at(*self.bicycle.body_twist(speed, front, rear), self.origin, 0.0)
         command = self.family.inverse(twist)
         return tuple(value / self.per_speed for value in command[: len(self.shafts)])
 
-    def pace(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, pace: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
         """The family's forward."""
-        driven = tuple(value * self.per_speed for value in pace)
+        driven = tuple(value * self.per_speed for value in inputs)
         twist = self.family.forward((*driven, front) if self._steered else driven)
-        return moved_point(*twist, -self.origin, 0.0)
+        return twist_at(*twist, -self.origin, 0.0)
 
 
 @dataclass(frozen=True)
@@ -183,20 +183,20 @@ class SynchroChassis(Chassis):
         """All wheels roll as fast as the base."""
         return (self.family.inverse((speed, 0.0, 0.0))[0] * self.family.wheel_radius,)
 
-    def pace(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
         """The shaft itself."""
         return shaft_speeds
 
-    def twist(self, pace: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
         """The platform translates along its wheels."""
-        return self.family.platform_twist((pace[0] / self.family.wheel_radius, 0.0), front)
+        return self.family.platform_twist((inputs[0] / self.family.wheel_radius, 0.0), front)
 
 
 @dataclass(frozen=True)
 class IndependentChassis(Chassis):
     """Two steered axles with ideal linkages, every wheel with a motor of its own.
 
-    Two axle angles always leave a forward speed, so the family's turning on the spot is out of their reach.
+    Two axle angles always leave a forward speed, so the family's turning on the spot is not available.
 
     Args:
         family: the drive.
@@ -205,17 +205,17 @@ class IndependentChassis(Chassis):
     family: IndependentSteer
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
-        """Wheel speeds about the common turning centre."""
+        """Wheel speeds about the common ICR."""
         twist = self.bicycle.body_twist(speed, front, rear)
         return self.family.inverse(twist)[len(self.shafts) :]
 
-    def pace(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, pace: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
         """Least-squares twist of the wheels' velocities."""
-        return self.family.forward((*self.bicycle.wheel_angles(front, rear), *pace))
+        return self.family.forward((*self.bicycle.wheel_angles(front, rear), *inputs))
 
 
 # Builders: a body of the configuration names one of these
@@ -223,7 +223,7 @@ class IndependentChassis(Chassis):
 
 @dataclass(frozen=True, slots=True)
 class Dimensions:
-    """What every robot has, whatever its body."""
+    """Dimensions that every robot has."""
 
     drivetrain: DriveTrain
     """Motor to wheel, the same for every shaft."""
@@ -294,7 +294,7 @@ def _steered_front(size: Dimensions, steering: SteeringPolynomials, family: Driv
 
 
 def differential_chassis(size: Dimensions) -> Chassis:
-    """Two driven wheels beside the base point."""
+    """Two driven wheels, to the left and right of the base point."""
     return _driven_sides(size, Differential(size.drivetrain.wheel_radius, size.track))
 
 
@@ -310,7 +310,7 @@ def skid_steer_chassis(
 
     Args:
         size: the robot's.
-        icr_left: lateral position of the left side's turning centre, m; None = half the track.
+        icr_left: lateral position of the left side's ICR, m; None = half the track.
         icr_right: of the right side's, m; None = minus half the track.
         icr_x: longitudinal position of both, m, 0 to -wheelbase.
         gain_left: effective over nominal radius of the left wheels.

@@ -1,4 +1,4 @@
-"""What every drive family answers, and what follows from it alone.
+"""The protocol of all drive families, and the checks they share.
 
 A command is the drive's inputs in order (speeds m/s, wheel rates rad/s, angles rad), a twist is (vx, vy, wz) of the
 drive's reference point in the body frame. Both are tuples of floats, or of (N,) arrays for N states at once; an
@@ -29,10 +29,10 @@ class Drive(Protocol):
         ...
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
-        """Command that produces a twist; limits are not looked at.
+        """Command that produces a twist, without regard to limits.
 
         Raises:
-            KinematicsError: the family cannot make this twist (the component is named), or NaN.
+            KinematicsError: the family cannot produce this twist (the component is named), or NaN.
         """
         ...
 
@@ -58,7 +58,7 @@ def scaled_to(values: Sequence[Real], limit: float) -> Real:
 
 
 def refuse(name: str, value: Real, scale: Real, why: str) -> None:
-    """Refuse a twist component that a family cannot make.
+    """Refuse a twist component that a family cannot produce.
 
     Raises:
         KinematicsError: |value| above rounding of ``scale``.

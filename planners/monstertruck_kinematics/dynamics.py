@@ -2,7 +2,7 @@
 
 m (dv_y/dt + v_x w) = F_f + F_r,  I_z dw/dt = l_f F_f - l_r F_r,  F = C alpha, alpha_f = d_f - atan((v_y + l_f w)/v_x),
 alpha_r = d_r - atan((v_y - l_r w)/v_x). Singular as v_x -> 0, where tyres roll without slip anyway. No parameters of
-the truck's tyres are published: the defaults are assumptions of the right size.
+the truck's tyres are published: the defaults are assumptions of the right magnitude.
 """
 
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class SingleTrack:
         blend_to: forward speed from which it is dynamic; between them it is mixed smoothly.
 
     Raises:
-        KinematicsError: a field is not above 0, or the blend is the wrong way round.
+        KinematicsError: a field is not above 0, or blend_to is not above blend_from.
     """
 
     geometry: FourWheelSteering = field(default_factory=FourWheelSteering)
@@ -61,7 +61,7 @@ class SingleTrack:
         the tyres are at low speed.
 
         Args:
-            twist: (vx, vy, wz) now.
+            twist: (vx, vy, wz) at the start.
             speed: the drivetrain's, m/s, along the direction of travel; the forward speed follows it without lag.
             front: axle angle, rad.
             rear: axle angle, rad.
@@ -77,8 +77,8 @@ class SingleTrack:
         vx = np.asarray(rolled[0], np.float64)
         fast = np.maximum(np.abs(vx), self.blend_from)
         forward = np.where(vx < 0.0, -fast, fast)
-        now = np.asarray(twist[1], np.float64), np.asarray(twist[2], np.float64)
-        ahead = self._advanced(forward, *now, np.asarray(front, np.float64), np.asarray(rear, np.float64), dt)
+        lateral = np.asarray(twist[1], np.float64), np.asarray(twist[2], np.float64)
+        ahead = self._advanced(forward, *lateral, np.asarray(front, np.float64), np.asarray(rear, np.float64), dt)
         share = np.clip((np.abs(vx) - self.blend_from) / (self.blend_to - self.blend_from), 0.0, 1.0)
         share = share * share * (3.0 - 2.0 * share)
         vy = rolled[1] + share * (ahead[0] - rolled[1])

@@ -1,4 +1,4 @@
-"""Bounded robust least squares in plain numpy, with standard errors: what the identifications share."""
+"""Bounded robust least squares in plain numpy, with standard errors: shared by all identifications."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from monstertruck_kinematics.elementary import Array, KinematicsError
 
 
 @dataclass(frozen=True)
-class Fit:
+class FitResult:
     """Result of a fit.
 
     Attributes:
@@ -44,7 +44,7 @@ def least_squares(
     *,
     huber: float | None = None,
     iterations: int = 200,
-) -> Fit:
+) -> FitResult:
     """Minimise the (Huber-weighted) squares of ``residual`` within bounds: Levenberg-Marquardt with an active set.
 
     Args:
@@ -52,14 +52,14 @@ def least_squares(
         start: (n,) first guess within the bounds.
         lower: (n,) least values, -inf for none; equal bounds hold a parameter fixed.
         upper: (n,) largest values, inf for none.
-        huber: residual from which on a datum counts linearly only; None weighs all alike.
+        huber: residual above which a sample counts linearly; None weighs all alike.
         iterations: at most.
 
     Raises:
         KinematicsError: start outside the bounds, fewer residuals than parameters, or residuals that are not finite.
     """
     point, value, taken = _solve(residual, start, lower, upper, huber, iterations)
-    return Fit(point, _standard_errors(residual, point, lower, upper, value, huber), value, taken)
+    return FitResult(point, _standard_errors(residual, point, lower, upper, value, huber), value, taken)
 
 
 def _solve(
@@ -107,7 +107,9 @@ def _solve(
     return point, value, taken
 
 
-def minimax(residual: Callable[[Array], Array], start: Array, lower: Array, upper: Array, *, rounds: int = 12) -> Fit:
+def minimax(
+    residual: Callable[[Array], Array], start: Array, lower: Array, upper: Array, *, rounds: int = 12
+) -> FitResult:
     """Minimise the largest absolute residual: least squares in ever higher norms (2, 4, ... 2^rounds).
 
     The largest residual found exceeds the true optimum by less than m^(1/2^rounds). Standard errors have no meaning
@@ -129,7 +131,7 @@ def minimax(residual: Callable[[Array], Array], start: Array, lower: Array, uppe
         steps += taken
         if np.abs(residual(sharper)).max() <= height:
             point = sharper
-    return Fit(point, np.full(point.size, np.inf), residual(point), steps)
+    return FitResult(point, np.full(point.size, np.inf), residual(point), steps)
 
 
 def _cost(value: Array, huber: float | None) -> float:

@@ -8,17 +8,17 @@ from typing import Literal
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array, KinematicsError, require_positive
-from monstertruck_kinematics.fitting import Fit, least_squares, minimax
+from monstertruck_kinematics.fitting import FitResult, least_squares, minimax
 from monstertruck_kinematics.motion import integrate, to_body
 from monstertruck_kinematics.unsteered import SkidSteer
 
 MAX_SLIP_RATIO = 1.15
 MAX_ICR = 3.0
-"""Bounds of a believable fit: gain of one side over the other, and turning centres in half tracks."""
+"""Bounds of a plausible fit: gain of one side over the other, and ICRs in half tracks."""
 
 
 @dataclass(frozen=True)
-class Circle:
+class MeasuredCircle:
     """One circle: wheel rates in rad/s, measured radius (m) and speed (m/s) of the robot's centre."""
 
     label: str
@@ -31,17 +31,17 @@ class Circle:
 PUBLISHED_RADIUS = 0.021
 PUBLISHED_HALF_TRACK = 0.0525
 PUBLISHED_CIRCLES = (
-    Circle("2:1, 1.57 rad/s", 0.785, 1.57, 0.21, 0.0273),
-    Circle("2:1, 1.25 rad/s", 0.625, 1.25, 0.21, 0.0223),
-    Circle("2:1, 1.04 rad/s", 0.52, 1.04, 0.21, 0.0181),
-    Circle("3:1, 1.57 rad/s", 1.57 / 3.0, 1.57, 0.155, 0.0245),
-    Circle("3:1, 1.25 rad/s", 1.25 / 3.0, 1.25, 0.155, 0.0187),
-    Circle("3:1, 1.04 rad/s", 1.04 / 3.0, 1.04, 0.155, 0.0166),
-    Circle("left locked, 1.57 rad/s", 0.0, 1.57, 0.055, 0.0188),
+    MeasuredCircle("2:1, 1.57 rad/s", 0.785, 1.57, 0.21, 0.0273),
+    MeasuredCircle("2:1, 1.25 rad/s", 0.625, 1.25, 0.21, 0.0223),
+    MeasuredCircle("2:1, 1.04 rad/s", 0.52, 1.04, 0.21, 0.0181),
+    MeasuredCircle("3:1, 1.57 rad/s", 1.57 / 3.0, 1.57, 0.155, 0.0245),
+    MeasuredCircle("3:1, 1.25 rad/s", 1.25 / 3.0, 1.25, 0.155, 0.0187),
+    MeasuredCircle("3:1, 1.04 rad/s", 1.04 / 3.0, 1.04, 0.155, 0.0166),
+    MeasuredCircle("left locked, 1.57 rad/s", 0.0, 1.57, 0.055, 0.0188),
 )
 """The skid-steer paper's table; the faster side is taken as the right one.
 
-It gives the locked row's deviations without their sign; they are taken upwards, like all the others."""
+It prints the deviations of the locked circle without sign; they are taken as positive, like all others."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,14 @@ def skid_model(
     """One of the models, around a robot's nominal dimensions.
 
     All have a gain (effective over nominal radius). ``symmetric`` adds one effective half track, ``centre of mass`` an
-    offset of the centre (turning centres c - y and -c - y), ``icr`` the two sides' turning centres, ``icr and slip``
+    offset of the centre (ICRs c - y and -c - y), ``icr`` the two sides' ICRs, ``icr and slip``
     also the ratio of the sides' gains.
 
     Args:
         name: of the model.
         radius: nominal wheel radius, m.
         half_track: c, m.
-        bounded: hold the turning centres within 3 c and the slip ratio within 1.15; else only to physical signs.
+        bounded: keep the ICRs within 3 c and the slip ratio within 1.15; else only to physical signs.
         with_icr_x: also fit x_ICR, which circles alone do not show.
 
     Raises:
@@ -136,7 +136,7 @@ class SkidFit:
 
     model: SkidModel
     robot: SkidSteer
-    fit: Fit
+    fit: FitResult
 
     def parameter_table(self) -> list[tuple[str, float, float]]:
         """Name, value and standard error of every parameter."""
@@ -144,7 +144,7 @@ class SkidFit:
         return list(zip(self.model.parameters, values, errors, strict=True))
 
 
-def circle_errors(robot: SkidSteer, circles: Sequence[Circle]) -> Array:
+def circle_errors(robot: SkidSteer, circles: Sequence[MeasuredCircle]) -> Array:
     """(2, n) relative errors of a robot's radius and speed against the measured circles."""
     left, right = (np.array([getattr(c, side) for c in circles]) for side in ("left", "right"))
     vx, vy, wz = robot.forward((left, right))
@@ -156,7 +156,7 @@ def circle_errors(robot: SkidSteer, circles: Sequence[Circle]) -> Array:
 
 
 def fit_circles(
-    circles: Sequence[Circle],
+    circles: Sequence[MeasuredCircle],
     model: SkidModel,
     *,
     objective: Literal["least squares", "minimax"] = "least squares",
@@ -168,7 +168,7 @@ def fit_circles(
         circles: measured circles.
         model: from ``skid_model``.
         objective: sum of squares, or the largest error.
-        radii_only: leave the speeds out (the gain then stays 1).
+        radii_only: ignore the speeds (the gain then stays 1).
 
     Raises:
         KinematicsError: no circles or too few for the model, or a circle driven straight.
@@ -190,7 +190,7 @@ def fit_circles(
     return SkidFit(model, model.build(fit.parameters), fit)
 
 
-def unexplained_spread(circles: Sequence[Circle]) -> float:
+def unexplained_spread(circles: Sequence[MeasuredCircle]) -> float:
     """Relative speed error that every model linear in the wheel rates must leave.
 
     Circles of one ratio differ only in rate, so the model's speed over rate is one number while the measured ones
@@ -213,7 +213,7 @@ def fit_trajectory(
     position_noise: float = 0.005,
     heading_noise: float = 0.01,
 ) -> SkidFit:
-    """Identify a robot from its recorded way: predicted against measured motion over windows of samples.
+    """Identify a robot from a recorded trajectory: predicted against measured motion over windows of samples.
 
     Args:
         times: (N,) s, increasing.
@@ -221,7 +221,7 @@ def fit_trajectory(
         poses: (3, N) measured x, y (m) and heading (rad, continuous or wrapped).
         model: from ``skid_model``.
         window: samples over which motion is predicted; longer windows weigh noise less.
-        huber: residual, in units of the noise, from which on a window counts linearly only; None for plain squares.
+        huber: residual, in units of the noise, above which a window counts linearly; None for plain squares.
         position_noise: expected error of a window's displacement, m.
         heading_noise: of its turn, rad.
 

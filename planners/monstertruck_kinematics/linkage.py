@@ -1,4 +1,4 @@
-"""The steering linkage itself (thesis eqs. 2.2-2.7, corrected and signed), and what its error costs the four wheels.
+"""The steering linkage itself (thesis eqs. 2.2-2.7, corrected and signed), and the steering errors of its wheels.
 
 Servo arm (Pitman) -> drag link -> left wheel's arm -> tie rod -> right wheel's arm. The drag link's far end is taken to
 move only sideways, as the source does; the tie rod is exact. Angles rad, left positive, a positive servo angle steers
@@ -147,9 +147,9 @@ class SteeringLinkage:
 def common_motion(
     geometry: FourWheelSteering, angles: tuple[Real, Real, Real, Real]
 ) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
-    """The motion that four wheels at any angles agree on best, and how far each is off it.
+    """Least-squares planar motion of four wheels at any angles, and the steering error of each.
 
-    Ideal wheels share one turning centre; a linkage's do not. Least squares over the wheels' sideways speeds.
+    Ideal wheels share one ICR; a linkage's do not. Least squares over the wheels' sideways speeds.
 
     Args:
         geometry: wheelbase, track, reference point.

@@ -17,7 +17,7 @@ def to_body(heading: Real, x_rate: Real, y_rate: Real) -> tuple[Real, Real]:
     return c * x_rate + s * y_rate, c * y_rate - s * x_rate
 
 
-def moved_point(vx: Real, vy: Real, wz: Real, x: float, y: float) -> tuple[Real, Real, Real]:
+def twist_at(vx: Real, vy: Real, wz: Real, x: float, y: float) -> tuple[Real, Real, Real]:
     """Twist of the body's point (x, y), m, from the twist of its origin."""
     return vx - wz * y, vy + wz * x, wz
 

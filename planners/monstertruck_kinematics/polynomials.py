@@ -1,8 +1,8 @@
 """Fitted steering polynomials of the truck (thesis eq. 2.8): servo angle, wheel angles and the axle's bicycle angle.
 
 Angles in rad. A positive servo angle turns its axle's wheels to the left, on both axles. Only servo -> left wheel (f)
-and left -> right wheel (g) are used as fitted; the way back is their exact inverse, so a round trip loses nothing.
-The rear axle is the front one mirrored front to back with its servo turned round: both the value and the argument
+and left -> right wheel (g) are used as fitted; the other direction is their exact inverse, so a round trip is exact.
+The rear axle is the front one mirrored front to back with its servo reversed: both the value and the argument
 change sign, delta_LR = -f(-theta_R), delta_RR = -g(-delta_LR).
 """
 
@@ -46,7 +46,7 @@ class AxlePolynomials:
     Args:
         left_from_servo: f, highest power first.
         right_from_left: g, highest power first.
-        servo_limit: largest servo angle either way, rad; beyond it every call is refused.
+        servo_limit: largest servo angle to either side, rad; larger ones raise.
 
     Raises:
         KinematicsError: f or the axle angle is not strictly increasing over the servo's range.
@@ -78,7 +78,7 @@ class AxlePolynomials:
         return polynomial(self.left_from_servo, servo)
 
     def right_of(self, left: Real) -> Real:
-        """Right wheel angle when the left one stands at ``left`` (g)."""
+        """Right wheel angle at the left wheel angle ``left`` (g)."""
         return polynomial(self.right_from_left, left)
 
     def wheels_from_servo(self, servo: Real) -> tuple[Real, Real]:
@@ -87,9 +87,9 @@ class AxlePolynomials:
         return left, self.right_of(left)
 
     def axle_from_left(self, left: Real) -> Real:
-        """Bicycle angle of the axle whose left wheel stands at ``left``.
+        """Bicycle angle of the axle at the left wheel angle ``left``.
 
-        Mean of the two wheels' tangents: what the two no-slip conditions, averaged, ask of the axle's middle. The mean
+        Mean of the two wheels' tangents: the average of both no-slip conditions at the axle's middle. The mean
         of cotangents (eq. 2.35) is the same for ideal wheels near straight and has a pole here, because g(0) is not 0.
         """
         return atan(0.5 * (tan(left) + tan(polynomial(self.right_from_left, left))))
@@ -119,7 +119,7 @@ class AxlePolynomials:
             error = 0.5 * (left_tangent + right_tangent) - target
             slope = 1.0 + left_tangent * left_tangent + (1.0 + right_tangent * right_tangent) * polynomial(dg, left)
             moved = clip(servo - 2.0 * error / (slope * polynomial(df, servo)), -self.servo_limit, self.servo_limit)
-            done = _still(moved, servo)
+            done = _converged(moved, servo)
             servo = moved
             if done:
                 break
@@ -138,16 +138,16 @@ class AxlePolynomials:
             moved = clip(
                 servo - (polynomial(f, servo) - left) / polynomial(df, servo), -self.servo_limit, self.servo_limit
             )
-            done = _still(moved, servo)
+            done = _converged(moved, servo)
             servo = moved
             if done:
                 break
         return servo
 
 
-def _still(now: Real, before: Real) -> bool:
-    """Whether a Newton iterate has settled (the last step, quadratic, left nothing above rounding)."""
-    change = now - before
+def _converged(new: Real, old: Real) -> bool:
+    """Whether Newton's method has converged (quadratic, so the error of the last iterate is below rounding)."""
+    change = new - old
     if isinstance(change, np.ndarray):
         return bool((np.abs(change) < 1e-9).all())
     return abs(change) < 1e-9
@@ -166,7 +166,7 @@ class SteeringPolynomials:
 
         ``corrected``: eq. 2.8 with the cubic term of f at -0.0605. ``as_published``: with the printed -0.00605 (the
         rear axle still properly mirrored: the printed rear lines turn the two rear wheels apart). ``2016``: the
-        robot's quadratics of October 2016, the front one with its sign slip mended (-0.029).
+        robot's quadratics of October 2016, the front one with its sign error corrected (-0.029).
 
         Raises:
             KinematicsError: no such set.

@@ -1,4 +1,4 @@
-"""Basic motion control: moves (radius, length, angle) driven under trapezoidal or cubic speed profiles."""
+"""Basic motion control: moves (radius, length, angle) driven under trapezoidal or cubic motion profiles."""
 
 import math
 from dataclasses import dataclass
@@ -55,16 +55,16 @@ class CubicRamp:
         return self.a0 + t * (2.0 * a1 + t * 3.0 * a2)
 
 
-class SpeedProfile(Protocol):
-    """A way from rest to rest."""
+class MotionProfile(Protocol):
+    """Position and speed over time, from rest to rest."""
 
     @property
     def duration(self) -> float:
-        """Whole time, s."""
+        """Total time, s."""
         ...
 
     def position(self, times: Array) -> Array:
-        """(N,) way done, m (rad for a turn on the spot); its ends hold outside the duration."""
+        """(N,) distance covered, m (rad for a turn on the spot); constant before the start and after the end."""
         ...
 
     def speed(self, times: Array) -> Array:
@@ -74,10 +74,10 @@ class SpeedProfile(Protocol):
 
 @dataclass(frozen=True)
 class TrapezoidalProfile:
-    """Constant acceleration, constant speed, constant braking; a triangle if the way is short.
+    """Constant acceleration, constant speed, constant braking; a triangle if the distance is short.
 
     Args:
-        distance: way, m (or rad), negative for backwards.
+        distance: m (or rad), negative for backwards.
         max_speed: m/s.
         max_acceleration: m/s^2.
 
@@ -101,11 +101,11 @@ class TrapezoidalProfile:
 
     @property
     def duration(self) -> float:
-        """Whole time, s."""
+        """Total time, s."""
         return abs(self.distance) / self.peak + self.peak / self.max_acceleration if self.distance else 0.0
 
     def position(self, times: Array) -> Array:
-        """(N,) way done."""
+        """(N,) distance covered."""
         t = np.clip(times, 0.0, self.duration)
         ramp = self.peak / self.max_acceleration
         left = self.duration - t
@@ -124,10 +124,10 @@ class TrapezoidalProfile:
 class CubicProfile:
     """Cubic ramp up, constant speed, cubic ramp down: no jump of the acceleration.
 
-    A way too short for the full speed is driven with both ramps at a lower one.
+    A distance too short for full speed is driven with both ramps to a lower peak.
 
     Args:
-        distance: way, m (or rad), negative for backwards.
+        distance: m (or rad), negative for backwards.
         max_speed: m/s.
         ramp_time: of either ramp, s; the peak acceleration is 1.5 max_speed / ramp_time.
 
@@ -151,33 +151,33 @@ class CubicProfile:
 
     @property
     def duration(self) -> float:
-        """Whole time, s."""
+        """Total time, s."""
         return abs(self.distance) / self.peak + self.ramp_time if self.distance else 0.0
 
     def position(self, times: Array) -> Array:
-        """(N,) way done."""
+        """(N,) distance covered."""
         t = np.clip(times, 0.0, self.duration)
         left = self.duration - t
         along = self.peak * (t - 0.5 * self.ramp_time)
-        way = np.where(
+        covered = np.where(
             t < self.ramp_time,
-            self._ramp_way(t),
-            np.where(left < self.ramp_time, abs(self.distance) - self._ramp_way(left), along),
+            self._ramp_distance(t),
+            np.where(left < self.ramp_time, abs(self.distance) - self._ramp_distance(left), along),
         )
-        return np.asarray(np.sign(self.distance) * way)
+        return np.asarray(np.sign(self.distance) * covered)
 
     def speed(self, times: Array) -> Array:
         """(N,) speed, with the distance's sign."""
         share = np.clip(np.minimum(times, self.duration - times) / self.ramp_time, 0.0, 1.0)
         return np.asarray(np.sign(self.distance) * self.peak * share**2 * (3.0 - 2.0 * share))
 
-    def _ramp_way(self, t: Array) -> Array:
+    def _ramp_distance(self, t: Array) -> Array:
         share = t / self.ramp_time
         return np.asarray(self.peak * self.ramp_time * share**3 * (1.0 - 0.5 * share))
 
 
 @dataclass(frozen=True)
-class Move:
+class BasicMove:
     """One basic move: an arc of radius R (left positive) and length D turns by phi = D/R.
 
     R = 0 turns on the spot (D = 0, phi given), infinite R goes straight (phi = 0).
@@ -207,17 +207,17 @@ class Move:
             raise KinematicsError(f"angle is {self.angle}: expected 0 for a straight move")
 
     @classmethod
-    def straight(cls, length: float) -> "Move":
+    def straight(cls, length: float) -> "BasicMove":
         """Straight ahead (or back)."""
         return cls(math.inf, length, 0.0)
 
     @classmethod
-    def spot(cls, angle: float) -> "Move":
+    def spot(cls, angle: float) -> "BasicMove":
         """Turn on the spot."""
         return cls(0.0, 0.0, angle)
 
     @classmethod
-    def arc(cls, radius: float, length: float) -> "Move":
+    def arc(cls, radius: float, length: float) -> "BasicMove":
         """Arc of a length; the turn follows.
 
         Raises:
@@ -228,19 +228,19 @@ class Move:
         return cls(radius, length, length / radius)
 
     @property
-    def way(self) -> float:
-        """What a speed profile covers: the length, m, or the angle, rad, of a turn on the spot."""
+    def profile_distance(self) -> float:
+        """What a motion profile covers: the length, m, or the angle, rad, of a turn on the spot."""
         return self.angle if self.radius == 0.0 else self.length
 
     @property
     def direction(self) -> tuple[float, float, float]:
-        """Twist at unit rate of ``way``."""
+        """Twist at unit rate of ``profile_distance``."""
         return (0.0, 0.0, 1.0) if self.radius == 0.0 else (1.0, 0.0, 1.0 / self.radius)
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A move as driven.
+class DrivenMove:
+    """Samples of a driven move.
 
     Attributes:
         times: (N,) s.
@@ -257,30 +257,30 @@ class Motion:
 
 def drive_move(
     drive: Drive,
-    move: Move,
-    profile: SpeedProfile,
+    move: BasicMove,
+    profile: MotionProfile,
     *,
     period: float = 0.02,
     start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> Motion:
-    """Commands and poses of a move under a speed profile, for any drive family.
+) -> DrivenMove:
+    """Commands and poses of a move under a motion profile, for any drive family.
 
-    Steering stands at its angle for the whole move, also at its ends where the speed is 0.
+    The steering angle is constant over the whole move, including its ends where the speed is 0.
 
     Args:
         drive: the robot.
         move: what to drive.
-        profile: over ``move.way``.
+        profile: over ``move.profile_distance``.
         period: between samples, s; the last sample is the move's end.
         start: pose at the beginning.
 
     Raises:
-        KinematicsError: the profile is for another way, the drive cannot make the move, or not within its limits.
+        KinematicsError: the profile has another distance, the drive cannot perform the move, or not within its limits.
     """
     require_positive("period", period)
     ends = profile.position(np.array([profile.duration]))
-    if abs(float(ends[0]) - move.way) > 1e-9 * (1.0 + abs(move.way)):
-        raise KinematicsError(f"profile covers {float(ends[0]):.6g}: expected the move's {move.way:.6g}")
+    if abs(float(ends[0]) - move.profile_distance) > 1e-9 * (1.0 + abs(move.profile_distance)):
+        raise KinematicsError(f"profile covers {float(ends[0]):.6g}: expected the move's {move.profile_distance:.6g}")
     times = np.append(np.arange(0.0, profile.duration, period), profile.duration)
     rates = profile.speed(times)
     once, twice = (np.array(drive.inverse(tuple(k * d for d in move.direction))) for k in (1.0, 2.0))
@@ -291,9 +291,9 @@ def drive_move(
         if np.abs(wanted - allowed).max() > 1e-9 * (1.0 + np.abs(wanted).max()):
             worst = float(wanted[np.abs(wanted).argmax()])
             raise KinematicsError(f"{name} would be {worst:.6g}: the move is beyond the drive's limits")
-    ways = profile.position(times)
-    unit = tuple(d * ways for d in move.direction)
+    distances = profile.position(times)
+    unit = tuple(d * distances for d in move.direction)
     origin = (np.full_like(times, start[0]), np.full_like(times, start[1]), np.full_like(times, start[2]))
     poses = integrate(origin, unit[0], unit[1], unit[2], 1.0)
     twists = np.array(move.direction)[:, None] * rates
-    return Motion(times, commands, twists, np.array(poses))
+    return DrivenMove(times, commands, twists, np.array(poses))

@@ -24,7 +24,7 @@ from monstertruck_kinematics.elementary import (
     tan,
 )
 from monstertruck_kinematics.motion import to_world
-from monstertruck_kinematics.truck import STEEPEST, FourWheelSteering
+from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, FourWheelSteering
 from monstertruck_kinematics.wheels import FixedWheel, SteeredWheel, Wheel
 
 
@@ -58,7 +58,7 @@ class Bicycle:
         require_positive("radius", self.radius)
         if self.driven not in ("front", "rear"):
             raise KinematicsError(f"driven is {self.driven!r}: expected front or rear")
-        require_limit("max_steer", self.max_steer, math.pi / 2.0 if self.driven == "front" else STEEPEST)
+        require_limit("max_steer", self.max_steer, math.pi / 2.0 if self.driven == "front" else MAX_AXLE_ANGLE)
         require_limit("max_speed", self.max_speed)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
@@ -66,7 +66,7 @@ class Bicycle:
         speed, steer = unpacked(command, self.inputs)
         if self.driven == "front":
             return speed * cos(steer), 0.0 * speed, speed * sin(steer) / self.wheelbase
-        require_within("steer", steer, -STEEPEST, STEEPEST)
+        require_within("steer", steer, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         return speed + 0.0 * steer, 0.0 * speed, speed * tan(steer) / self.wheelbase
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
@@ -78,7 +78,7 @@ class Bicycle:
         steer = atan2(aside, abs(vx))
         if self.driven == "front":
             return facing * hypot(vx, aside), steer
-        require_within("steer that vx, wz need", steer, -STEEPEST, STEEPEST)
+        require_within("steer that vx, wz need", steer, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         return vx, steer
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
@@ -169,7 +169,7 @@ class Ackermann:
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
-        require_limit("max_steer", self.max_steer, STEEPEST)
+        require_limit("max_steer", self.max_steer, MAX_AXLE_ANGLE)
         require_limit("max_speed", self.max_speed)
         _ = self.geometry
 
@@ -200,7 +200,7 @@ class Ackermann:
         return Bicycle(self.wheelbase).jacobian(command)
 
     def front_angles(self, steer: Real) -> tuple[Real, Real]:
-        """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R tells which is inner."""
+        """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R says which is inner."""
         left, right, _, _ = self.geometry.wheel_angles(steer, 0.0 * steer)
         return left, right
 
@@ -217,7 +217,7 @@ class Ackermann:
         return atan2(0.5 * (tan_l / (1.0 + half * tan_l) + tan_r / (1.0 - half * tan_r)), 1.0 + 0.0 * tan_l)
 
     def defect(self, left: Real, right: Real) -> Real:
-        """How far two front wheels are from Ackermann's condition cot d_r - cot d_l = w/L (2.12): 0 if ideal.
+        """Violation of Ackermann's condition by two front wheels, cot d_r - cot d_l = w/L (2.12): 0 if ideal.
 
         Multiplied out, tan d_l - tan d_r - (w/L) tan d_l tan d_r, so that straight ahead is no special case.
         """
@@ -263,7 +263,7 @@ class FourWheelSteer:
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
-        require_limit("max_steer", self.max_steer, STEEPEST)
+        require_limit("max_steer", self.max_steer, MAX_AXLE_ANGLE)
         require_limit("max_speed", self.max_speed)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
@@ -272,7 +272,7 @@ class FourWheelSteer:
         return self.geometry.body_twist(speed, front, rear)
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
-        """(speed, front, rear) through the common turning centre."""
+        """(speed, front, rear) through the common ICR."""
         vx, vy, wz = unpacked(twist, TWIST)
         return self.geometry.steer_for_twist(vx, vy, wz)
 
@@ -305,7 +305,7 @@ class FourWheelSteer:
         return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
-        """The four wheels at their angles through the common turning centre."""
+        """The four wheels at their angles through the common ICR."""
         _, front, rear = unpacked(command, self.inputs)
         angles = self.geometry.wheel_angles(front, rear)
         return tuple(
@@ -319,7 +319,7 @@ class IndependentSteer:
     """Every wheel steered and driven alone: any twist, turning on the spot (R = 0) included.
 
     The command is all steering angles, then all wheel speeds (m/s). Angles stay within +-90 deg, a wheel that would
-    have to look back rolls backwards instead. Forward takes the least-squares twist if the wheels contradict.
+    have to turn further rolls backwards instead. Forward takes the least-squares twist of inconsistent wheels.
 
     Args:
         positions: (x, y) of the wheels, m; at least two at different places.
@@ -361,7 +361,7 @@ class IndependentSteer:
         return total[0], total[1], total[2]
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
-        """Angle and speed of every wheel; a wheel that stands (at the turning centre) keeps angle 0."""
+        """Angle and speed of every wheel; a wheel at the ICR (speed 0) keeps angle 0."""
         vx, vy, wz = unpacked(twist, TWIST)
         angles: list[Real] = []
         speeds: list[Real] = []
@@ -408,12 +408,12 @@ class IndependentSteer:
 class Synchro:
     """Synchro drive; its posture is (x, y, direction of the wheels), its twist is in the wheels' own frame.
 
-    In those terms it moves like a unicycle: xdot = v cos th, ydot = v sin th, thdot = omega. ``platform_twist`` tells
-    what the platform, which never turns, does.
+    In those terms it moves like a unicycle: xdot = v cos th, ydot = v sin th, thdot = omega. ``platform_twist`` is
+    the motion of the platform, which never turns.
 
     Args:
         wheel_radius: m.
-        circle: radius of the circle (an equilateral triangle) on which the three wheels stand, m.
+        circle: radius of the circle (an equilateral triangle) that carries the three wheels, m.
         max_rate: of the wheels, rad/s.
         max_turn: of the wheels' direction, rad/s.
 

@@ -34,9 +34,9 @@ from monstertruck_kinematics.elementary import (
 )
 from monstertruck_kinematics.motion import integrate
 
-Mode = Literal["front", "rear", "counter", "crab", "spot"]
+SteeringModeName = Literal["front", "rear", "counter", "crab", "spot"]
 
-STEEPEST = math.radians(89.0)
+MAX_AXLE_ANGLE = math.radians(89.0)
 """Largest axle angle that the bicycle form accepts (tangents stay meaningful)."""
 
 
@@ -68,11 +68,11 @@ class DriveTrain:
         return speed * (self.ratio / self.wheel_radius)
 
     def distance(self, motor_angle: Real) -> Real:
-        """Way rolled, m, for a motor angle in rad."""
+        """Distance rolled, m, for a motor angle in rad."""
         return motor_angle * (self.wheel_radius / self.ratio)
 
     def motor_angle(self, distance: Real) -> Real:
-        """Motor angle, rad, for a way rolled in m."""
+        """Motor angle, rad, for a distance rolled in m."""
         return distance * (self.ratio / self.wheel_radius)
 
 
@@ -116,8 +116,8 @@ class FourWheelSteering:
         return ((self.l_f, half), (self.l_f, -half), (-self.l_r, half), (-self.l_r, -half))
 
     def _tangents(self, front: Real, rear: Real) -> tuple[Real, Real]:
-        require_within("front", front, -STEEPEST, STEEPEST)
-        require_within("rear", rear, -STEEPEST, STEEPEST)
+        require_within("front", front, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
+        require_within("rear", rear, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         return tan(front), tan(rear)
 
     def tan_sideslip(self, tan_f: Real, tan_r: Real) -> Real:
@@ -155,7 +155,7 @@ class FourWheelSteering:
     def steer_for(self, curvature: Real, sideslip: Real) -> tuple[Real, Real]:
         """Axle angles (front, rear) for a path curvature (1/m) and sideslip at C: exact inverse of 2.34 and 2.38."""
         require_finite("curvature", curvature)
-        require_within("sideslip", sideslip, -STEEPEST, STEEPEST)
+        require_within("sideslip", sideslip, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         tan_b = tan(sideslip)
         turn = curvature / cos(sideslip)
         return atan(tan_b + self.l_f * turn), atan(tan_b - self.l_r * turn)
@@ -208,11 +208,11 @@ class FourWheelSteering:
         )
 
     def drive_speed(self, speed: Real, front: Real, rear: Real) -> Real:
-        """Ground speed, m/s, that the one motor sees at the wheels when C travels at ``speed``.
+        """Ground speed, m/s, that the motor has at the wheels when C travels at ``speed``.
 
         Each open differential turns with the mean of its two wheels, which the truck's nearly parallel linkage makes
         the speed of the axle's middle along its wheels; the rigid transfer case turns with the mean of both axles.
-        Proportional to ``speed``: divide by ``drive_speed(1.0, front, rear)`` for the way back.
+        Proportional to ``speed``: divide by ``drive_speed(1.0, front, rear)`` for the inverse.
         """
         require_finite("speed", speed)
         tan_f, tan_r = self._tangents(front, rear)
@@ -242,8 +242,8 @@ class FourWheelSteering:
             KinematicsError: a limit outside 0 to 89 deg.
         """
         far = limit if rear_limit is None else rear_limit
-        require_within("limit", limit, 0.0, STEEPEST)
-        require_within("rear_limit", far, 0.0, STEEPEST)
+        require_within("limit", limit, 0.0, MAX_AXLE_ANGLE)
+        require_within("rear_limit", far, 0.0, MAX_AXLE_ANGLE)
         tightest = self.curvature(limit, -far)
         curvature = clip(self.curvature(front, rear), -tightest, tightest)
         # tan(beta) + l_f kappa/cos(beta) = +-tan(limit) solved for beta, likewise at the rear.
@@ -254,10 +254,10 @@ class FourWheelSteering:
         wanted_f, wanted_r = self.steer_for(curvature, clip(self.sideslip(front, rear), low, high))
         return clip(wanted_f, -limit, limit), clip(wanted_r, -far, far)
 
-    def minimum_radius(self, mode: Mode, limit: float, *, every_wheel: bool = False) -> float:
+    def minimum_radius(self, mode: SteeringModeName, limit: float, *, every_wheel: bool = False) -> float:
         """Least turning radius R (m): lateral distance of the ICR from the body's middle line (eq. 2.37).
 
-        Front and rear steering turn about a point beside the straight axle, counter steering beside the centre.
+        The ICR of front and rear steering is on the line of the straight axle, that of counter steering on the centre's.
 
         Args:
             mode: steering mode; crab never turns (infinite), spot needs wheels steered one by one (0).
@@ -267,7 +267,7 @@ class FourWheelSteering:
         Raises:
             KinematicsError: unknown mode, or a limit outside 0 to 89 deg.
         """
-        require_within("limit", limit, 0.0, STEEPEST)
+        require_within("limit", limit, 0.0, MAX_AXLE_ANGLE)
         if mode not in ("front", "rear", "counter", "crab", "spot"):
             raise KinematicsError(f"mode {mode!r}: expected front, rear, counter, crab or spot")
         if mode == "spot":

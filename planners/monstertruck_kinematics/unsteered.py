@@ -88,16 +88,16 @@ class SkidSteer:
 
     Args:
         radius: of the wheels, m.
-        icr_left: lateral position y_L of the left side's centre in the reference point's frame, m (ideal: c).
+        icr_left: lateral position y_L of the left side's ICR in the reference point's frame, m (ideal: c).
         icr_right: y_R of the right side's (ideal: -c).
-        icr_x: longitudinal position x_ICR of the turning centre, m.
+        icr_x: longitudinal position x_ICR of the ICRs, m.
         gain_left: effective over nominal radius, slip included, of the left side.
         gain_right: of the right side.
         max_rate: of a wheel, rad/s.
         length: between front and rear wheels, m; only ``wheels`` uses it.
 
     Raises:
-        KinematicsError: a length or gain not above 0, or the centres the wrong way round.
+        KinematicsError: a length or gain not above 0, or icr_left not left of icr_right.
     """
 
     radius: float

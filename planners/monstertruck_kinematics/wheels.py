@@ -1,6 +1,6 @@
 """Wheels as linear constraints on the body's velocity (vx, vy, wz), and the mobility of any set of them.
 
-Every wheel stands at (x, y) in the body frame and rolls along ``heading`` (rad from the body's x axis). In polar form
+Every wheel is at (x, y) in the body frame and rolls along ``heading`` (rad from the body's x axis). In polar form
 (l, alpha; plane angle beta) that is heading = alpha + beta - pi/2, and the rows below become the textbook's
 [sin(alpha+beta), -cos(alpha+beta), -l cos beta] (rolling) and [cos(alpha+beta), sin(alpha+beta), l sin beta] (no slip).
 """
@@ -53,7 +53,7 @@ class Wheel:
 
     @property
     def rolling_gain(self) -> float:
-        """Metres per radian of the wheel's own turning in its rolling row."""
+        """Metres per radian of wheel rotation in its rolling row."""
         return self.radius
 
     @property
@@ -69,7 +69,7 @@ class FixedWheel(Wheel):
 
 @dataclass(frozen=True)
 class SteeredWheel(Wheel):
-    """Centred orientable wheel, at present along ``heading``.
+    """Centred orientable wheel, currently along ``heading``.
 
     Args:
         group: wheels of one group are turned by one motor and stay parallel (a synchro drive's belt); None is alone.
@@ -126,7 +126,7 @@ class SwedishWheel(Wheel):
 
     @property
     def rolling_row(self) -> Array:
-        """Row along the direction in which the rollers do not give way."""
+        """Row along the direction in which the rollers do not roll."""
         return self.row(self.heading + self.roller)
 
     @property
@@ -136,7 +136,7 @@ class SwedishWheel(Wheel):
 
     @property
     def sliding_row(self) -> Array | None:
-        """None: the rollers give way."""
+        """None: the rollers allow sideways motion."""
         return None
 
 
@@ -174,14 +174,14 @@ IcrKind = Literal["none", "point", "infinite", "line", "anywhere"]
 
 @dataclass(frozen=True)
 class Mobility:
-    """What a set of wheels can do at its present steering angles.
+    """Mobility of a set of wheels at its current steering angles.
 
     Attributes:
         mobility: delta_m = 3 - rank C*: velocities free at once.
         steerability: delta_s: further freedoms that steering opens.
-        icr_kind: none (cannot move), point (one turning centre), infinite (straight motion only), line (anywhere on
+        icr_kind: none (cannot move), point (one ICR), infinite (straight motion only), line (anywhere on
             a line) or anywhere.
-        icr: the turning centre (x, y), m, if it is one point.
+        icr: (x, y), m, if it is one point.
         icr_line: a point of the line and its unit direction, if the centres form a line.
         non_holonomic: fewer free velocities than reachable posture dimensions. A synchro drive counts as non-holonomic
             (one velocity, two dimensions), although its point can go anywhere.
@@ -206,7 +206,7 @@ class Mobility:
 
 
 def analyse(wheels: Sequence[Wheel], tolerance: float = RANK_TOLERANCE) -> Mobility:
-    """Mobility of the wheels at their present headings.
+    """Mobility of the wheels at their current headings.
 
     Lengths are scaled by the robot's size about its middle, so neither the unit nor the frame's origin matters.
     Steering alone can align every single centred wheel with any body velocity that the fixed wheels allow, so the
@@ -255,7 +255,7 @@ def analyse(wheels: Sequence[Wheel], tolerance: float = RANK_TOLERANCE) -> Mobil
 
 
 def _frame(wheels: Sequence[Wheel]) -> tuple[Array, float]:
-    """Middle of the wheels and the largest distance from it (1 if all stand at one place)."""
+    """Mean position of the wheels and the largest distance from it (1 if all are at one place)."""
     places = np.array([[wheel.x, wheel.y] for wheel in wheels])
     middle = places.mean(axis=0)
     size = float(np.hypot(*(places - middle).T).max())
@@ -263,7 +263,7 @@ def _frame(wheels: Sequence[Wheel]) -> tuple[Array, float]:
 
 
 def _scaled(rows: Array, middle: Array, size: float) -> Array:
-    """Rows about the middle with the turning column made dimensionless."""
+    """Rows about the middle with a dimensionless yaw column."""
     arms = rows[:, 2] - (rows[:, 1] * middle[0] - rows[:, 0] * middle[1])
     return np.column_stack([rows[:, :2], arms / size])
 
@@ -278,7 +278,7 @@ def _null_space(rows: Array, tolerance: float) -> Array:
 
 
 def _turns_parallel(wheels: Sequence[Wheel]) -> bool:
-    """Whether some group of parallel steered wheels stands at more than one place."""
+    """Whether some group of parallel steered wheels has wheels at more than one place."""
     places: dict[str, set[tuple[float, float]]] = {}
     for wheel in wheels:
         if isinstance(wheel, SteeredWheel) and wheel.group is not None:

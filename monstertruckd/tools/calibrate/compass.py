@@ -14,7 +14,7 @@ import numpy as np
 from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.fitting import Fit, least_squares
+from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import COMPASS, Estimate, Result
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
@@ -169,7 +169,7 @@ def result_of(circle: FieldCircle) -> Result:
     )
 
 
-def fit_ellipse(circle: FieldCircle) -> Fit:
+def fit_ellipse(circle: FieldCircle) -> FitResult:
     """Least squares of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
 
     ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is what the motor's
@@ -198,7 +198,7 @@ def _iron(parameters: Array) -> tuple[float, ...]:
     return x, y, w * math.exp(u), v, w * math.exp(-u)
 
 
-def _iron_errors(fit: Fit) -> Array:
+def _iron_errors(fit: FitResult) -> Array:
     """Standard errors in the order of ``_NAMES``, by the slopes of ``_iron`` (those of u and v hardly correlate)."""
     point, errors = fit.parameters[:4], fit.standard_errors[:4]
     step = 1e-6

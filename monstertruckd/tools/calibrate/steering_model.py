@@ -15,7 +15,7 @@ import numpy as np
 
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.fitting import Fit, least_squares
+from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_kinematics.polynomials import AxlePolynomials
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.truck import TruckConfig
@@ -152,7 +152,7 @@ class SteeringModel:
         """Way rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
-    def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = GAIN) -> Fit:
+    def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = GAIN) -> FitResult:
         """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
 
         Args:
@@ -196,7 +196,7 @@ class SteeringModel:
         return float(linkage.servo_from_axle(angles[axle])), float(maps.servo(axle, leg.pulses[axle]).mean())
 
 
-def half_widths(fit: Fit, priors: int = 3) -> Array:
+def half_widths(fit: FitResult, priors: int = 3) -> Array:
     """Half the 95 % intervals of the parameters.
 
     The errors of a leg are known beforehand; where the legs disagree by more, their spread counts.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from monstertruck_kinematics.identification import SkidModel
-    from monstertruck_kinematics.truck import Mode
+    from monstertruck_kinematics.truck import SteeringModeName
     from monstertruck_kinematics.wheels import Wheel
 
 app = command_group("Kinematics of the truck and of every wheeled-robot family.")
@@ -182,7 +182,7 @@ def radius_table_command(
     """Least turning radius by steering mode and steering limit."""
     from monstertruck_kinematics.truck import FourWheelSteering
 
-    modes: tuple[Mode, ...] = ("front", "rear", "counter", "crab", "spot")
+    modes: tuple[SteeringModeName, ...] = ("front", "rear", "counter", "crab", "spot")
     degrees = limits or [22.5, math.degrees(0.4), 25.0]
     with refusals():
         geometry = FourWheelSteering(wheelbase, track)
@@ -207,7 +207,7 @@ def radius_table_command(
         )
     if png:
         angles = [5.0 + 0.25 * i for i in range(141)]
-        steered: tuple[Mode, ...] = ("front", "counter")
+        steered: tuple[SteeringModeName, ...] = ("front", "counter")
         with figure(png, "steering limit, deg", "least turning radius, m") as axes:
             for mode in steered:
                 radii = [geometry.minimum_radius(mode, math.radians(a)) for a in angles]

@@ -21,7 +21,7 @@ from monstertruck_kinematics.chassis import (
     truck_chassis,
 )
 from monstertruck_kinematics.elementary import KinematicsError
-from monstertruck_kinematics.truck import STEEPEST, DriveTrain
+from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, DriveTrain
 
 DRIVETRAIN = DriveTrain()
 SKID = {"icr_left": 0.2, "icr_right": -0.21, "icr_x": -0.03, "gain_left": 0.98, "gain_right": 0.9}
@@ -55,7 +55,7 @@ def test_shafts_move_the_base_as_the_bicycle_and_tell_it_again(chassis):
         assert chassis.refusal(front, rear) is None
         shafts = chassis.shaft_speeds(speed, front, rear)
         assert len(shafts) == len(chassis.shafts)
-        twist = chassis.twist(chassis.pace(shafts, front, rear), front, rear)
+        twist = chassis.twist(chassis.input_speeds(shafts, front, rear), front, rear)
         assert twist == pytest.approx(chassis.bicycle.body_twist(speed, front, rear), abs=1e-12)
 
 
@@ -65,7 +65,7 @@ def test_travel_is_the_fastest_wheel_with_the_sign_of_the_way(chassis):
     share = {"skid-steer": 1 / 0.9, "omni": math.cos(math.pi / 6)}
     assert fastest == pytest.approx(0.2 * next((share[n] for n in share if BODIES[n] is chassis), 1.0))
     for speed in (0.2, -0.2):
-        travel = chassis.travel(chassis.shaft_speeds(speed, 0.0, 0.0))
+        travel = chassis.fastest_wheel_speed(chassis.shaft_speeds(speed, 0.0, 0.0))
         assert travel == pytest.approx(math.copysign(fastest, speed))
 
 
@@ -122,9 +122,9 @@ def test_what_a_body_cannot_do_is_refused_with_the_reason(body, front, rear, why
 def test_only_steered_axles_limit_the_reach():
     ackermann = BODIES["ackermann"]
     stiff = replace(ackermann.linkage, rear=replace(ackermann.linkage.rear, servo_limit=0.1))
-    assert replace(ackermann, linkage=stiff).reach == ackermann.reach
-    assert replace(BODIES["truck"], linkage=stiff).reach < 0.1
-    assert BODIES["mecanum"].reach == STEEPEST
+    assert replace(ackermann, linkage=stiff).max_axle_angle == ackermann.max_axle_angle
+    assert replace(BODIES["truck"], linkage=stiff).max_axle_angle < 0.1
+    assert BODIES["mecanum"].max_axle_angle == MAX_AXLE_ANGLE
 
 
 @pytest.mark.parametrize(

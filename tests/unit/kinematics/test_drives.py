@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.elementary import KinematicsError
-from monstertruck_kinematics.motion import integrate, integration_jacobians, moved_point, to_body, to_world
+from monstertruck_kinematics.motion import integrate, integration_jacobians, to_body, to_world, twist_at
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, SwedishDrive, mecanum, omni
@@ -347,4 +347,4 @@ def test_integration_jacobians_are_derivatives(rng, scale):
 def test_frames_are_inverse_and_points_move_with_the_body():
     assert to_body(0.7, *to_world(0.7, 0.3, -0.4)) == pytest.approx((0.3, -0.4))
     assert to_world(math.pi / 2, 1.0, 0.0) == pytest.approx((0.0, 1.0))
-    assert moved_point(0.0, 0.0, 2.0, 0.5, 0.25) == pytest.approx((-0.5, 1.0, 2.0))
+    assert twist_at(0.0, 0.0, 2.0, 0.5, 0.25) == pytest.approx((-0.5, 1.0, 2.0))

@@ -7,7 +7,7 @@ import pytest
 
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
-from monstertruck_kinematics.motion import moved_point
+from monstertruck_kinematics.motion import twist_at
 from monstertruck_kinematics.polynomials import (
     F_CORRECTED,
     F_PRINTED,
@@ -241,14 +241,14 @@ ROBOT = SkidSteer(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK - 0.01, -PUBLISHED_HALF
 def test_k5_turning_centre_has_both_signs_turned():
     vx, vy, wz = ROBOT.forward((0.5, 1.5))
     d_cx, d_cy = vy / wz, -vx / wz  # eq. 4: vx/(-d_Cy) = vy/d_Cx = omega
-    assert moved_point(vx, vy, wz, -d_cx, -d_cy) == pytest.approx((0.0, 0.0, wz))
-    assert moved_point(vx, vy, wz, -d_cx, d_cy)[0] == pytest.approx(2.0 * vx)  # as printed, +d_Cy
+    assert twist_at(vx, vy, wz, -d_cx, -d_cy) == pytest.approx((0.0, 0.0, wz))
+    assert twist_at(vx, vy, wz, -d_cx, d_cy)[0] == pytest.approx(2.0 * vx)  # as printed, +d_Cy
 
 
 def test_k8_front_and_back_are_exchanged_in_print():
     vx, vy, wz = ROBOT.forward((0.5, 1.5))
     a = b = 0.0305
-    front, back = moved_point(vx, vy, wz, b, 0.0)[1], moved_point(vx, vy, wz, -a, 0.0)[1]
+    front, back = twist_at(vx, vy, wz, b, 0.0)[1], twist_at(vx, vy, wz, -a, 0.0)[1]
     assert front == pytest.approx((b - ROBOT.icr_x) * wz)
     assert back == pytest.approx((-a - ROBOT.icr_x) * wz)
     assert front != pytest.approx((-a - ROBOT.icr_x) * wz, rel=0.1)
@@ -261,8 +261,8 @@ def test_k9_needs_the_velocity_vector():
     matrix = np.array([[1, -c], [1, c], [0, b - x_icr], [0, -a - x_icr]])
     left, right, front, back = matrix @ [vx, wz]
     assert (left, right) == pytest.approx((0.5 * robot.radius, 1.5 * robot.radius))
-    assert front == pytest.approx(moved_point(vx, vy, wz, b, 0.0)[1])
-    assert back == pytest.approx(moved_point(vx, vy, wz, -a, 0.0)[1])
+    assert front == pytest.approx(twist_at(vx, vy, wz, b, 0.0)[1])
+    assert back == pytest.approx(twist_at(vx, vy, wz, -a, 0.0)[1])
 
 
 def test_k_table_deviations_recomputed():

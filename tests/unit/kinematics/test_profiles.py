@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.elementary import KinematicsError
-from monstertruck_kinematics.profiles import CubicProfile, CubicRamp, Move, TrapezoidalProfile, drive_move
+from monstertruck_kinematics.profiles import BasicMove, CubicProfile, CubicRamp, TrapezoidalProfile, drive_move
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
-ARCS = (Move.arc(1.0, 0.8), Move.arc(-1.0, -0.5), Move.straight(0.6))
+ARCS = (BasicMove.arc(1.0, 0.8), BasicMove.arc(-1.0, -0.5), BasicMove.straight(0.6))
 ROBOTS = {
-    "differential": (Differential(), (*ARCS, Move.spot(1.0))),
-    "tricycle": (Tricycle(max_steer=math.pi / 2), (*ARCS, Move.spot(-1.0))),
+    "differential": (Differential(), (*ARCS, BasicMove.spot(1.0))),
+    "tricycle": (Tricycle(max_steer=math.pi / 2), (*ARCS, BasicMove.spot(-1.0))),
     "bicycle": (Bicycle(), ARCS),
     "ackermann": (Ackermann(), ARCS),
     "four-wheel steer": (FourWheelSteer(), ARCS),
-    "independent": (IndependentSteer(), (*ARCS, Move.spot(1.0), Move.arc(0.05, 0.3))),
-    "synchro": (Synchro(), (*ARCS, Move.spot(1.0))),
-    "omni": (omni(), (*ARCS, Move.spot(1.0))),
-    "mecanum": (mecanum(), (*ARCS, Move.spot(1.0))),
-    "skid steer": (SkidSteer(0.02, 0.07, -0.06), (*ARCS, Move.spot(1.0))),
+    "independent": (IndependentSteer(), (*ARCS, BasicMove.spot(1.0), BasicMove.arc(0.05, 0.3))),
+    "synchro": (Synchro(), (*ARCS, BasicMove.spot(1.0))),
+    "omni": (omni(), (*ARCS, BasicMove.spot(1.0))),
+    "mecanum": (mecanum(), (*ARCS, BasicMove.spot(1.0))),
+    "skid steer": (SkidSteer(0.02, 0.07, -0.06), (*ARCS, BasicMove.spot(1.0))),
 }
 
 
@@ -31,7 +31,9 @@ def test_every_family_drives_its_moves(name, profile):
     drive, moves = ROBOTS[name]
     for move in moves:
         speeds = (
-            TrapezoidalProfile(move.way, 0.2, 0.4) if profile == "trapezoidal" else CubicProfile(move.way, 0.2, 0.5)
+            TrapezoidalProfile(move.profile_distance, 0.2, 0.4)
+            if profile == "trapezoidal"
+            else CubicProfile(move.profile_distance, 0.2, 0.5)
         )
         motion = drive_move(drive, move, speeds, start=(1.0, 2.0, 0.5))
         np.testing.assert_allclose(drive.forward(tuple(motion.commands)), motion.twists, atol=1e-12)
@@ -83,23 +85,23 @@ def test_ramp_as_published():
 def test_moves_beyond_the_robot_are_refused():
     profile = TrapezoidalProfile(0.5, 0.2, 0.4)
     with pytest.raises(KinematicsError, match="beyond the drive's limits"):
-        drive_move(FourWheelSteer(), Move.arc(0.2, 0.5), profile)
+        drive_move(FourWheelSteer(), BasicMove.arc(0.2, 0.5), profile)
     with pytest.raises(KinematicsError, match=r"speed would be 0\.2"):
-        drive_move(FourWheelSteer(max_speed=0.1), Move.straight(0.5), profile)
+        drive_move(FourWheelSteer(max_speed=0.1), BasicMove.straight(0.5), profile)
     with pytest.raises(KinematicsError, match="vx is 0"):
-        drive_move(FourWheelSteer(), Move.spot(0.5), profile)
+        drive_move(FourWheelSteer(), BasicMove.spot(0.5), profile)
     with pytest.raises(KinematicsError, match=r"profile covers 0\.5: expected the move's 0\.6"):
-        drive_move(Differential(), Move.straight(0.6), profile)
+        drive_move(Differential(), BasicMove.straight(0.6), profile)
 
 
 def test_bad_moves_and_profiles_are_named():
     for call, text in (
-        (lambda: Move(1.0, 2.0, 1.0), "length is 2"),
-        (lambda: Move(0.0, 1.0, 1.0), "length is 1"),
-        (lambda: Move(math.inf, 1.0, 0.1), "angle is 0.1"),
-        (lambda: Move(math.nan, 1.0, 0.1), "radius is nan"),
-        (lambda: Move.arc(0.0, 1.0), "radius is 0"),
-        (lambda: Move.straight(math.nan), "length is nan"),
+        (lambda: BasicMove(1.0, 2.0, 1.0), "length is 2"),
+        (lambda: BasicMove(0.0, 1.0, 1.0), "length is 1"),
+        (lambda: BasicMove(math.inf, 1.0, 0.1), "angle is 0.1"),
+        (lambda: BasicMove(math.nan, 1.0, 0.1), "radius is nan"),
+        (lambda: BasicMove.arc(0.0, 1.0), "radius is 0"),
+        (lambda: BasicMove.straight(math.nan), "length is nan"),
         (lambda: TrapezoidalProfile(1.0, 0.0, 1.0), "max_speed"),
         (lambda: TrapezoidalProfile(math.nan, 1.0, 1.0), "distance"),
         (lambda: CubicProfile(1.0, 1.0, -1.0), "ramp_time"),

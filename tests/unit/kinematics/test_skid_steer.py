@@ -13,14 +13,14 @@ from monstertruck_kinematics.identification import (
     PUBLISHED_CIRCLES,
     PUBLISHED_HALF_TRACK,
     PUBLISHED_RADIUS,
-    Circle,
+    MeasuredCircle,
     circle_errors,
     fit_circles,
     fit_trajectory,
     skid_model,
     unexplained_spread,
 )
-from monstertruck_kinematics.motion import integrate, moved_point
+from monstertruck_kinematics.motion import integrate, twist_at
 from monstertruck_kinematics.unsteered import SkidSteer
 
 IDEAL = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)
@@ -46,7 +46,7 @@ def test_offset_centre_is_the_same_robot_seen_elsewhere(rng):
     command = tuple(rng.uniform(-2.0, 2.0, 2).tolist())
     x, y = 0.01, -0.02
     seen = SkidSteer(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK - y, -PUBLISHED_HALF_TRACK - y, -x).forward(command)
-    assert seen == pytest.approx(moved_point(*IDEAL.forward(command), x, y))
+    assert seen == pytest.approx(twist_at(*IDEAL.forward(command), x, y))
     faster = replace(IDEAL, gain_left=1.1, gain_right=1.1)
     assert faster.forward(command) == pytest.approx(tuple(1.1 * v for v in IDEAL.forward(command)))
 
@@ -54,7 +54,7 @@ def test_offset_centre_is_the_same_robot_seen_elsewhere(rng):
 def test_slip_of_front_and_rear_wheels():
     robot = SkidSteer(0.021, 0.06, -0.06, icr_x=0.01)
     twist = robot.forward((1.0, 2.0))
-    slip = moved_point(*twist, 0.03, 0.0)[1], moved_point(*twist, -0.03, 0.0)[1]
+    slip = twist_at(*twist, 0.03, 0.0)[1], twist_at(*twist, -0.03, 0.0)[1]
     assert slip == pytest.approx(((0.03 - 0.01) * twist[2], (-0.03 - 0.01) * twist[2]))
     with pytest.raises(KinematicsError, match=r"vy is 0\.1"):
         robot.inverse((0.1, 0.1, 0.0))
@@ -165,7 +165,7 @@ def test_bad_identification_input_is_named(rng):
         (lambda: fit_trajectory(times, rates, nan, symmetric), "finite"),
         (lambda: fit_trajectory(times, rates, poses, symmetric, window=400), "window is 400"),
         (lambda: fit_circles([], symmetric), "circles is empty"),
-        (lambda: fit_circles([Circle("line", 1.0, 1.0, 1.0, 1.0)], symmetric), "circle line"),
+        (lambda: fit_circles([MeasuredCircle("line", 1.0, 1.0, 1.0, 1.0)], symmetric), "circle line"),
         (lambda: fit_circles(PUBLISHED_CIRCLES[:1], model("icr and slip")), "2 residuals"),
         (lambda: model("rubber"), "rubber"),
         (lambda: skid_model("icr", -0.1, 0.1), "radius"),
