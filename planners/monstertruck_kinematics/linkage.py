@@ -1,4 +1,4 @@
-"""The steering linkage itself (thesis eqs. 2.2-2.7, corrected and signed), and the steering errors of its wheels.
+"""The steering linkage (thesis eqs. 2.2-2.7, corrected and signed) and the steering errors of wheels that it moves.
 
 Servo arm (Pitman) -> drag link -> left wheel's arm -> tie rod -> right wheel's arm. The drag link's far end is taken to
 move only sideways, as the source does; the tie rod is exact. Angles rad, left positive, a positive servo angle steers

@@ -257,7 +257,7 @@ class FourWheelSteering:
     def minimum_radius(self, mode: SteeringModeName, limit: float, *, every_wheel: bool = False) -> float:
         """Least turning radius R (m): lateral distance of the ICR from the body's middle line (eq. 2.37).
 
-        The ICR of front and rear steering is on the line of the straight axle, that of counter steering on the centre's.
+        Front and rear steering have their ICR on the straight axle's line, counter steering on the line of the centre.
 
         Args:
             mode: steering mode; crab never turns (infinite), spot needs wheels steered one by one (0).
