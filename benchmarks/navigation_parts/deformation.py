@@ -11,10 +11,10 @@ import time
 
 import numpy as np
 
+from monstertruck_planners.goals.deform_step import Window
 from monstertruck_planners.local.api import LocalPlannerState
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from navigation_parts import Options, Part

@@ -8,8 +8,8 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import DistanceField, Footprint, clearance_to_points
+from monstertruck_planners.goals.deform_step import Window
 from monstertruck_planners.local.api import PosePath
-from monstertruck_planners.local.window import Window
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner

@@ -28,8 +28,7 @@ from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import CommandLimiter, Motion
-from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.sensors import Assessment, SensorMonitor, SteeringCheck
 from monstertruckd.gate.sources import Source, Sources
 from monstertruckd.gate.states import EventLog, GateEvent, States

@@ -124,7 +124,7 @@ def called(*arguments: str, **streams: Any) -> "subprocess.CompletedProcess[str]
 def test_help_and_usage_errors_are_bare_lines_in_pipes():
     told = called("log", "--help", capture_output=True).stdout
     assert told.isascii()
-    report = "Write one HTML page about a log: way, states, events, signals, health, losses."
+    report = "Write one HTML page about a log: path, states, events, signals, health, losses."
     assert f"  report   {report}\n" in told
     refused = called("probe", capture_output=True)
     assert refused.returncode == 2
