@@ -1,7 +1,7 @@
-"""The deforming step: a scan into the obstacle window; out whether the route is free, or a path round obstacles. For workers.
+"""The local planner's step, for workers: a scan into the obstacle window; out whether the route is free, or a path.
 
-While the route is free it is driven as it was planned: the deformer is used only from the moment something stands on it
-until the truck is back on it.
+While the route is free it is driven as it was planned: the local planner is used only from the moment an obstacle is on
+it until the truck is back on it.
 """
 
 import math
