@@ -66,7 +66,7 @@ class Daemon:
         tree: origins of the configuration's values, kept with the log.
         seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
-        environment: what systemd says of the socket and the watchdog it wants to be told on.
+        environment: socket and watchdog period of systemd (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``).
     """
 
     def __init__(

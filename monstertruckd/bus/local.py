@@ -173,7 +173,7 @@ class Bus:
 
     @property
     def drops(self) -> int:
-        """Messages lost in bounded queues since the start: all FIFO subscriptions, and what ``add_drops`` told."""
+        """Messages lost in bounded queues since the start: all FIFO subscriptions, and what ``add_drops`` adds."""
         return self._drops + sum(mailbox.drops for ends in self._ends.values() for mailbox in ends.mailboxes)
 
     def add_drops(self, count: int) -> None:

@@ -210,7 +210,7 @@ class ZenohBridge:
         with query:
             key = str(query.key_expr)
             name = key.removeprefix(rpc_key(self._robot, ""))
-            # A reply waits for room in the queue of a station that takes nothing: beside the loop.
+            # A reply waits for room in the queue of a station that reads nothing: in a thread.
             if await in_thread(partial(self._reply_schemas, query)):
                 return
             payload = b"" if query.payload is None else query.payload.to_bytes()

@@ -84,7 +84,7 @@ class Result(Schema):
     readings: tuple[tuple[float, ...], ...] = ()
     """Raw readings that a later run may use again; their meaning is the wizard's"""
     partial: bool = False
-    """Only these were measured: what the run before found beside them stays"""
+    """Only these were measured: other results of the run before stay"""
     again: str | None = None
     """What has to be done before the calibration is complete"""
 

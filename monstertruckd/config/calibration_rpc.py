@@ -39,7 +39,7 @@ def register(
         config: the running one, calibration included.
         loaded: the file it includes.
         clock: dates the files.
-        events: told of every new file.
+        events: gets an event for every new file.
         offload: where files are read and written.
         mode: the gate's present one; nothing is written while the truck may move.
     """
@@ -77,8 +77,8 @@ def register(
         await offload(lambda: with_values(config, [result], "result"))
         path = await offload(lambda: store.save(result, real_time()))
         saved = (await offload(lambda: store.load(path))).results[result.wizard]
-        told = tell(path, f"{result.wizard} calibrated", payload.get("by"))
-        return told | {"result": saved.model_dump(mode="json")}
+        answer = tell(path, f"{result.wizard} calibrated", payload.get("by"))
+        return answer | {"result": saved.model_dump(mode="json")}
 
     async def undo(payload: dict[str, Any]) -> dict[str, Any]:
         wizard: WizardName | None = next((n for n in get_args(WizardName) if n == payload.get("wizard")), None)

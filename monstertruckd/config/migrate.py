@@ -1,6 +1,6 @@
 """Brings configuration files of older versions up to the present one, step by step, keeping their comments.
 
-A file without a ``version`` of its own has that of the file that includes it. The previous file is kept beside the new
+A file without a ``version`` of its own has that of the file that includes it. The previous file is kept next to the new
 one as ``NAME.vN``. A file that includes others is written last: an upgrade that is interrupted can simply be repeated,
 because a step does nothing to a key that is already as it should be.
 """
@@ -104,7 +104,7 @@ def _includes(text: YamlText) -> list[str]:
 
 
 def carry_out(upgrades: Sequence[Upgrade]) -> None:
-    """Write the files, each whole or not at all, with the previous one beside it.
+    """Write the files, each whole or not at all, with the previous one next to it.
 
     Raises:
         InputError: a previous file of another content is kept there already, or one cannot be written.

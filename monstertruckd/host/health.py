@@ -22,7 +22,7 @@ class HealthBoard:
     """Collects every service's state, publishes the table on change and once a second.
 
     The first loss and the recovery of a service are events; repeated failures of one outage are not. A device that was
-    unplugged from a hub is told at its second failure: if the whole hub is gone there is none, as it waits for the
+    unplugged from a hub is reported at its second failure: if the whole hub is gone there is none, as it waits for the
     hub, whose loss is one event for all.
 
     Args:

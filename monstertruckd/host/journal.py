@@ -45,8 +45,8 @@ class Journal(logging.Handler):
     Args:
         clock: time; must be readable from any thread, as the wall clock is.
         out: ``event/log``.
-        on_loss: told how many records did not fit.
-        reproducible: for the virtual clock: only what the loop's own thread logs, as other threads run beside its time.
+        on_loss: called with the number of records that did not fit.
+        reproducible: for the virtual clock: only what the loop's own thread logs, as other threads run on real time.
     """
 
     def __init__(

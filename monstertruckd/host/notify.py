@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, stopping (protocol of sd_notify(3)). Alive: the control tick keeps its pace."""
+"""Notifications to systemd: ready, alive, stopping (protocol of sd_notify(3)). Alive: the tick keeps its pace."""
 
 import os
 import socket
@@ -104,7 +104,7 @@ class NotifyService:
     def _tell(self, *first: str) -> bool:
         """Send what is news; a status that did not arrive is news again the next time.
 
-        Only the ticks since the last look count, told or not: a gate that limps must not save them up for a ping.
+        Only the ticks since the last look count, notified or not: a gate that limps must not save them up for a ping.
         """
         ticks, status = self._ticks(), self._status()
         kept_pace = ticks - self._seen_ticks >= self._enough

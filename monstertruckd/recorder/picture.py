@@ -36,7 +36,7 @@ class MapService:
         pose: pose in map.
         path: path being tracked.
         tracker: progress on it.
-        events: where the end of a picture is told.
+        events: where finished pictures are reported.
     """
 
     name = "map"

@@ -38,7 +38,7 @@ class Mailbox(Generic[M]):
 
     Args:
         delivery: what waits while the reader is busy.
-        on_close: told once when the mailbox is closed.
+        on_close: called once when the mailbox is closed.
     """
 
     def __init__(self, delivery: Delivery, on_close: Callable[["Mailbox[M]"], None] = lambda _: None) -> None:

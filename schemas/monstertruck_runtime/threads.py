@@ -1,4 +1,4 @@
-"""Between the event loop and threads: blocking work beside the loop, and the hop back onto it."""
+"""Between the event loop and threads: blocking work off the loop, and the hop back onto it."""
 
 import asyncio
 import threading
@@ -18,7 +18,7 @@ class ThreadHop(Generic[T]):
     Args:
         deliver: called on the loop for every item, in the order of ``put``.
         depth: items that may wait; beyond that the oldest one of the lowest rank is lost.
-        on_loss: told on the loop how many were lost since the last delivery.
+        on_loss: called on the loop with the number lost since the last delivery.
         rank: worth of an item; None = all are worth the same.
     """
 
@@ -104,7 +104,7 @@ class ThreadHop(Generic[T]):
 
 
 async def in_thread(function: Callable[[], T]) -> T:
-    """Run a blocking ``function`` beside the loop, to its end even if the caller is cancelled meanwhile."""
+    """Run a blocking ``function`` off the loop, to its end even if the caller is cancelled meanwhile."""
     work = asyncio.ensure_future(asyncio.to_thread(function))
     try:
         return await asyncio.shield(work)
@@ -114,7 +114,7 @@ async def in_thread(function: Callable[[], T]) -> T:
 
 
 async def in_daemon_thread(function: Callable[[], T]) -> T:
-    """Run a blocking ``function`` beside the loop; neither a cancelled caller nor the process's end waits for it."""
+    """Run a blocking ``function`` off the loop; neither a cancelled caller nor the process's end waits for it."""
     work: Future[T] = Future()
 
     def run() -> None:
@@ -132,7 +132,7 @@ async def in_daemon_thread(function: Callable[[], T]) -> T:
 
 
 async def inline(function: Callable[[], T]) -> T:
-    """Run ``function`` on the loop: for the virtual clock, whose time would run on beside a thread."""
+    """Run ``function`` on the loop: for the virtual clock, whose time would run on while a thread works."""
     return function()
 
 

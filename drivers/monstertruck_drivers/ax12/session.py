@@ -17,7 +17,7 @@ GAP: Final = 100e-6
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a status packet told."""
+    """Content of a status packet."""
 
     error: Alarm
     data: bytes

@@ -23,7 +23,7 @@ class IioBatteryDriver:
         computer: whose converter; files are read off the loop, as a conversion over I2C takes milliseconds.
         clock: time.
         out: battery messages.
-        events: told when the battery's level changes.
+        events: gets an event when the battery's level changes.
         drive: the motor's feedback, whose current explains the sag; None = not used.
         name: service name.
     """

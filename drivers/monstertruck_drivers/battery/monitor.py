@@ -139,7 +139,7 @@ class BatteryMonitor:
     Args:
         config: the pack.
         out: where messages go.
-        events: told when the level changes.
+        events: gets an event when the level changes.
         source: name in events.
         drive: motor feedback for the sag; None = the voltage is judged as measured.
     """

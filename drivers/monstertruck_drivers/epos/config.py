@@ -42,7 +42,7 @@ class EposConfig(Schema):
     command_timeout: Seconds = 0.25
     """Age of the last command at which the target becomes 0."""
     quick_stop_after: Seconds = 1.0
-    """Age of the last command at which the controller is told to quick stop."""
+    """Age of the last command at which the controller is commanded to quick stop."""
     standstill_rpm: Annotated[int, Field(ge=1)] = 60
     """Slower than this counts as at rest."""
 

@@ -132,7 +132,7 @@ DISABLE_TIME = 0.04
 REENABLE_LIMIT = 0.3
 """Seconds after which running again from a quick stop goes the long way, through power stage off."""
 GOAL_LIMIT = 2.0
-"""Seconds after which the operator is told that the controller does not do as it is told."""
+"""Seconds after which a controller that does not follow its commands is reported."""
 
 
 class EposDriver:
@@ -168,7 +168,7 @@ class EposDriver:
         self.resets: list[int] = []
         """Instants of the fault resets of the last ``fault_reset_window``."""
         self.reported_fault: int | None = None
-        """Fault the operator was told about and that is still there."""
+        """Fault that was reported and is still there."""
         self._port = port
         self._quiet_until = 0
 

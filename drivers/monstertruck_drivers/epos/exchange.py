@@ -112,7 +112,7 @@ class Exchanger:
     async def read_row(self, entries: Sequence[Entry], take: Callable[[int], bool]) -> None:
         """Read objects one right after the other, until ``take``, which gets every value at once, says False.
 
-        Nor does a row go on that nobody waits for.
+        Nor does a row go on without a reader.
 
         Raises:
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.

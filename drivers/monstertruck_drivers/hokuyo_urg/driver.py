@@ -34,7 +34,7 @@ class HokuyoDriver:
         port: where it is plugged in.
         clock: time.
         out: where scans go.
-        events: where faults, recoveries and losses are told.
+        events: where faults, recoveries and losses are reported.
         name: of the service.
     """
 
@@ -172,7 +172,7 @@ class HokuyoDriver:
             raise DeviceTimeoutError(f"{self._port.name}: no good scan in time") from error
 
     def _decode(self, reply: Reply, shape: tuple[int, int, int], bad: int) -> ScanBlock | None:
-        """The scan, or None if it is damaged; told unless ``bad`` others came just before."""
+        """The scan, or None if it is damaged; reported unless ``bad`` others came just before."""
         try:
             return decode_scan(reply, *shape)
         except ProtocolError as error:

@@ -25,7 +25,7 @@ LEAD: Final = 10_000_000
 
 
 class RecordedRanges:
-    """Scans of a recorded drive; a ``RangeSource`` once :meth:`start` told when it begins.
+    """Scans of a recorded drive; a ``RangeSource`` once :meth:`start` has set when it begins.
 
     Args:
         times: shape (n,), ns since the first scan, increasing: step 0 of each revolution.

@@ -90,7 +90,7 @@ class MaestroEmulator:
         noise_lsb: standard deviation of the analog noise.
         rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, to which inputs are referred.
         usb: the port it hangs on; lets a brown-out make it vanish and come back.
-        on_output: told (channel, high) when a digital output changes, whatever the cause.
+        on_output: called with (channel, high) when a digital output changes, whatever the cause.
     """
 
     def __init__(

@@ -7,7 +7,7 @@ from monstertruck_drivers.os4000.session import Os4000Session, observed_fields, 
 from monstertruck_runtime.clock import Clock
 
 PROBE_RATE = 20
-"""Set only when the unit was told to be silent."""
+"""Set only when the unit was set to be silent."""
 
 
 async def probe(port: Port, clock: Clock, settings: Os4000Config | None = None) -> dict[str, object]:

@@ -282,7 +282,7 @@ class HubCoordinator:
         )
 
     def _tell_if_moved(self, name: str, device: UsbDevice) -> None:
-        """A device that looks like a missing one came at another place. It is told, never used there."""
+        """A device that looks like a missing one came at another place. It is reported, never used there."""
         for other, slot in self._slots.items():
             known = slot.device
             wanted = other in self._roles or other in self._outages
@@ -359,7 +359,7 @@ PERIOD: Final = SECOND
 class UsbService:
     """Looks at the tree when something is announced, missed or due, and every few seconds anyway.
 
-    Without this service nobody waits for a hub.
+    Without this service no device waits for a hub.
 
     Args:
         config: times.

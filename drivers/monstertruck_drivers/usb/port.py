@@ -82,7 +82,7 @@ class PortPower:
     Args:
         config: method and times.
         machine: where the ports are.
-        events: every cycle is told.
+        events: reports every power cycle.
     """
 
     def __init__(self, config: PowerConfig, machine: Machine, events: EventSink) -> None:
@@ -160,7 +160,7 @@ class HubNode:
     Args:
         config: the place.
         machine: where it is looked up.
-        hubs: who must wait for a hub; None = nobody waits.
+        hubs: who must wait for a hub; None = the port does not wait.
         role: the device's role, for ``hubs``.
         kind: ``tty`` or ``video4linux``.
     """
@@ -220,7 +220,7 @@ class HubPort:
         config: the place.
         machine: where it is looked up.
         events: an adapter's latency that cannot be lowered.
-        hubs: who must wait for a hub; None = nobody waits.
+        hubs: who must wait for a hub; None = the port does not wait.
         power: switches the port after several short sessions, where configured.
         role: the device's role.
     """

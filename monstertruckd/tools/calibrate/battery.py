@@ -94,7 +94,7 @@ class BatteryWizard:
     def _result(self, readings: list[MeterReading], keys: tuple[str, str]) -> Result:
         volts = [reading.volts for reading in readings]
         gain, offset = self.bounds(readings)
-        told = offset.half < 0.9 * GROUND
+        observed = offset.half < 0.9 * GROUND
         bounds = (
             f"pack volts; bounds from the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
             f"rounding, and at most {GROUND:g} V along the ground wire"
@@ -119,7 +119,7 @@ class BatteryWizard:
             wizard="battery",
             measured=f"{len(readings)} readings of a multimeter, {min(volts):.2f} to {max(volts):.2f} V",
             estimates=estimates,
-            unobserved=() if told else ("the offset: it takes readings of a fuller and an emptier pack",),
+            unobserved=() if observed else ("the offset: it takes readings of a fuller and an emptier pack",),
             readings=tuple((reading.raw, reading.volts, reading.error) for reading in readings),
         )
 

@@ -282,7 +282,7 @@ def _steered(axle: int, angle: float) -> tuple[float, float]:
 
 
 def _directions(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
-    """+1 where an axle steers as it is told, -1 where it steers the other way.
+    """+1 where an axle steers as commanded, -1 where it steers the other way.
 
     Raises:
         InputError: an axle does not turn the truck.

@@ -28,7 +28,7 @@ class MoveRecord:
     steering: list[SteeringFeedback] = field(default_factory=list)
     attitude: list[Attitude] = field(default_factory=list)
     left: int = 0
-    """When it was told to set off, ns"""
+    """When the command to set off was given, ns"""
     arrived: int = 0
     """When it was at rest again, ns"""
 

@@ -39,7 +39,7 @@ FileOption = Annotated[
 
 @dataclass(frozen=True)
 class _Call:
-    """What every wizard's command is told."""
+    """Options of every wizard's command."""
 
     robot: str
     endpoint: str

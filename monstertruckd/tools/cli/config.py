@@ -86,7 +86,7 @@ def migrate(
 ) -> None:
     """Bring a configuration of an older version, and all it includes, up to date.
 
-    Comments stay, and so does the previous file, beside the new one as NAME.vN.
+    Comments stay, and so does the previous file, next to the new one as NAME.vN.
     """
     from monstertruckd.config.load import VERSION
     from monstertruckd.config.migrate import carry_out, plan

@@ -2,7 +2,7 @@
 
 Results go to standard output, everything else (remarks, progress, errors) to standard error. Errors are raised as
 ``TruckError``; ``CommandGroup`` prints them as one sentence and ends with their reason's exit code. Ctrl-C and SIGTERM
-mean the same: commands that run until they are told to end do so with 0 (``until_stopped``), all others give up with
+mean the same: commands that run until they are stopped end with 0 (``until_stopped``), all others give up with
 ``CANCELLED``.
 """
 
@@ -136,7 +136,7 @@ def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
 
 
 def remark(text: str) -> None:
-    """Say something beside the result."""
+    """Print a remark on standard error, so that standard output holds the result alone."""
     if sys.stderr is not None:  # print() would take standard output in its place
         print(text, file=sys.stderr, flush=True)
 

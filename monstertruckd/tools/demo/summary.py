@@ -88,8 +88,8 @@ class Summary:
 
     def _interruption_row(self) -> list[tuple[str, str]]:
         """Nothing, for a lap without a stop."""
-        told = Counter(reason.text for reason in self.lap.interruptions)
-        text = ", ".join(f"{count} x {reason}" for reason, count in told.items())
+        counts = Counter(reason.text for reason in self.lap.interruptions)
+        text = ", ".join(f"{count} x {reason}" for reason, count in counts.items())
         return [("stopped on the way", f"{text}; armed again")] if text else []
 
     def _closing_row(self) -> list[tuple[str, str]]:

@@ -52,7 +52,7 @@ class PlannedFile:
     text: str = ""
     target: Path | None = None
     keep_previous: bool = False
-    """An operator may have edited it: the old one stays beside the new one."""
+    """An operator may have edited it: the old one is kept next to the new one."""
 
 
 @dataclass(frozen=True, slots=True)

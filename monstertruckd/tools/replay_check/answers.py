@@ -61,7 +61,7 @@ class Book:
 
 
 class _Replayed:
-    """Takes steps in the loop, and is told by a log when their results count."""
+    """Takes steps in the loop, and takes from a log when their results count."""
 
     def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: Book, latency: float) -> None:
         self._inner = LoopActor(target, WallClock(), 0.0)  # not virtual: it answers at once

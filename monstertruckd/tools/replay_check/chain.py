@@ -50,7 +50,7 @@ WORKER: Final = (topics.SLAM.name, topics.SCAN_MOTION.name, topics.MAP.name, top
 """Outputs of the estimation worker, which come when it is done."""
 
 LINKS: Final = 16
-"""Turns of the loop after which a worker's answer has certainly been told."""
+"""Turns of the loop after which a worker's answer has certainly been delivered."""
 
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by the tracker."""
@@ -104,7 +104,7 @@ def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | 
     """What keeps the planner of a robot from being computed again; None = nothing does, or it has none."""
     if own.planner is None or used.planner is None:
         return None if own.planner is used.planner else "only one of the two configurations has a planner"
-    if not log.told:
+    if not log.reports:
         return "the log holds no report on goals"
     if used.slam is None and used.planner.map is not None and not used.planner.map.is_file():
         return f"planner.map: {used.planner.map}: no such file, and the log does not hold it"
@@ -126,7 +126,7 @@ def period_of(planner: PlannerConfig) -> int:
 def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
     """Ticks that left nothing in the log: when, ns, and whose; in their order."""
     early = [(instant, "odometry") for instant in _early_ticks(config, log)]
-    if config.planner is None or not log.goals.told:
+    if config.planner is None or not log.goals.reports:
         return early
     return sorted(early + [(instant, "goals") for instant in log.goals.unseen_ticks(period_of(config.planner))])
 
@@ -149,7 +149,7 @@ class Chain:
         config: of the robot; see ``replayable``.
         clock: of the running replay.
         unseen: ticks nobody recorded, see ``unseen_ticks``.
-        log: what the log told beforehand.
+        log: what was read from the log beforehand.
     """
 
     def __init__(self, config: TruckConfig, clock: PacedClock, unseen: Iterable[tuple[int, str]], log: Survey) -> None:
@@ -159,7 +159,7 @@ class Chain:
         self._goal_record, self._book = log.goals, Book()
         self._calls = {} if config.planner is None else log.goals.calls(period_of(config.planner))
         self._goal_ticks = [] if config.planner is None else log.goals.ticks(period_of(config.planner))
-        self._called = [one.state.stamp for one in log.goals.told if one.sequence in self._calls]
+        self._called = [one.state.stamp for one in log.goals.reports if one.sequence in self._calls]
         self._asked: Counter[str] = Counter()
         """Newest number of a request for goals, by source."""
         self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None

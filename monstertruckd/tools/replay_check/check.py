@@ -52,7 +52,7 @@ def check_log(
         log: file to read; of a run in several parts any one stands for all.
         config: another configuration to compute with; None = the log's own.
         tolerance: greatest difference that agrees, in SI units, instead of the ones above.
-        progress: told the bytes of the run read so far.
+        progress: called with the bytes of the run read so far.
 
     Raises:
         NotFoundError: no such log, configuration or saved map.

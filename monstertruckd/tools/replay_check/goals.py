@@ -61,7 +61,7 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class GoalReport:
     """A report on the goal, where it stood in the log."""
 
     sequence: int
@@ -72,7 +72,7 @@ class Told:
 class GoalRecord:
     """Of one log."""
 
-    told: list[Told] = field(default_factory=list)
+    reports: list[GoalReport] = field(default_factory=list)
     paths: list[Path] = field(default_factory=list)
     planner_requests: list[int] = field(default_factory=list)
     """Stamps of requests to stand still, ns."""
@@ -87,28 +87,28 @@ class GoalRecord:
         with suppress(TruckError):
             match entry.topic:
                 case topics.GOAL.name:
-                    self._tell(entry)
+                    self._add_report(entry)
                 case topics.PATH.name:
                     path = entry.decode()
                     assert isinstance(path, Path)
                     self.paths.append(path)
-                case topics.PLAN_DRIVE.name if self.told and asks_standstill(entry):
+                case topics.PLAN_DRIVE.name if self.reports and asks_standstill(entry):
                     self.planner_requests.append(entry.stamp)
 
-    def _tell(self, entry: LogMessage) -> None:
+    def _add_report(self, entry: LogMessage) -> None:
         state = entry.decode()
         assert isinstance(state, GoalState)
-        self.told.append(Told(entry.sequence, state))
+        self.reports.append(GoalReport(entry.sequence, state))
 
     @property
     def start(self) -> int | None:
         """When the service reported first, ns; None in a log without goals."""
-        return self.told[0].state.stamp if self.told else None
+        return self.reports[0].state.stamp if self.reports else None
 
     def ticks(self, period: int) -> list[int]:
         """Instants of the ticks that show."""
         calls = self.calls(period)
-        stamps = [one.state.stamp for one in self.told if one.sequence not in calls] + self.planner_requests
+        stamps = [one.state.stamp for one in self.reports if one.sequence not in calls] + self.planner_requests
         shown: list[int] = []
         for stamp in sorted(stamps):
             if not shown or stamp - shown[-1] > TOGETHER:
@@ -117,12 +117,12 @@ class GoalRecord:
 
     def unseen_ticks(self, period: int) -> list[int]:
         """Instants of those between them that left nothing while a goal was pursued, so that no report was due."""
-        told = [one.state.stamp for one in self.told]
+        stamps = [one.state.stamp for one in self.reports]
         found: list[int] = []
         for before, after in itertools.pairwise(self.ticks(period)):
             for number in range(round((after - before) / period) - 1, 0, -1):
                 instant = after - number * period
-                newest = self.told[bisect_right(told, instant) - 1].state
+                newest = self.reports[bisect_right(stamps, instant) - 1].state
                 if newest.phase is not GoalPhase.IDLE:
                     found.append(min(instant, newest.stamp + REPORT - 1))
         return found
@@ -133,7 +133,7 @@ class GoalRecord:
         What comes by topic is in the log itself, and shows within two ticks.
         """
         found: dict[int, Call] = {}
-        for before, after in itertools.pairwise(self.told):
+        for before, after in itertools.pairwise(self.reports):
             stamp = after.state.stamp
             if any(0 <= stamp - asked <= 2 * period for asked in self.asked):
                 continue
@@ -144,19 +144,19 @@ class GoalRecord:
     def unknown_waypoints(self, period: int) -> bool:
         """Whether a remote call named waypoints: reports only count them."""
         goals = {number for number, call in self.calls(period).items() if isinstance(call.what, Pose2D)}
-        return any(one.sequence in goals and one.state.waypoints for one in self.told)
+        return any(one.sequence in goals and one.state.waypoints for one in self.reports)
 
     def decided(self, since: int) -> int | None:
         """When the answer to what was asked of the route planner at ``since``, ns, counted; None = not any more."""
-        for before, after in itertools.pairwise(self.told):
+        for before, after in itertools.pairwise(self.reports):
             if after.state.stamp > since and _answered(before.state, after.state):
                 return after.state.stamp
         return None
 
     def path_between(self, begin: int, end: int, name: str) -> Path | None:
-        """First path told after ``begin`` and until ``end``, ns, whose name fits the pattern."""
-        told = (path for path in self.paths if begin < path.stamp <= end)
-        return next((path for path in told if re.fullmatch(name, path.name)), None)
+        """First path published after ``begin`` and until ``end``, ns, whose name fits the pattern."""
+        found = (path for path in self.paths if begin < path.stamp <= end)
+        return next((path for path in found if re.fullmatch(name, path.name)), None)
 
 
 def asks_standstill(entry: LogMessage) -> bool:

@@ -1,1 +1,1 @@
-"""Behaviours beside driving along a path: keeping the lidar level."""
+"""Behaviours other than driving along a path: keeping the lidar level."""

@@ -38,7 +38,7 @@ FORGET: Final = 1.0
 
 
 class AxleModel:
-    """Both axles' present angles, computed from the requests: servos report what they are told, not where they are.
+    """Both axles' present angles, computed from the requests: servos report their commands, not where they are.
 
     Args:
         dead_time: s.

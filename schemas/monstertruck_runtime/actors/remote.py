@@ -372,7 +372,7 @@ async def work(caller: Caller, clock: Clock, name: str, target: str, codec: Step
         failed = False
         try:
             text = await in_thread(partial(_answer, step, codec, reply["inputs"]))
-        except Exception as error:  # noqa: BLE001 - told to the robot, which decides
+        except Exception as error:  # noqa: BLE001 - sent to the robot, which decides
             failed, text = True, f"{type(error).__name__}: {error}"
             step = await in_thread(partial(_build, target))
         parts = [text[i : i + PART] for i in range(0, len(text), PART)] or [""]

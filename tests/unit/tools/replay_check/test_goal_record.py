@@ -7,7 +7,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
-from monstertruckd.tools.replay_check.goals import Call, GoalRecord, Told
+from monstertruckd.tools.replay_check.goals import Call, GoalRecord, GoalReport
 
 PERIOD = SECOND // 10
 GOAL = Pose2D(x=1.0, y=2.0, yaw=0.0)
@@ -15,13 +15,15 @@ GOAL = Pose2D(x=1.0, y=2.0, yaw=0.0)
 
 def record(*rows, asked=(), planner_requests=()):
     """``rows``: seconds, number, phase, and other fields of a report."""
-    told = []
+    reports = []
     for sequence, (seconds, number, phase, *rest) in enumerate(rows):
         stamp = round(seconds * SECOND)
         fields = {"goal": GOAL, "source": "me", "outcome": Reason.DRIVING} | (rest[0] if rest else {})
-        told.append(Told(sequence, GoalState(stamp=stamp, received=stamp, seq=0, number=number, phase=phase, **fields)))
+        reports.append(
+            GoalReport(sequence, GoalState(stamp=stamp, received=stamp, seq=0, number=number, phase=phase, **fields))
+        )
     return GoalRecord(
-        told,
+        reports,
         planner_requests=[round(at * SECOND) for at in planner_requests],
         asked=[round(at * SECOND) for at in asked],
     )
