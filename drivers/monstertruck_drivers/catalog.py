@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, cast
 from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
-from monstertruck_drivers.os4000.protocol import BAUD as OS4000_BAUD
+from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics

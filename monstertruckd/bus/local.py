@@ -85,7 +85,7 @@ class Bus:
 
     def __init__(self, clock: Clock, gather_seconds: float = 0.0) -> None:
         self._clock = clock
-        self._outgoing = Outgoing(gather_seconds, self._tell_taps)
+        self._outgoing = Outgoing(gather_seconds, self._deliver_to_taps)
         self._claimed: set[str] = set()
         self._ends: defaultdict[str, _ReadEnds] = defaultdict(_ReadEnds)
         self._taps: list[Tap] = []
@@ -201,15 +201,15 @@ class Bus:
                 self._ends[name].taps -= 1
             tap.topics = frozenset()
 
-    def _tell_taps(self, row: Sequence[Sent]) -> None:
-        """Encode the whole row, then hand it to one tap after the other.
+    def _deliver_to_taps(self, batch: Sequence[Sent]) -> None:
+        """Encode the whole batch, then hand it to one tap after the other.
 
         Raises:
             Exception: a message cannot be encoded, or a tap has a bug; that costs nothing but this message.
         """
         encoded: list[tuple[Topic[Any], Message, bytes, int]] = []
         bug: Exception | None = None
-        for topic, message, at in row:
+        for topic, message, at in batch:
             try:
                 encoded.append((topic, message, wire.encode(topic, message), at))
             except Exception as error:  # noqa: BLE001  # raised below

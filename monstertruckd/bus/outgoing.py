@@ -1,6 +1,6 @@
-"""What leaves the process, in rows: a message that follows another costs a fraction of one that comes alone.
+"""What leaves the process, in batches: a message that follows another costs a fraction of one that comes alone.
 
-The code that encodes, records and puts is then in the caches, and each row wakes Zenoh's threads once.
+The code that encodes, records and puts is then in the caches, and each batch wakes Zenoh's threads once.
 """
 
 import asyncio
@@ -14,8 +14,8 @@ from monstertruck_schemas.topics import Topic
 OFTEN: Final = 1.0
 """Topics of so many messages a second or more may wait for others."""
 BEHIND: Final = MILLISECOND
-"""Nanoseconds after the multiples at which rows leave: what the gate says there goes with them, not held up by them."""
-ROW: Final = 10
+"""Nanoseconds after the multiples at which batches leave: what the gate publishes there leaves with them."""
+BATCH: Final = 10
 """Messages delivered in one turn of the loop: a fraction of a millisecond."""
 
 Sent = tuple[Topic[Any], Message, int]
@@ -26,8 +26,8 @@ class Outgoing:
     """Delivers messages of no rate at once, and with them, or after a moment, the regular ones that wait before them.
 
     Args:
-        seconds: rows leave a moment after the multiples of this; 0: nothing waits.
-        deliver: gets a row of messages.
+        seconds: batches leave a moment after the multiples of this; 0: nothing waits.
+        deliver: gets a batch of messages.
     """
 
     def __init__(self, seconds: float, deliver: Callable[[Sequence[Sent]], None]) -> None:
@@ -54,24 +54,24 @@ class Outgoing:
             return
         try:
             while self._waiting:
-                self._next_row()
+                self._next_batch()
         finally:
             if self._waiting and self._timer is None:
                 self._timer = asyncio.get_running_loop().call_soon(self._due)
 
     def _due(self) -> None:
-        """Deliver all that waits, a row a turn."""
+        """Deliver all that waits, one batch per turn of the loop."""
         try:
             if self._waiting:
-                self._next_row()
+                self._next_batch()
         finally:
             self._timer = asyncio.get_running_loop().call_later(0.0, self._due) if self._waiting else None
 
-    def _next_row(self) -> None:
-        row = self._waiting[:ROW]
-        del self._waiting[:ROW]
+    def _next_batch(self) -> None:
+        batch = self._waiting[:BATCH]
+        del self._waiting[:BATCH]
         self._delivering = True
         try:
-            self._deliver(row)
+            self._deliver(batch)
         finally:
             self._delivering = False

@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
 from monstertruck_runtime.requests import OPERATORS
-from monstertruck_runtime.stops import causes_text
+from monstertruck_runtime.stop_text import causes_text
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable

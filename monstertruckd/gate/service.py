@@ -11,7 +11,7 @@ import numpy as np
 
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.stops import causes_text
+from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop

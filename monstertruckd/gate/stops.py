@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.stops import causes_text, duration_text
+from monstertruck_runtime.stop_text import causes_text, duration_text
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Cause, Event, Measurement, Severity
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState

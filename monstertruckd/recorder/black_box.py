@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink
-from monstertruck_runtime.stops import causes_text
+from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason

@@ -95,24 +95,30 @@ class Topic(Generic[M]):
 
 W = Writer
 
-SCAN: Final = Topic("sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, 0.25, foxglove="foxglove.LaserScan")
-COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, 0.25)
-DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, 0.2)
-DRIVE_2: Final = Topic("sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, 0.2)
-DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, 0.2)
-DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, 0.2)
-STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, 0.25)
-BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, 2.0)
+SCAN: Final = Topic(
+    "sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, stale_after=0.25, foxglove="foxglove.LaserScan"
+)
+COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, stale_after=0.25)
+DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, stale_after=0.2)
+DRIVE_2: Final = Topic(
+    "sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, stale_after=0.2
+)
+DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, stale_after=0.2)
+DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, stale_after=0.2)
+STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, stale_after=0.25)
+BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, stale_after=2.0)
 CAMERA: Final = Topic(
     "sensor/camera",
     CompressedImage,
     W.DRIVER,
     "Pictures of the supervision camera",
     15,
-    2.0,
+    stale_after=2.0,
     foxglove="foxglove.CompressedImage",
 )
-STABILISER: Final = Topic("sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 25, 0.2)
+STABILISER: Final = Topic(
+    "sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 25, stale_after=0.2
+)
 
 ODOMETRY: Final = Topic(
     "state/odometry",
@@ -120,10 +126,12 @@ ODOMETRY: Final = Topic(
     W.ESTIMATION,
     "Dead-reckoned pose in odom",
     50,
-    0.2,
+    stale_after=0.2,
     foxglove="foxglove.PoseInFrame",
 )
-POSE: Final = Topic("state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, 0.2, foxglove="foxglove.PoseInFrame")
+POSE: Final = Topic(
+    "state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, stale_after=0.2, foxglove="foxglove.PoseInFrame"
+)
 SCAN_MOTION: Final = Topic(
     "state/scan_motion", ScanMotion, W.ESTIMATION, "Motion of base between two scans, by the scans alone", 10
 )
@@ -145,43 +153,57 @@ MAP_TILES: Final = Topic(
     foxglove="foxglove.Grid",
 )
 GATE: Final = Topic(
-    "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, 0.5, retained=True
+    "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, stale_after=0.5, retained=True
 )
 CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daemon time", 1, retained=True)
 
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
-TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 20, 0.5)
+TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 20, stale_after=0.5)
 GOAL: Final = Topic("plan/goal", GoalState, W.PLANNER, "Progress towards the goal", 2, retained=True)
-PLAN_DRIVE: Final = Topic("plan/drive", DriveRequest, W.PLANNER, "The planners' drive requests to the gate", 20, 0.3)
+PLAN_DRIVE: Final = Topic(
+    "plan/drive", DriveRequest, W.PLANNER, "The planners' drive requests to the gate", 20, stale_after=0.3
+)
 PLAN_STABILISER: Final = Topic(
     "plan/stabiliser",
     StabiliserCommand,
     W.PLANNER,
     "Joint goals of the lidar's mount; they move no wheel, so they pass no gate",
     25,
-    0.5,
+    stale_after=0.5,
 )
 
-CMD_DRIVE: Final = Topic("cmd/drive", DriveCommand, W.GATE, "Command sent to the drive controller", 50, 0.1)
-CMD_DRIVE_2: Final = Topic("cmd/drive_2", DriveCommand, W.GATE, "The same to the second driven shaft", 50, 0.1)
-CMD_DRIVE_3: Final = Topic("cmd/drive_3", DriveCommand, W.GATE, "The same to the third driven shaft", 50, 0.1)
-CMD_DRIVE_4: Final = Topic("cmd/drive_4", DriveCommand, W.GATE, "The same to the fourth driven shaft", 50, 0.1)
-CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command sent to the servos", 50, 0.1)
+CMD_DRIVE: Final = Topic("cmd/drive", DriveCommand, W.GATE, "Command sent to the drive controller", 50, stale_after=0.1)
+CMD_DRIVE_2: Final = Topic(
+    "cmd/drive_2", DriveCommand, W.GATE, "The same to the second driven shaft", 50, stale_after=0.1
+)
+CMD_DRIVE_3: Final = Topic(
+    "cmd/drive_3", DriveCommand, W.GATE, "The same to the third driven shaft", 50, stale_after=0.1
+)
+CMD_DRIVE_4: Final = Topic(
+    "cmd/drive_4", DriveCommand, W.GATE, "The same to the fourth driven shaft", 50, stale_after=0.1
+)
+CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command sent to the servos", 50, stale_after=0.1)
 
-HEALTH: Final = Topic("health/services", HealthTable, W.DAEMON, "Every service's state", 1, 3.0, retained=True)
-LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, 3.0)
-RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, 3.0, retained=True)
-LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, 3.0)
-HOST: Final = Topic("health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, 3.0)
-SLAM: Final = Topic("health/slam", SlamHealth, W.ESTIMATION, "How well the scans fit the map", 10, 3.0)
-FUSION: Final = Topic("health/odometry", OdometryHealth, W.ESTIMATION, "Slip, and a disturbed compass", 1, 3.0)
-USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, 3.0, retained=True)
+HEALTH: Final = Topic(
+    "health/services", HealthTable, W.DAEMON, "Every service's state", 1, stale_after=3.0, retained=True
+)
+LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, stale_after=3.0)
+RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, stale_after=3.0, retained=True)
+LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, stale_after=3.0)
+HOST: Final = Topic(
+    "health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, stale_after=3.0
+)
+SLAM: Final = Topic("health/slam", SlamHealth, W.ESTIMATION, "How well the scans fit the map", 10, stale_after=3.0)
+FUSION: Final = Topic(
+    "health/odometry", OdometryHealth, W.ESTIMATION, "Slip, and a disturbed compass", 1, stale_after=3.0
+)
+USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, stale_after=3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
 STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the truck was stopped, with the chain of causes", retained=True)
 LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", foxglove="foxglove.Log")
 
-REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, 0.3)
+REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, stale_after=0.3)
 REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")
 REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
 REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")

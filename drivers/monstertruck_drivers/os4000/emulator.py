@@ -10,9 +10,9 @@ import numpy as np
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import AttitudeSource, CompassReading, EmulatorSetup, Trail
 from monstertruck_drivers.os4000.protocol import (
-    BAUD,
     BAUDS,
     ESC,
+    FACTORY_BAUD,
     FORMAT_TAGGED,
     RATE_MAX,
     RATE_MIN,
@@ -42,7 +42,7 @@ class Settings:
     rate: int
     fields: int
     format: int = FORMAT_TAGGED
-    baud: int = BAUDS.index(BAUD)
+    baud: int = BAUDS.index(FACTORY_BAUD)
     mounting: int = 1
     temperature_offset: int = 0
 
@@ -55,7 +55,7 @@ class Settings:
                 self.fields = number
             case Key.FORMAT if number in (1, 2, 4, 8):
                 self.format = number
-            case Key.BAUD if 0 <= number < len(BAUDS):
+            case Key.FACTORY_BAUD if 0 <= number < len(BAUDS):
                 self.baud = number
             case Key.MOUNTING if 1 <= number <= 6:
                 self.mounting = number
@@ -66,7 +66,7 @@ class Settings:
         return True
 
 
-VALUE_KEYS: Final = (Key.RATE, Key.FIELDS, Key.FORMAT, Key.BAUD, Key.MOUNTING, Key.TEMPERATURE_OFFSET)
+VALUE_KEYS: Final = (Key.RATE, Key.FIELDS, Key.FORMAT, Key.FACTORY_BAUD, Key.MOUNTING, Key.TEMPERATURE_OFFSET)
 CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 

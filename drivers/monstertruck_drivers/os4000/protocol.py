@@ -15,8 +15,8 @@ ESC: Final = 0x1B
 SENTENCE_LIMIT: Final = 200
 """Bytes without a line end after which what was collected is dropped."""
 
-BAUD: Final = 19200
-"""From the factory."""
+FACTORY_BAUD: Final = 19200
+"""Baud rate of a unit as delivered; the kind's row in the catalog makes it the default of a port."""
 BAUDS: Final = (4800, 9600, 14400, 19200, 38400, 57600, 115200)
 """Baud rates by the value the baud command takes; a change acts from the next power-up on."""
 RATE_MIN: Final = -100
@@ -41,7 +41,7 @@ class Fields(IntFlag):
 class Key(IntEnum):
     """Command keys, sent behind ESC."""
 
-    BAUD = ord("B")
+    FACTORY_BAUD = ord("B")
     RATE = ord("R")
     FORMAT = ord("*")
     FIELDS = ord("X")

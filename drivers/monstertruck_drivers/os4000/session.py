@@ -95,10 +95,11 @@ class Os4000Session:
         if self.bytes_heard:
             raise WrongDeviceError(
                 f"{name}: {self.bytes_heard} bytes, but no OS4000 sentence: another device, or another baud rate "
-                f"than the unit's ({', '.join(map(str, protocol.BAUDS))}; {protocol.BAUD} from the factory)"
+                f"than the unit's ({', '.join(map(str, protocol.BAUDS))}; {protocol.FACTORY_BAUD} from the factory)"
             )
         raise DeviceTimeoutError(
-            f"{name}: silence; expected an OS4000 that streams, at its baud rate ({protocol.BAUD} from the factory)"
+            f"{name}: silence; expected an OS4000 that streams, at its baud rate "
+            f"({protocol.FACTORY_BAUD} from the factory)"
         )
 
     async def set(self, command: Key, number: int) -> None:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
-from monstertruck_runtime.stops import stop_lines
+from monstertruck_runtime.stop_text import stop_lines
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState

@@ -6,7 +6,7 @@ behaviours in turn when that does not help. Every decision is reported with its 
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, assert_never
 
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import Place, PlanAnswer, Pose
@@ -285,8 +285,10 @@ def _recover(run: GoalRun, reason: Reason, text: str, config: PlannerConfig) -> 
         case "back_out":
             planning = _enter(replace(run, planned="escape"), GoalPhase.PLANNING)
             return planning, (report, Halt(), Plan("escape"))
-        case _:
+        case "clear" | "replan":
             return _with(_plan(run, config, clear=behaviour == "clear"), report, Halt())
+        case _:
+            assert_never(behaviour)
 
 
 def _plan(run: GoalRun, config: PlannerConfig, *, clear: bool = False, afresh: bool = False) -> Step:

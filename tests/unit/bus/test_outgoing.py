@@ -7,7 +7,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT, MAP, ODOMETRY, POSE, Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.outgoing import BEHIND, ROW, Outgoing
+from monstertruckd.bus.outgoing import BATCH, BEHIND, Outgoing
 from tests.bus_kit import gate_state, odometry
 
 
@@ -58,17 +58,17 @@ def test_a_long_row_leaves_in_several_turns_of_the_loop():
 
     async def main(clock):
         outgoing = Outgoing(0.02, found.extend)
-        for number in range(2 * ROW + 1):
+        for number in range(2 * BATCH + 1):
             outgoing.send(ODOMETRY, None, number)
         counts = []
         await clock.sleep_until(2 * SECOND // 100 + clock.now() + BEHIND)
         for _ in range(3):
             counts.append(len(found))
             await asyncio.sleep(0)
-        assert counts == [ROW, 2 * ROW, 2 * ROW + 1]
+        assert counts == [BATCH, 2 * BATCH, 2 * BATCH + 1]
 
     run_virtual(main)
-    assert [at for _, _, at in found] == list(range(2 * ROW + 1))
+    assert [at for _, _, at in found] == list(range(2 * BATCH + 1))
 
 
 def test_nothing_waits_if_it_is_told_so():
@@ -84,20 +84,20 @@ def test_after_a_failure_the_rest_is_delivered_all_the_same():
 
     def deliver(row):
         found.extend(at for _, _, at in row)
-        if found[0] == 0 and len(found) == ROW:
+        if found[0] == 0 and len(found) == BATCH:
             raise OSError("full")
 
     async def main(clock):
         errors = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
         outgoing = Outgoing(0.02, deliver)
-        for number in range(ROW + 1):
+        for number in range(BATCH + 1):
             outgoing.send(ODOMETRY, None, number)
         await clock.sleep(0.1)
         assert [str(error) for error in errors] == ["full"]
 
     run_virtual(main)
-    assert found == list(range(ROW + 1))
+    assert found == list(range(BATCH + 1))
 
 
 def test_what_was_sent_while_a_row_failed_leaves_in_the_next_turn():

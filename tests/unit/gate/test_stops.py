@@ -3,7 +3,7 @@
 import pytest
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.stops import causes_text, stop_lines
+from monstertruck_runtime.stop_text import causes_text, stop_lines
 from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason

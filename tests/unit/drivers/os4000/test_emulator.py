@@ -86,7 +86,7 @@ def test_negative_zero_is_printed_as_zero():
         (Key.FIELDS, 512, lambda s: s.fields == 335),
         (Key.MOUNTING, 3, lambda s: s.mounting == 3),
         (Key.MOUNTING, 7, lambda s: s.mounting == 1),
-        (Key.BAUD, 6, lambda s: s.baud == 6),
+        (Key.FACTORY_BAUD, 6, lambda s: s.baud == 6),
         (Key.FORMAT, 3, lambda s: s.format == 1),
         (Key.TEMPERATURE_OFFSET, -2, lambda s: s.temperature_offset == -2),
     ],
@@ -202,7 +202,7 @@ def test_slow_rates():
 
 def test_a_new_baud_rate_acts_from_the_next_power_up_on():
     async def test(t: Terminal) -> None:
-        t.link.write(key(Key.BAUD) + value(4))
+        t.link.write(key(Key.FACTORY_BAUD) + value(4))
         await t.hear(1.5)
         assert t.rig.port.device.baud == 19200
         t.rig.emulator.power_cycle()
