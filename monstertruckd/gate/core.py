@@ -3,7 +3,7 @@
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so it completes even if nothing is
 sent afterwards. ``sources`` holds the rules of who drives, ``states`` the transitions, ``sensors`` what stops or slows
-the truck, ``limiter`` and ``obstacles`` the way from a request to the commanded motion, ``stops`` the causes reported.
+the truck, ``limiter`` the way from a request to the commanded motion, ``stops`` the causes reported.
 
 Every stop ends with standstill confirmed by the drive. After a short fault (a late scan, an expired lease) the same
 source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING``, disarms.

@@ -67,7 +67,7 @@ class Topic(Generic[M]):
     rate: float | None = None
     """Nominal rate in Hz; None = on change."""
     stale_after: float | None = None
-    """Seconds after which the newest message no longer counts; gate, tracker and levelling take it from here."""
+    """Seconds after which the newest message no longer counts; gate, tracker, goals and levelling take it from here."""
     logged: bool = True
     retained: bool = False
     """Late joiners get the newest message at once."""
