@@ -251,7 +251,7 @@ class Daemon:
         rpc.register("config", config)
         rpc.register("versions", versions)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
-        gate_rpc.register(rpc, self.bus)
+        gate_rpc.register(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
             rpc, self.config, loaded, self.clock, self._events, self._offload, lambda: self.gate.mode

@@ -5,6 +5,7 @@ a product with its driver: what ``kind:`` means. Both may come from other distri
 Modules of a kind are loaded on use, so that listing kinds, checking a configuration and ``--help`` cost nothing.
 """
 
+import re
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -17,6 +18,7 @@ from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics
+from monstertruck_schemas.base import Schema
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
 
@@ -183,6 +185,12 @@ class DeviceKind(Plugin):
         return cast("Probe", load(self.probe))
 
 
+RESERVED: Final = frozenset(
+    {"present", "shafts", "gate", "recorder", "bus", "usb", "tracker", "goals", "slam", "odometry"}
+)
+"""Names of services, and of what a section of the configuration has besides its roles."""
+
+
 class DeviceCatalog(Catalog[DeviceKind]):
     """All kinds of devices, and the roles they fill: ours, then those that kinds of other distributions bring."""
 
@@ -194,9 +202,15 @@ class DeviceCatalog(Catalog[DeviceKind]):
         """What is wrong with a kind of another distribution, or with a role it brings."""
         if fault := super().fault(row):
             return fault
+        if not row.roles:
+            return "expected at least one role"
         for role in row.roles:
-            if not role.name.isidentifier() or not role.writes:
-                return f"role {role.name!r}: expected an identifier that writes a topic"
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", role.name) or not role.writes:
+                return f"role {role.name!r}: expected a name of small letters, digits and _ that writes a topic"
+            if hasattr(Schema, role.name) or role.name in RESERVED:
+                return f"role {role.name}: the name has another meaning"
+            if role.duty is Duty.ACTUATOR and role not in OUR_ROLES:
+                return f"role {role.name}: actuators are this repository's alone"
             if self._roles.get(role.name, role) != role:
                 return f"role {role.name}: there is another one of that name"
             if not_its := [t.name for t in role.writes.values() if t.writer is not Writer.DRIVER]:

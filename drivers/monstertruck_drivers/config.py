@@ -100,6 +100,16 @@ class _Devices(Schema):
             taken[where] = role
         return self
 
+    @model_validator(mode="after")
+    def _one_writer_each(self) -> Self:
+        owners: dict[str, str] = {}
+        for role in self.present():
+            topic = next(iter(DEVICES.roles[role].writes.values())).name
+            if other := owners.get(topic):
+                raise ValueError(f"{other} and {role} both publish {topic}; a topic has one writer")
+            owners[topic] = role
+        return self
+
 
 class _Monitors(Schema):
     """What is read from the computer itself, without a port; what is left out is not watched."""

@@ -7,6 +7,7 @@ whether the bytes come from a tty, a pty or another coroutine.
 import asyncio
 import contextlib
 import errno
+import os
 import termios
 from collections.abc import Callable
 from pathlib import Path
@@ -321,9 +322,20 @@ class _SerialProtocol(asyncio.Protocol):
     """
 
     def __init__(self, name: str, tty: serial.Serial) -> None:
-        transport = serial_asyncio.SerialTransport(asyncio.get_running_loop(), self, tty)
+        self._fd = tty.fileno()
+        self._transport = serial_asyncio.SerialTransport(asyncio.get_running_loop(), self, tty)
         # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(name, transport.write, transport.abort)
+        self.link = Link(name, self._send, self._transport.abort)
+
+    def _send(self, data: bytes) -> None:
+        """Write at once: a last command before ``close`` must not wait in a buffer that ``abort`` drops."""
+        if self._transport.is_closing():
+            return
+        if self._transport.get_write_buffer_size() == 0:
+            with contextlib.suppress(OSError):  # not one byte fits, or the tty is lost: the transport finds out
+                data = data[os.write(self._fd, data) :]
+        if data:
+            self._transport.write(data)
 
     def data_received(self, data: bytes) -> None:
         self.link.feed(data)

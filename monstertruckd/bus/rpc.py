@@ -38,6 +38,10 @@ class Rpc:
             raise RuntimeError(msg)
         self._handlers[name] = handler
 
+    def serves(self, name: str) -> bool:
+        """Whether a handler is registered."""
+        return name in self._handlers
+
     async def call(self, name: str, payload: dict[str, Any]) -> dict[str, Any]:
         """Run one handler.
 

@@ -22,6 +22,7 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
 from monstertruck_schemas.topics import CAMERA, MAP, MAP_TILES, TOPICS, Topic, Writer, alive_key, rpc_key
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 
 BULKY = frozenset({CAMERA.name, MAP.name, MAP_TILES.name})
 """Topics of large messages: on a slow link all others, and answers, go first."""
+ORDERS = frozenset(order.value for order in Order)
+"""Calls that must get through when others fill the places."""
 MAX_CALLS = 16
 """Remote calls served at once."""
 MAX_WAITING_CALLS = 64
@@ -199,7 +202,8 @@ class ZenohBridge:
                 query.reply(key, wire.encode(topic, newest), encoding=wire.encoding(topic))
 
     def _serve(self, query: zenoh.Query, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
-        if len(active) >= MAX_CALLS:
+        name = str(query.key_expr).removeprefix(rpc_key(self._robot, ""))
+        if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
             _refuse(query, Reason.BUSY, "too many calls at once")
             return
         task = calls.create_task(self._answer(query))
@@ -211,7 +215,7 @@ class ZenohBridge:
             key = str(query.key_expr)
             name = key.removeprefix(rpc_key(self._robot, ""))
             # A reply waits for room in the queue of a station that reads nothing: in a thread.
-            if await in_thread(partial(self._reply_schemas, query)):
+            if not self._rpc.serves(name) and await in_thread(partial(self._reply_schemas, query)):
                 return
             payload = b"" if query.payload is None else query.payload.to_bytes()
             success, data = await self._rpc.answer(name, payload)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import RpcRegistry
 from monstertruck_runtime.requests import parse_request
@@ -27,22 +28,26 @@ CARRIED_OUT: Final[Mapping[Order, Callable[[GateMode], bool]]] = {
 }
 """Modes that show an order as carried out."""
 
+STANDSTILL: Final = 4.0
+"""Seconds for the truck to come to rest."""
+
 GRADUAL: Final = frozenset({Order.DISARM, Order.STOP})
 """Orders that end with the truck at rest; the others take effect at once."""
 
 
-def register(rpc: RpcRegistry, bus: Bus) -> None:
+def register(rpc: RpcRegistry, bus: Bus, clock: Clock) -> None:
     """Serve every ``Order`` under its name; the payload is a ``ControlRequest``, the answer a ``GateState``.
 
     Args:
         rpc: where.
         bus: carries the orders to the gate.
+        clock: time.
     """
     for order in Order:
-        rpc.register(order.value, partial(_carry_out, bus, order))
+        rpc.register(order.value, partial(_carry_out, bus, clock, order))
 
 
-async def _carry_out(bus: Bus, order: Order, payload: dict[str, Any]) -> dict[str, Any]:
+async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, Any]) -> dict[str, Any]:
     request = parse_request(ControlRequest, {**payload, "order": order.value})
     with bus.subscribe(GATE, fifo(64)) as states:
         states.drain()
@@ -50,9 +55,14 @@ async def _carry_out(bus: Bus, order: Order, payload: dict[str, Any]) -> dict[st
         assert isinstance(decision, Decision)
         if decision.reason is not Reason.OK:
             raise RequestRefusedError(decision.reason, decision.text)
-        while True:
-            state = await states.next()
-            if CARRIED_OUT[order](state.mode):
-                return state.model_dump(mode="json")
-            if order not in GRADUAL:
-                raise RequestRefusedError(next(iter(state.reasons), Reason.DISARMED))
+        try:
+            async with clock.deadline(STANDSTILL):
+                while True:
+                    state = await states.next()
+                    if CARRIED_OUT[order](state.mode):
+                        return state.model_dump(mode="json")
+                    if order not in GRADUAL:
+                        raise RequestRefusedError(next(iter(state.reasons), Reason.DISARMED))
+        except TimeoutError:
+            msg = f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s"
+            raise NoAnswerError(msg) from None

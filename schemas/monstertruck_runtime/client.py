@@ -10,7 +10,7 @@ import re
 import socket
 import stat
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -179,6 +179,8 @@ class TruckClient(Operator):
         self._asking = asyncio.Lock()
         # Must also grow from one run of this program to the next.
         self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
+        self._overtaking = 0
+        """Stops and emergency stops ordered so far."""
 
     async def __aenter__(self) -> Self:
         """Connect to the endpoint.
@@ -298,21 +300,26 @@ class TruckClient(Operator):
         header = await self._answered(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
 
-    async def order(self, order: Order) -> GateState:
-        """Give an order and wait until it is carried out; returns the gate's state then.
+    def order(self, order: Order) -> Coroutine[Any, Any, GateState]:
+        """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
-        An emergency stop or stop is published at once, whatever is known of the robot, before its outcome is awaited.
+        An emergency stop or stop is published by this call itself, whatever is known of the robot and whether or not
+        its outcome is awaited. Any other order that is still waiting for the robot's nonce then is withdrawn.
 
         Raises:
-            RequestRefusedError: refused; carries the reason.
+            RequestRefusedError: refused, or overtaken by a stop; carries the reason.
             NoAnswerError: no answer in time, or the robot's nonce did not come in time.
             NotFoundError: the robot is not there.
         """
         if order in OVERTAKING:
+            self._overtaking += 1
             self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
-            header = self._header(1.0)
-        else:
-            header = await self._answered(1.0)
+        return self._outcome(order, self._overtaking)
+
+    async def _outcome(self, order: Order, overtaking: int) -> GateState:
+        header = self._header(1.0) if order in OVERTAKING else await self._answered(1.0)
+        if overtaking != self._overtaking and order not in OVERTAKING:
+            raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: overtaken by a stop")
         return wire.decode(GATE, await self._call(order.value, header, ORDER_TIMEOUT))
 
     async def goal(

@@ -4,7 +4,7 @@ The gate and the planners check requests by the same rules, whether they come by
 """
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Coroutine
 from typing import Any, Final, Protocol, TypeVar
 
 from pydantic import ValidationError
@@ -44,8 +44,8 @@ class Operator(Protocol):
         """Call ``rpc`` with a JSON object; returns its answer."""
         ...
 
-    async def order(self, order: Order) -> GateState:
-        """Give an order and wait until it is carried out; returns the gate's state then.
+    def order(self, order: Order) -> Coroutine[Any, Any, GateState]:
+        """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
         Raises:
             RequestRefusedError: refused; carries the reason.
@@ -87,7 +87,7 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
         InputError: it is no such request; the text names the first wrong field.
     """
     try:
-        return model.model_validate_json(json.dumps(payload))
+        return model.model_validate_json(json.dumps(payload), extra="ignore")  # a newer client may say more
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
         text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, Final, Generic, TypeVar
 
 from monstertruck_schemas.base import Message
@@ -237,10 +238,21 @@ class TopicTable(ExtensibleTable[Topic[Message]]):
         model: Any = row.model
         if not (isinstance(model, type) and issubclass(model, Message)):
             return "model: expected a subclass of Message"
-        taken = {known.schema_name: known.model for known in self.ours.values()}
-        if taken.get(row.schema_name, model) is not model:
+        if row.foxglove is not None:
+            return "foxglove: only this repository's messages travel as Foxglove schemas"
+        numbers: dict[str, Any] = {"rate": row.rate, "stale_after": row.stale_after}
+        for name, value in numbers.items():
+            if value is not None and not (isinstance(value, int | float) and value > 0):
+                return f"{name}: expected a positive number, found {value!r}"
+        model.model_json_schema()  # raises where the recorder would
+        if self._models.setdefault(row.schema_name, model) is not model:
             return f"another message is called {row.schema_name}"
         return None
+
+    @cached_property
+    def _models(self) -> dict[str, type[Message]]:
+        """Accepted messages by schema name."""
+        return {known.schema_name: known.model for known in self.ours.values()}
 
 
 BY_NAME: Final = TopicTable(

@@ -121,13 +121,13 @@ class LocalDriver(LocalOperator):
     source = "operator"
 
     def __init__(self, trip: Trip) -> None:
-        super().__init__(trip.rig.bus, trip.clock)
+        super().__init__(trip.rig.daemon, trip.clock)
         self._trip = trip
 
     async def get_retained(self, topic: Any) -> Any:
         return self._trip.rig.bus.newest(topic)
 
-    async def go(
+    async def goal(
         self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
     ) -> dict[str, Any]:
         return await self._trip.goal(*goal, via=via)

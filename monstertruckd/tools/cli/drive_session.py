@@ -6,6 +6,7 @@ import os
 import signal
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import IO, Any, Final
 
 from rich.console import Console, RenderableType
@@ -19,7 +20,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.req import Order, Role
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.cli.driving_modes import SteeringMode
 from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
@@ -148,21 +149,21 @@ class DriveSession:
 
     async def _obey(self, client: TruckClient) -> None:
         """Give the keys' orders, each without waiting for the outcome of the one before; returns at the end."""
-        orders: set[asyncio.Task[None]] = set()
+        outcomes: set[asyncio.Task[GateState]] = set()
         try:
             while (command := await self._commands.get()) != "end":
-                order = asyncio.create_task(self._order(client, command))
-                orders.add(order)
-                order.add_done_callback(orders.discard)
+                self._stream.refusal = ""
+                # The order itself leaves here: a task that is cancelled at the end may never begin.
+                outcome = asyncio.create_task(client.order(command))
+                outcomes.add(outcome)
+                outcome.add_done_callback(partial(self._show_outcome, command))
+                outcome.add_done_callback(outcomes.discard)
         finally:
-            for order in orders:
-                order.cancel()
+            for outcome in outcomes:
+                outcome.cancel()
 
-    async def _order(self, client: TruckClient, order: Order) -> None:
-        self._stream.refusal = ""
-        try:
-            await client.order(order)
-        except TruckError as error:
+    def _show_outcome(self, order: Order, outcome: asyncio.Task[GateState]) -> None:
+        if not outcome.cancelled() and (error := outcome.exception()) is not None:
             self._stream.refusal = f"{order.value} refused: {error}"
 
     async def _ask(self, client: TruckClient) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
+from pydantic import ValidationError
 
 from monstertruck_drivers.catalog import DEVICES, LIDAR, DeviceKind, Duty, Role, start_order
 from monstertruck_drivers.config import Device, Devices, Monitors
@@ -98,7 +99,7 @@ SONAR = Role(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": to
     [
         (SONAR, None),
         (dataclasses.replace(LIDAR, doc="another"), "role lidar: there is another one of that name"),
-        (dataclasses.replace(SONAR, name="so nar"), "expected an identifier"),
+        (dataclasses.replace(SONAR, name="so nar"), "expected a name of small letters"),
         (dataclasses.replace(SONAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
         (
             dataclasses.replace(SONAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/sonar")}),
@@ -111,3 +112,33 @@ def test_a_role_of_another_distribution_must_fit_in(role: Role, fault: str | Non
     kind = dataclasses.replace(DEVICES["os4000"], roles=(role,))
     found = catalog.fault(kind)
     assert (found is None) if fault is None else (found is not None and fault in found)
+
+
+def kind_with(**changes: object) -> DeviceKind:
+    """A kind of another distribution whose role is not quite right."""
+    role = dataclasses.replace(LIDAR, name="sonar", writes={"out": topics.CAMERA})
+    roles = changes["roles"] if "roles" in changes else (dataclasses.replace(role, **changes),)
+    return dataclasses.replace(DEVICES["hokuyo_urg"], roles=roles)
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"roles": ()}, "at least one role"),
+        ({"name": "present"}, "another meaning"),
+        ({"name": "model_config"}, "another meaning"),
+        ({"name": "_x"}, "small letters"),
+        ({"name": "gate"}, "another meaning"),
+        ({"duty": Duty.ACTUATOR}, "actuators are this repository's alone"),
+    ],
+)
+def test_a_role_that_would_harm_the_daemon_is_refused(changes, complaint):
+    assert complaint in (DEVICES.fault(kind_with(**changes)) or "")
+
+
+def test_two_devices_that_publish_one_topic_are_refused(monkeypatch):
+    port = {"port": {"path": "/dev/a"}, "driver": {"kind": "os4000"}}
+    lidar = {"port": {"path": "/dev/b"}, "driver": {"kind": "hokuyo_urg"}}
+    monkeypatch.setitem(DEVICES._roles, "compass", dataclasses.replace(DEVICES.roles["compass"], writes=LIDAR.writes))
+    with pytest.raises(ValidationError, match="lidar and compass both publish sensor/scan"):
+        Devices.model_validate({"compass": port, "lidar": lidar}, strict=False)

@@ -362,3 +362,16 @@ async def test_a_wait_shorter_than_the_loops_timers_may_be_followed_by_a_long_on
         await asyncio.sleep(0.1)
         assert waiter.heard == ["late"]
         link.end_wait()
+
+
+async def test_what_is_written_just_before_closing_arrives():
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    try:
+        link = await SerialPort(Path(os.ttyname(slave))).open()
+        link.write(b"deadman low")
+        link.close()
+        assert os.read(master, 100) == b"deadman low"
+    finally:
+        os.close(master)
+        os.close(slave)

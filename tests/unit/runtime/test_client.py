@@ -295,3 +295,36 @@ def test_a_station_needs_nothing_of_the_robot():
         "sys.exit(bool({'monstertruckd', 'monstertruck_drivers', 'mcap', 'PIL', 'serial'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+async def test_a_stop_withdraws_an_order_that_still_waits_for_the_nonce(monkeypatch):
+    client = TruckClient()
+    known, called, put = asyncio.Event(), [], []
+
+    async def answered(_lease):
+        await known.wait()
+        return {}
+
+    async def call(name, _header, _timeout):
+        called.append(name)
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(client, "_answered", answered)
+    monkeypatch.setattr(client, "_call", call)
+    monkeypatch.setattr(client, "_put", lambda _topic, request: put.append(request.order))
+    monkeypatch.setattr(client, "_header", lambda _lease: header())
+    reset = asyncio.create_task(client.order(Order.RESET))
+    await asyncio.sleep(0)
+    stop = asyncio.create_task(client.order(Order.ESTOP))
+    await asyncio.sleep(0)
+    known.set()
+    with pytest.raises(RequestRefusedError) as refused:
+        await reset
+    assert refused.value.refusal is Reason.BAD_SEQUENCE
+    assert (put, called) == ([Order.ESTOP], ["estop"])
+    stop.cancel()
+    await asyncio.wait([stop])
+
+
+def header():
+    return {"stamp": 1, "received": 1, "seq": 1, "source": "ann", "role": Role.STATION, "lease": 1.0, "nonce": ""}

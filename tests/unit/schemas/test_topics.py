@@ -1,7 +1,10 @@
 """The topic table is consistent: everything else is derived from it."""
 
+import dataclasses
+
 import pytest
 
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import BY_NAME, TOPICS, Topic, TopicTable, Writer, alive_key, rpc_key, topics_of
@@ -43,6 +46,7 @@ def test_every_field_of_every_message_has_a_json_schema():
 
 
 SONAR = """
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic, Writer
 
@@ -92,3 +96,16 @@ def test_reasons_have_stable_exit_codes_and_texts():
     assert all(0 <= reason.exit_code < 126 and reason.text for reason in Reason)
     assert Reason("tilt_stop") is Reason.TILT_STOP
     assert Reason.BAD_CONFIG.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"foxglove": "foxglove.PointCloud"}, "foxglove"),
+        ({"rate": "10"}, "rate"),
+        ({"stale_after": -1.0}, "stale_after"),
+    ],
+)
+def test_a_topic_of_another_distribution_that_the_recorder_could_not_write_is_refused(changes, complaint):
+    row = dataclasses.replace(topics.COMPASS, name="sensor/sonar", **changes)
+    assert complaint in (topics.BY_NAME.fault(row) or "")

@@ -1,9 +1,11 @@
 """The screen of a terminal that is gone."""
 
+import asyncio
 import errno
 import io
 
 from monstertruck_runtime.clock import WallClock
+from monstertruck_schemas.req import Order
 from monstertruckd.tools.cli.drive_session import DriveSession
 
 
@@ -20,3 +22,26 @@ class Gone(io.StringIO):
 async def test_the_screen_of_a_terminal_that_is_gone_ends_quietly():
     session = DriveSession(None, WallClock(), None, Gone())
     await session._draw(None)
+
+
+class Robot:
+    """A client whose orders are published by the call and never answered."""
+
+    def __init__(self) -> None:
+        self.published: list[Order] = []
+
+    def order(self, order: Order):
+        self.published.append(order)
+        return self._outcome()
+
+    async def _outcome(self):
+        await asyncio.Event().wait()
+
+
+async def test_an_emergency_stop_that_the_end_follows_at_once_has_left():
+    robot = Robot()
+    session = DriveSession(None, WallClock(), None, io.StringIO())
+    session._commands.put_nowait(Order.ESTOP)
+    session._commands.put_nowait("end")
+    await asyncio.wait_for(session._obey(robot), 1.0)
+    assert robot.published == [Order.ESTOP]
