@@ -58,4 +58,6 @@ def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_
     assert isinstance(last, DeformAnswer)
     assert plan.poses is not None
     assert last.finding == "new"
-    assert found["tracking"][0][-1].drive[0].speed > 0.0
+    driven = found["tracking"][0][-1]
+    assert driven.drive
+    assert driven.command.speed > 0.0
