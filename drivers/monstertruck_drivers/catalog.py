@@ -186,7 +186,21 @@ class DeviceKind(Plugin):
 
 
 RESERVED: Final = frozenset(
-    {"present", "shafts", "gate", "recorder", "bus", "usb", "tracker", "goals", "slam", "odometry"}
+    {
+        "present",
+        "shafts",
+        "gate",
+        "recorder",
+        "bus",
+        "usb",
+        "clock",
+        "health",
+        "path",
+        "tracker",
+        "goals",
+        "slam",
+        "odometry",
+    }
 )
 """Names of services, and of what a section of the configuration has besides its roles."""
 

@@ -176,11 +176,6 @@ class EmulatedUsb:
         """The hub drops off the bus: its devices vanish, then itself, though every cable is in."""
         self._vanish(self._things[name].name)
 
-    def lose_power(self, hub: str) -> None:
-        """Everything behind a hub vanishes, the hub stays."""
-        for name in self._behind(hub):
-            self._vanish(name)
-
     async def return_hub(self, name: str, clock: Clock, *, first: float = 0.2, between: float = ENUMERATION) -> None:
         """The hub is enumerated again, then, one after the other, what is plugged into it.
 
