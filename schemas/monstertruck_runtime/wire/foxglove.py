@@ -5,7 +5,9 @@ own: the default pool holds the published ones under the same names. Bytes of ve
 are zero, and bytes of any other protobuf writer are read alike.
 """
 
+import itertools
 import math
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -54,28 +56,34 @@ def descriptor_set(name: str) -> bytes:
     return FileDescriptorSet(file=files.values()).SerializeToString(deterministic=True)
 
 
-def _message_class(name: str) -> type[Any]:
+def _message_class(name: str, *, packed: bool) -> type[Any]:
+    """Class of ``name``; ``packed``: with each ``repeated double`` as the ``bytes`` that it is when packed."""
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(descriptor_set(name)).file:
+        for field in itertools.chain.from_iterable(message.field for message in file.message_type if packed):
+            if (field.type, field.label) == (field.TYPE_DOUBLE, field.LABEL_REPEATED):
+                field.type, field.label = field.TYPE_BYTES, field.LABEL_OPTIONAL
         pool.Add(file)
     return GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-def _timestamp(stamp: int) -> dict[str, int]:
-    seconds, nanos = divmod(stamp, SECOND)
-    return {"seconds": seconds, "nanos": nanos}
+def _write_time(timestamp: Any, stamp: int) -> None:
+    timestamp.seconds, timestamp.nanos = divmod(stamp, SECOND)
 
 
 def _nanoseconds(timestamp: Any) -> int:
     return int(timestamp.seconds) * SECOND + int(timestamp.nanos)
 
 
-def _counters(message: Message) -> dict[str, Any]:
-    return {"received": message.received, "seq": message.seq}
+def _write_counters(message: Message, proto: Any) -> None:
+    proto.received = message.received
+    proto.seq = message.seq
 
 
-def _header(message: Message) -> dict[str, Any]:
-    return {"timestamp": _timestamp(message.stamp), "frame_id": message.frame, **_counters(message)}
+def _write_header(message: Message, proto: Any) -> None:
+    _write_time(proto.timestamp, message.stamp)
+    proto.frame_id = message.frame
+    _write_counters(message, proto)
 
 
 def _own_header(proto: Any) -> dict[str, Any]:
@@ -87,9 +95,10 @@ def _own_header(proto: Any) -> dict[str, Any]:
     }
 
 
-def _planar_pose(x: float, y: float, yaw: float) -> dict[str, dict[str, float]]:
-    """A ``foxglove.Pose`` in the plane."""
-    return {"position": {"x": x, "y": y}, "orientation": {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}}
+def _write_planar(pose: Any, x: float, y: float, yaw: float) -> None:
+    """Fill a ``foxglove.Pose`` in the plane."""
+    pose.position.x, pose.position.y = x, y
+    pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
 
 
 def _planar(pose: Any) -> tuple[float, float, float]:
@@ -99,78 +108,90 @@ def _planar(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, yaw
 
 
-def _array(values: Sequence[float]) -> NDArray[np.float64]:
+_Numbers = Sequence[float] | bytes
+"""A field of type ``repeated double``, or its packed bytes."""
+
+
+def _array(numbers: _Numbers) -> NDArray[np.float64]:
     """Read-only array of a repeated field."""
-    array = np.array(values, np.float64)
-    array.flags.writeable = False
-    return array
+    data = numbers if isinstance(numbers, bytes) else np.array(numbers, np.float64).tobytes()
+    if len(data) % 8:
+        msg = f"packed numbers of {len(data)} bytes: expected 8 for each"
+        raise InputError(msg)
+    return np.frombuffer(data, np.float64)
 
 
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
+def _packed(*numbers: float) -> bytes:
+    return struct.pack(f"<{len(numbers)}d", *numbers)
+
+
+def _three(numbers: _Numbers) -> tuple[float, float, float]:
+    values = _array(numbers)
     if len(values) != 3:
         msg = f"expected 3 numbers, got {len(values)}"
         raise InputError(msg)
-    a, b, c = values
+    a, b, c = values.tolist()
     return a, b, c
 
 
-def _pose2d(exact: Sequence[float], pose: Any) -> Pose2D:
+def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
     """Our exact (x, y, yaw) if the writer gave it, else the standard pose."""
     x, y, yaw = _three(exact) if exact else _planar(pose)
     return Pose2D(x=x, y=y, yaw=yaw)
 
 
-_SCAN: Final = ("start_angle", "end_angle", "time_increment", "scan_time", "range_min", "range_max")
-_IDENTITY: Final = _planar_pose(0.0, 0.0, 0.0)
-"""Pose of what is drawn in its own frame."""
-_PackedRanges: Final = GetMessageClass(foxglove_fields_pb2.DESCRIPTOR.message_types_by_name["PackedRanges"])
-
-
-def _write_scan(scan: LaserScan) -> dict[str, Any]:
-    return {
-        **_header(scan),
-        **{name: getattr(scan, name) for name in _SCAN},
-        "pose": _IDENTITY,
-        "codes": scan.codes.tobytes(),
-        "tilt": () if scan.tilt is None else (scan.tilt,),
-    }
-
-
-def _pack_ranges(scan: LaserScan) -> bytes:
-    return _PackedRanges(ranges=scan.ranges.tobytes()).SerializeToString()
+def _write_scan(scan: LaserScan, proto: Any) -> None:
+    _write_header(scan, proto)
+    proto.pose.orientation.w = 1.0
+    proto.start_angle = scan.start_angle
+    proto.end_angle = scan.end_angle
+    proto.time_increment = scan.time_increment
+    proto.scan_time = scan.scan_time
+    proto.range_min = scan.range_min
+    proto.range_max = scan.range_max
+    proto.ranges = scan.ranges.tobytes()
+    proto.codes = scan.codes.tobytes()
+    if scan.tilt is not None:
+        proto.tilt = _packed(scan.tilt)
 
 
 def _read_scan(proto: Any) -> LaserScan:
     return LaserScan(
         **_own_header(proto),
-        **{name: getattr(proto, name) for name in _SCAN},
+        start_angle=proto.start_angle,
+        end_angle=proto.end_angle,
+        time_increment=proto.time_increment,
+        scan_time=proto.scan_time,
+        range_min=proto.range_min,
+        range_max=proto.range_max,
         ranges=_array(proto.ranges),
         codes=np.frombuffer(proto.codes, np.uint8),
-        tilt=proto.tilt[0] if proto.tilt else None,
+        tilt=_array(proto.tilt).item() if proto.tilt else None,
     )
 
 
-def _write_image(image: CompressedImage) -> dict[str, Any]:
-    return {**_header(image), "data": image.data, "format": image.format, "sequence": image.sequence}
+def _write_image(image: CompressedImage, proto: Any) -> None:
+    _write_header(image, proto)
+    proto.data = image.data
+    proto.format = image.format
+    proto.sequence = image.sequence
 
 
 def _read_image(proto: Any) -> CompressedImage:
     return CompressedImage(**_own_header(proto), data=proto.data, format=proto.format, sequence=proto.sequence)
 
 
-def _write_odometry(odometry: Odometry) -> dict[str, Any]:
+def _write_odometry(odometry: Odometry, proto: Any) -> None:
     pose, twist = odometry.pose, odometry.twist
-    return {
-        **_header(odometry),
-        "pose": _planar_pose(pose.x, pose.y, pose.yaw),
-        "child": odometry.child,
-        "pose2d": (pose.x, pose.y, pose.yaw),
-        "twist2d": (twist.vx, twist.vy, twist.wz),
-        "pose_covariance": odometry.pose_covariance.tolist(),
-        "twist_covariance": odometry.twist_covariance.tolist(),
-        "age": odometry.age,
-        "sources": odometry.sources,
-    }
+    _write_header(odometry, proto)
+    _write_planar(proto.pose, pose.x, pose.y, pose.yaw)
+    proto.child = odometry.child
+    proto.pose2d = _packed(pose.x, pose.y, pose.yaw)
+    proto.twist2d = _packed(twist.vx, twist.vy, twist.wz)
+    proto.pose_covariance = odometry.pose_covariance.tobytes()
+    proto.twist_covariance = odometry.twist_covariance.tobytes()
+    proto.age = odometry.age
+    proto.sources.extend(odometry.sources)
 
 
 def _read_odometry(proto: Any) -> Odometry:
@@ -187,19 +208,18 @@ def _read_odometry(proto: Any) -> Odometry:
     )
 
 
-def _write_path(path: Path) -> dict[str, Any]:
+def _write_path(path: Path, proto: Any) -> None:
     if len(path.poses) % 3:
         msg = f"path of {len(path.poses)} numbers: expected (x, y, yaw) of each pose"
         raise InputError(msg)
-    return {
-        **_header(path),
-        "poses": [_planar_pose(*pose) for pose in path.poses.reshape(-1, 3).tolist()],
-        "poses2d": path.poses.tolist(),
-        "directions": path.directions.tolist(),
-        "steering": path.steering,
-        "closed": path.closed,
-        "name": path.name,
-    }
+    _write_header(path, proto)
+    for x, y, yaw in path.poses.reshape(-1, 3).tolist():
+        _write_planar(proto.poses.add(), x, y, yaw)
+    proto.poses2d = path.poses.tobytes()
+    proto.directions = path.directions.tobytes()
+    proto.steering.extend(path.steering)
+    proto.closed = path.closed
+    proto.name = path.name
 
 
 def _read_path(proto: Any) -> Path:
@@ -214,26 +234,19 @@ def _read_path(proto: Any) -> Path:
     )
 
 
-_OCCUPANCY: Final = {"name": "occupancy", "offset": 0, "type": "INT8"}
-"""Description of a grid's one byte per cell."""
-
-
-def _write_grid(grid: Grid) -> dict[str, Any]:
+def _write_grid(grid: Grid, proto: Any) -> None:
     if grid.cells.size != grid.width * grid.height:
         msg = f"grid of {grid.width} x {grid.height} has {grid.cells.size} cells"
         raise InputError(msg)
-    origin = (grid.origin.x, grid.origin.y, grid.origin.yaw)
-    return {
-        **_header(grid),
-        "pose": _planar_pose(*origin),
-        "column_count": grid.width,
-        "cell_size": {"x": grid.resolution, "y": grid.resolution},
-        "row_stride": grid.width,
-        "cell_stride": 1,
-        "fields": (_OCCUPANCY,),
-        "data": grid.cells.tobytes(),
-        "origin2d": origin,
-    }
+    _write_header(grid, proto)
+    origin = grid.origin.x, grid.origin.y, grid.origin.yaw
+    _write_planar(proto.pose, *origin)
+    proto.origin2d = _packed(*origin)
+    proto.column_count = proto.row_stride = grid.width
+    proto.cell_stride = 1
+    proto.cell_size.x = proto.cell_size.y = grid.resolution
+    proto.fields.add(name="occupancy", offset=0, type="INT8")
+    proto.data = grid.cells.tobytes()
 
 
 def _read_grid(proto: Any) -> Grid:
@@ -251,22 +264,21 @@ def _read_grid(proto: Any) -> Grid:
     )
 
 
-def _write_transforms(tree: Transforms) -> dict[str, Any]:
-    return {
-        **_counters(tree),
-        "stamp": tree.stamp,
-        "frame": tree.frame,
-        "transforms": [
-            {
-                "timestamp": _timestamp(transform.stamp),
-                "parent_frame_id": transform.parent,
-                "child_frame_id": transform.child,
-                "translation": dict(zip("xyz", transform.translation, strict=True)),
-                "rotation": dict(zip("xyzw", transform.rotation, strict=True)),
-            }
-            for transform in tree.transforms
-        ],
-    }
+def _write_transforms(tree: Transforms, proto: Any) -> None:
+    _write_counters(tree, proto)
+    proto.stamp = tree.stamp
+    proto.frame = tree.frame
+    for transform in tree.transforms:
+        _write_transform(transform, proto.transforms.add())
+
+
+def _write_transform(transform: Transform, proto: Any) -> None:
+    _write_time(proto.timestamp, transform.stamp)
+    proto.parent_frame_id = transform.parent
+    proto.child_frame_id = transform.child
+    t, q = proto.translation, proto.rotation
+    t.x, t.y, t.z = transform.translation
+    q.x, q.y, q.z, q.w = transform.rotation
 
 
 def _read_transforms(proto: Any) -> Transforms:
@@ -295,17 +307,15 @@ _LEVELS: Final = dict(enumerate(LogLevel, start=1))
 _LEVEL_NUMBERS: Final = {level: number for number, level in _LEVELS.items()}
 
 
-def _write_log(record: LogRecord) -> dict[str, Any]:
-    return {
-        **_counters(record),
-        "timestamp": _timestamp(record.stamp),
-        "frame": record.frame,
-        "level": _LEVEL_NUMBERS[record.level],
-        "message": record.text,
-        "name": record.name,
-        "file": record.file,
-        "line": record.line,
-    }
+def _write_log(record: LogRecord, proto: Any) -> None:
+    _write_counters(record, proto)
+    _write_time(proto.timestamp, record.stamp)
+    proto.frame = record.frame
+    proto.level = _LEVEL_NUMBERS[record.level]
+    proto.message = record.text
+    proto.name = record.name
+    proto.file = record.file
+    proto.line = record.line
 
 
 def _read_log(proto: Any) -> LogRecord:
@@ -327,20 +337,21 @@ class _Binding:
     """How one of our models travels as a well-known message."""
 
     proto: type[Any]
-    write: Callable[[Any], dict[str, Any]]
-    """Model to the protobuf message's fields; raises ``InputError``."""
+    packed: type[Any]
+    """The same message with its numbers packed, see ``_message_class``."""
+    write: Callable[[Any, Any], None]
+    """Fill the packed message from the model; raises ``InputError``."""
     read: Callable[[Any], Message]
-    """Protobuf message to model; raises ``InputError`` or ``pydantic.ValidationError``."""
-    pack: Callable[[Any], bytes] | None = None
-    """Serialized field that ``write`` leaves out; protobuf merges messages that follow each other."""
+    """Message, packed or not, to model; raises ``InputError`` or ``pydantic.ValidationError``."""
 
 
-def _binding(name: str, *functions: Callable[[Any], Any]) -> _Binding:
-    return _Binding(_message_class(f"foxglove.{name}"), *functions)
+def _binding(name: str, write: Callable[[Any, Any], None], read: Callable[[Any], Message]) -> _Binding:
+    proto, packed = (_message_class(f"foxglove.{name}", packed=packed) for packed in (False, True))
+    return _Binding(proto, packed, write, read)
 
 
 _BINDINGS: Final[dict[type[Message], _Binding]] = {
-    LaserScan: _binding("LaserScan", _write_scan, _read_scan, _pack_ranges),
+    LaserScan: _binding("LaserScan", _write_scan, _read_scan),
     CompressedImage: _binding("CompressedImage", _write_image, _read_image),
     Odometry: _binding("PoseInFrame", _write_odometry, _read_odometry),
     Path: _binding("PosesInFrame", _write_path, _read_path),
@@ -357,8 +368,10 @@ def encode(message: Message) -> bytes:
         InputError: it contradicts itself.
     """
     binding = _BINDINGS[type(message)]
-    data: bytes = binding.proto(**binding.write(message)).SerializeToString()
-    return data if binding.pack is None else data + binding.pack(message)
+    proto = binding.packed()
+    binding.write(message, proto)
+    data: bytes = proto.SerializeToString()
+    return data
 
 
 def decode(model: type[Message], data: bytes) -> Message:
@@ -370,7 +383,13 @@ def decode(model: type[Message], data: bytes) -> Message:
     """
     binding = _BINDINGS[model]
     try:
-        proto = binding.proto.FromString(data)
+        return binding.read(_parse_packed(binding.packed, data) or binding.proto.FromString(data))
     except DecodeError as error:
         raise InputError(str(error)) from None
-    return binding.read(proto)
+
+
+def _parse_packed(packed: type[Any], data: bytes) -> Any | None:
+    """Message of ``data`` if its numbers are packed in one piece, as we write them and protobuf need not."""
+    proto = packed.FromString(data)
+    proto.DiscardUnknownFields()
+    return proto if proto.ByteSize() == len(data) else None
