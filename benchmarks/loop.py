@@ -55,7 +55,7 @@ ADDED: dict[str, dict[str, Any]] = {
     "slam": {"slam": {"mode": "mapping"}},
     "planning": {
         "path": None,
-        "planner": {"map": str(ROOMS), "deform": {"kind": "rsband"}},
+        "planner": {"map": str(ROOMS), "local_planner": {"kind": "rsband"}},
         "tracker": {"kind": "lqr"},
         "odometry": {"start": {"x": 1.0, "y": 3.95, "yaw": 0.0}},
         "sim": {"world": {"map": "rooms"}},

@@ -19,6 +19,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Role
 from monstertruckd.config.load import load_config, load_tree
+from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.demo.fast import run_fast_demo
 from monstertruckd.tools.demo.wall import write_overlay
 from monstertruckd.tools.logs.summary import info
@@ -34,7 +35,7 @@ GOALS = ((0.2, -1.7), (0.42, -1.72))
 """ActorFactory (x, y) that the run ``goals`` drives to: asked for by topic, and by remote call."""
 PLANNER = {
     "route": {"kind": "hybrid", "effort": 3000, "unknown": "free"},
-    "deform": {"kind": "rsband"},
+    "local_planner": {"kind": "rsband"},
     "local": {"clearance": 0.6},
     "latency": 0.2,
 }
@@ -43,7 +44,7 @@ PLANNER = {
 
 def short_config(source: Path, folder: Path, **changes: Any) -> Path:
     """``source`` with all it includes and ``changes``, without what fills a log: pictures, every beam."""
-    config: dict[str, Any] = load_tree(source).data | {"version": 1} | changes
+    config: dict[str, Any] = load_tree(source).data | {"version": VERSION} | changes
     config.pop("include", None)
     config["recorder"] = {"compression": "zstd"}
     config["map"] = None

@@ -44,7 +44,7 @@ QUICK: dict[str, Any] = {
     "recorder": None,
     "blackbox": None,
     "planner": {"route": {"effort": 8000}},
-    "placement": {"planner": "loop", "deformer": "loop", "tracker": "loop"},
+    "placement": {"planner": "loop", "local_planner": "loop", "tracker": "loop"},
 }
 
 ROOM = 0.06

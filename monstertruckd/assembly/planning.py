@@ -150,13 +150,13 @@ def _deformation(
     config: TruckConfig, setup: Setup, bus: Bus, clock: Clock, actors: ActorFactory
 ) -> RouteDeformation | None:
     mapped, local = config.slam is not None, setup.config.local
-    if setup.config.deform is None or config.devices.lidar is None:
+    if setup.config.local_planner is None or config.devices.lidar is None:
         return None
     return RouteDeformation(
         setup,
         clock,
         actors.actor(
-            config.placement.deformer,
+            config.placement.local_planner,
             DEFORMING,
             STEPS[DEFORMING],
             latency=local.latency,

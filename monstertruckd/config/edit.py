@@ -1,10 +1,64 @@
 """Edits of YAML text in place: whatever is not named stays as it is, comments too. Pure."""
 
+import json
 from pathlib import Path
+from typing import Final, Self
 
-from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
 
-from monstertruckd.config.load import compose, reader
+from monstertruck_runtime.errors import ConfigError
+
+MOST_BYTES: Final = 1_000_000
+"""Of one file."""
+DEEPEST: Final = 50
+"""Sections and lists within each other."""
+
+
+def reader() -> YAML:
+    """Reads one document of plain data."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    return yaml
+
+
+def node_kind(node: Node) -> str:
+    """What stands there, for complaints."""
+    kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
+    return next((name for kind, name in kinds if isinstance(node, kind)), "a plain value")
+
+
+def _compose(text: str, path: Path) -> MappingNode | None:
+    _check_directives(text, path)
+    try:
+        node = reader().compose(text)
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise ConfigError(
+            f"{path}:{line}: not valid YAML: character {chr(error.character)!r} is not allowed"
+        ) from error
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        too_deep = isinstance(error, MaxDepthExceededError)
+        problem = f"nested more than {DEEPEST} times" if too_deep else f"not valid YAML: {error.problem}"
+        raise ConfigError(f"{path}:{line}: {problem}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{path}:1: not valid YAML: {error}") from error
+    if node is not None and not isinstance(node, MappingNode):
+        raise ConfigError(f"{path}:1: expected a mapping of sections, found {node_kind(node)}")
+    return node
+
+
+def _check_directives(text: str, path: Path) -> None:
+    for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), 1):
+        words = line.split()
+        if words and not line.startswith(("%", "#")):
+            return
+        if words[:1] == ["%YAML"] and words[1:2] != ["1.2"]:
+            raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; leave this line out")
 
 
 class YamlText:
@@ -15,16 +69,31 @@ class YamlText:
         path: its file, for complaints.
 
     Raises:
-        ConfigError: it is not YAML, or something else.
+        ConfigError: it is not YAML 1.2, is nested too deeply, or is something else than a mapping.
     """
 
     def __init__(self, text: str, path: Path) -> None:
-        self.text = text
-        self._path = path
-        self._root()
+        self.path = path
+        self._set(text)
 
-    def _root(self) -> MappingNode | None:
-        return compose(reader(), self.text, self._path)
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Content of a file.
+
+        Raises:
+            ConfigError: it cannot be read, is longer than ``MOST_BYTES``, or is refused as above.
+        """
+        try:
+            if (size := path.stat().st_size) > MOST_BYTES:
+                raise ConfigError(f"{path}:1: {size} bytes: expected a configuration of at most {MOST_BYTES}")
+            return cls(path.read_text(encoding="utf-8"), path)
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+            raise ConfigError(f"{path}: cannot be read: {reason}") from error
+
+    def _set(self, text: str) -> None:
+        self.text = text
+        self.root = _compose(text, self.path)
 
     def node(self, *key: str) -> Node | None:
         """What stands at ``key``; None if nothing does."""
@@ -38,7 +107,7 @@ class YamlText:
 
     def names(self, *key: str) -> list[str]:
         """Keys of the mapping at ``key``; none if there is no mapping."""
-        node = self.node(*key) if key else self._root()
+        node = self.node(*key) if key else self.root
         return [name.value for name, _ in node.value] if isinstance(node, MappingNode) else []
 
     def replace(self, key: tuple[str, ...], text: str) -> bool:
@@ -46,7 +115,7 @@ class YamlText:
         node = self.node(*key)
         if node is None:
             return False
-        self.text = self.text[: node.start_mark.index] + text + self.text[_end(node) :]
+        self._set(self.text[: node.start_mark.index] + text + self.text[_end(node) :])
         return True
 
     def rename(self, key: tuple[str, ...], name: str) -> bool:
@@ -55,11 +124,12 @@ class YamlText:
         if pair is None:
             return False
         start, end = pair[0].start_mark.index, pair[0].end_mark.index
-        self.text = self.text[:start] + name + self.text[end:]
+        quoted = json.dumps(name) if self.text[start] in "\"'" else name
+        self._set(self.text[:start] + quoted + self.text[end:])
         return True
 
     def _pair(self, key: tuple[str, ...]) -> tuple[Node, Node] | None:
-        node = self._root()
+        node = self.root
         pair = None
         for part in key:
             if not isinstance(node, MappingNode):

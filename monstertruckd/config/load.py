@@ -14,23 +14,23 @@ from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
 from monstertruckd.config.calibration import CalibrationStore, with_values
+from monstertruckd.config.edit import YamlText, node_kind, reader
+from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
 from monstertruckd.config.truck import TruckConfig
 
 Key = tuple[str | int, ...]
-Scalar = Callable[[Node], Any]
-"""Gives the value of a scalar node."""
 S = TypeVar("S", bound=Schema)
 T = TypeVar("T", bound=TruckConfig)
 
-VERSION = 1
+MOST_VALUES = 20_000
+"""Of one file; a full configuration has a few hundred."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -115,61 +115,29 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
 # YAML
 
 
-def reader() -> YAML:
-    """Reads one document of plain data."""
-    return YAML(typ="safe", pure=True)
-
-
-def compose(yaml: YAML, text: str, path: Path) -> MappingNode | None:
-    """The root mapping of a YAML text as nodes with positions; None if the text is empty.
-
-    Args:
-        yaml: reads it.
-        text: content.
-        path: its file, for complaints.
-
-    Raises:
-        ConfigError: it is not YAML, or not a mapping.
-    """
-    try:
-        node = yaml.compose(text)
-    except MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise ConfigError(f"{path}:{line}: not valid YAML: {error.problem}") from error
-    except YAMLError as error:
-        raise ConfigError(f"{path}:1: not valid YAML: {error}") from error
-    if node is not None and not isinstance(node, MappingNode):
-        raise ConfigError(f"{path}:1: expected a mapping of sections, found {_kind(node)}")
-    return node
-
-
 def load_tree(path: Path) -> Tree:
     """Read ``path`` and everything it includes; later values win over included ones, mappings merge.
 
-    ``include`` is a file name or a list of them, relative to the including file.
+    ``include`` is a file name or a list of them, relative to the including file. Keys of older versions are read under
+    their present names; the files stay as they are.
 
     Raises:
         ConfigError: a file is missing, is not YAML, repeats a key or includes itself.
     """
-    return _load(path, ())
+    return _load(path, (), None)
 
 
-def _load(path: Path, including: tuple[Path, ...]) -> Tree:
+def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tree:
     if path.resolve() in including:
         raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(f"{path}: cannot be read: {reason}") from error
-    own, yaml = Tree({}), reader()
-    node = compose(yaml, text, path)
-    if node is not None:
-        own.data = _build(node, path, (), own.origins, yaml.constructor.construct_object)
-    return _with_includes(own, path, including)
+    own, text = Tree({}), YamlText.read(path)
+    version = bring_up_to_date(text, inherited)
+    if text.root is not None:
+        own.data = _build(text.root, _Builder(path, own.origins), ())
+    return _with_includes(own, path, including, version)
 
 
-def _with_includes(own: Tree, path: Path, including: tuple[Path, ...]) -> Tree:
+def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: int | None) -> Tree:
     included = own.data.pop("include", [])
     where = own.origins.get(("include",))
     names = [included] if isinstance(included, str) else included
@@ -180,7 +148,7 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...]) -> Tree:
         target = Path(os.path.normpath(path.parent / name))
         if not target.is_file():
             raise ConfigError(f"{where}: include: no such file: {target}")
-        tree = _load(target, (*including, path.resolve()))
+        tree = _load(target, (*including, path.resolve()), version)
         _merge(merged, tree, ())
         merged.files += [] if Path(name).is_absolute() else tree.files
     _merge(merged, own, ())
@@ -192,7 +160,7 @@ def _merge(base: Tree, top: Tree, prefix: Key) -> None:
     below, above = _at(base.data, prefix), _at(top.data, prefix)
     for name, value in above.items():
         key = (*prefix, name)
-        if isinstance(value, dict) and isinstance(below.get(name), dict):
+        if isinstance(value, dict) and isinstance(below.get(name), dict) and not _other_kind(below[name], value):
             _merge(base, top, key)
         else:
             below[name] = value
@@ -201,44 +169,66 @@ def _merge(base: Tree, top: Tree, prefix: Key) -> None:
         base.origins[key] = top.origins[key]
 
 
+def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
+    """Whether ``above`` chooses another ``kind``, so that the keys of the one ``below`` mean nothing to it."""
+    return "kind" in above and above["kind"] != below.get("kind", above["kind"])
+
+
 def _at(data: Any, key: Key) -> dict[str, Any]:
     for part in key:
         data = data[part]
     return cast("dict[str, Any]", data)
 
 
-def _build(node: Node, path: Path, key: Key, origins: dict[Key, Origin], scalar: Scalar) -> Any:
-    line = node.start_mark.line + 1
-    origins.setdefault(key, Origin(path, line))
-    if isinstance(node, MappingNode):
-        return _build_mapping(node, path, key, origins, scalar)
+@dataclass(slots=True)
+class _Builder:
+    """Of one file."""
+
+    path: Path
+    origins: dict[Key, Origin]
+    scalar: Callable[[Node], Any] = field(default_factory=lambda: reader().constructor.construct_object)
+    """Gives the value of a scalar node."""
+    around: list[Node] = field(default_factory=list)
+    """Nodes in which the present one lies."""
+    count: int = 0
+    """Values built."""
+
+
+def _build(node: Node, builder: _Builder, key: Key) -> Any:
+    where = Origin(builder.path, node.start_mark.line + 1)
+    builder.origins.setdefault(key, where)
+    builder.count += 1
+    if builder.count > MOST_VALUES:
+        raise ConfigError(f"{where}: more than {MOST_VALUES} values, those that aliases repeat included")
+    if node in builder.around:
+        raise ConfigError(f"{where}: an alias in its own anchor: the value would contain itself")
+    if isinstance(node, ScalarNode):
+        try:
+            return builder.scalar(node)
+        except (YAMLError, ValueError) as error:
+            raise ConfigError(f"{where}: cannot read the value: {error}") from error
+    builder.around.append(node)
+    built: Any
     if isinstance(node, SequenceNode):
-        return [_build(item, path, (*key, index), origins, scalar) for index, item in enumerate(node.value)]
-    try:
-        return scalar(node)
-    except (YAMLError, ValueError) as error:
-        raise ConfigError(f"{path}:{line}: cannot read the value: {error}") from error
+        built = [_build(item, builder, (*key, index)) for index, item in enumerate(node.value)]
+    else:
+        built = _build_mapping(node, builder, key)
+    builder.around.pop()
+    return built
 
 
-def _build_mapping(
-    node: MappingNode, path: Path, key: Key, origins: dict[Key, Origin], scalar: Scalar
-) -> dict[str, Any]:
+def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name_node, value_node in node.value:
-        line = name_node.start_mark.line + 1
+        where = Origin(builder.path, name_node.start_mark.line + 1)
         name = name_node.value
         if not isinstance(name_node, ScalarNode):
-            raise ConfigError(f"{path}:{line}: a key must be plain text, found {_kind(name_node)}")
+            raise ConfigError(f"{where}: a key must be plain text, found {node_kind(name_node)}")
         if name in result:
-            raise ConfigError(f"{path}:{line}: {name}: given twice in one section")
-        origins[*key, name] = Origin(path, line)
-        result[name] = _build(value_node, path, (*key, name), origins, scalar)
+            raise ConfigError(f"{where}: {name}: given twice in one section")
+        builder.origins[*key, name] = where
+        result[name] = _build(value_node, builder, (*key, name))
     return result
-
-
-def _kind(node: Node) -> str:
-    kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
-    return next((name for kind, name in kinds if isinstance(node, kind)), "a plain value")
 
 
 # Validation
@@ -249,9 +239,7 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
     version = tree.data.get("version")
     if version != VERSION:
         origin = tree.origin(("version",)) or f"{path}:1"
-        older = isinstance(version, int) and 0 <= version < VERSION
-        advice = f"; `monstertruckd config migrate {path}` brings it up to date" if older else ""
-        raise ConfigError(f"{origin}: version: expected {VERSION}, found {version!r}{advice}")
+        raise ConfigError(f"{origin}: version: expected {OLDEST} to {VERSION}, found {version!r}")
     _locate_files(tree, getattr(model, "FILE_KEYS", ()))
     try:
         text = json.dumps(tree.data)

@@ -15,13 +15,35 @@ from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.edit import YamlText
-from monstertruckd.config.load import VERSION
 
 Step = Callable[[YamlText], None]
 """Edits one file from its version to the next; must do nothing to what is already so."""
 
-STEPS: Final[dict[int, Step]] = {}
-"""By the version they start from. Version 1 is the first there has been."""
+RENAMED: Final = (
+    (("gate", "obstacle", "beside"), "side_clearance"),
+    (("placement", "deformer"), "local_planner"),
+    (("planner", "deform"), "local_planner"),
+    (("planner", "ladder"), "recovery"),
+    (("planner", "local", "beside"), "rejoin_distance"),
+    (("planner", "local", "rejoin"), "rejoin_clearance"),
+    (("planner", "route", "greed"), "heuristic_weight"),
+    (("planner", "sightings"), "blocked_scans"),
+    (("slam", "mapper", "thinning"), "pruning"),
+    (("tracker", "turn_within"), "steering_distance"),
+)
+"""Keys of version 1, as of release 0.1.0, and what version 2 calls their last part."""
+
+
+def _rename_keys(text: YamlText) -> None:
+    for key, name in RENAMED:
+        text.rename(key, name)
+
+
+VERSION: Final = 2
+"""Of the configuration files that this program writes."""
+STEPS: Final[dict[int, Step]] = {1: _rename_keys}
+"""By the version they start from."""
+OLDEST: Final = min(STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,31 +91,49 @@ def _visit(
         raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
     if place in upgrades:
         return
-    try:
-        before = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    text = YamlText(before, path)
-    version = _version(text, path, inherited, target)
+    text = YamlText.read(path)
+    before, version = text.text, _version(text, inherited, target)
     for name in _includes(text):
         _visit(path.parent / name, version, steps, target, upgrades, (*including, place))
-    for number in range(version, target):
-        if number not in steps:
-            raise ConfigError(f"{path}: no way from version {number} to {number + 1}")
-        steps[number](text)
-        text.replace(("version",), str(number + 1))
+    _upgrade(text, version, steps, target)
     upgrades[place] = Upgrade(path, version, before, text.text)
 
 
-def _version(text: YamlText, path: Path, inherited: int | None, target: int) -> int:
+def _upgrade(text: YamlText, version: int, steps: Mapping[int, Step], target: int) -> None:
+    for number in range(version, target):
+        if number not in steps:
+            raise ConfigError(f"{text.path}: no way from version {number} to {number + 1}")
+        steps[number](text)
+        text.replace(("version",), str(number + 1))
+
+
+def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
+    """Give the keys of a file of an older version their present names, in memory only.
+
+    Args:
+        text: content of the file.
+        inherited: version of the file that includes it.
+
+    Returns:
+        The version it had; None if that is missing or not known, and nothing was done.
+    """
+    said = text.value("version")
+    version = inherited if text.node("version") is None else int(said) if said and said.isdecimal() else None
+    if version is None or not OLDEST <= version <= VERSION:
+        return None
+    _upgrade(text, version, STEPS, VERSION)
+    return version
+
+
+def _version(text: YamlText, inherited: int | None, target: int) -> int:
     node, said = text.node("version"), text.value("version")
     if node is None and inherited is not None:
         return inherited
     line = 1 if node is None else node.start_mark.line + 1
     if said is None or not said.isdecimal():
-        raise ConfigError(f"{path}:{line}: version: expected a number of 0 to {target}, found {said!r}")
+        raise ConfigError(f"{text.path}:{line}: version: expected a number of 0 to {target}, found {said!r}")
     if int(said) > target:
-        raise ConfigError(f"{path}:{line}: version: {said} is newer than this program, which knows up to {target}")
+        raise ConfigError(f"{text.path}:{line}: version: {said} is newer than this program, which knows up to {target}")
     return int(said)
 
 

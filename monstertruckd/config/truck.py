@@ -76,7 +76,7 @@ class PlacementConfig(Schema):
 
     planner: Literal["loop", "worker", "remote"] = "worker"
     """In the loop only for studies: it stands still meanwhile"""
-    deformer: Literal["loop", "worker", "remote"] = "worker"
+    local_planner: Literal["loop", "worker", "remote"] = "worker"
     """Likewise"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
 
@@ -87,7 +87,7 @@ class TruckConfig(Schema):
     FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"), ("planner", "map"))
     """Keys that name files which must exist; they are relative to the file that says them."""
 
-    version: Literal[1]
+    version: Literal[2]
     robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = "truck"
     """Name of this robot in every key"""
     body: AnyBody = TruckBody()

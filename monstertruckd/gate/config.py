@@ -79,7 +79,7 @@ class ObstacleLimits(Schema):
 
     ahead: Share = 0.05
     """Distance between footprint and obstacle after the stop, m."""
-    beside: Share = 0.02
+    side_clearance: Share = 0.02
     """Clearance to all sides while passing, m, added to the footprint's padding."""
     deceleration: Positive = 0.15
     """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""

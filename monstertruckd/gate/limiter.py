@@ -58,7 +58,7 @@ class ObstacleGuard:
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._stopping(config.speed, delay, config.obstacle.deceleration)
-        self._near = self._reach + footprint.circumscribed_radius + config.obstacle.beside
+        self._near = self._reach + footprint.circumscribed_radius + config.obstacle.side_clearance
         self._distances = np.linspace(0.0, self._reach, POSES)
         self._sweep = lru_cache(SWEEPS)(self._swept)
 
@@ -89,7 +89,7 @@ class ObstacleGuard:
 
     def _free_distance(self, direction: float, front: int, rear: int) -> float:
         poses = self._sweep(direction, front, rear)
-        contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.beside)
+        contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)
         return math.inf if contact is None else float(self._distances[contact - 1])
 
     def allowed_speed(self, free: float, now: int) -> float:

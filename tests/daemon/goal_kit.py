@@ -19,8 +19,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK = {
     "recorder": None,
     "blackbox": None,
-    "planner": {"route": {"effort": 3000, "margin": 0.04}, "deform": None},
-    "placement": {"planner": "loop", "deformer": "loop"},
+    "planner": {"route": {"effort": 3000, "margin": 0.04}, "local_planner": None},
+    "placement": {"planner": "loop", "local_planner": "loop"},
 }
 
 
@@ -71,7 +71,7 @@ class Trip:
 
 def travel(story: Callable[[Trip], Awaitable[None]], **overlay: Any) -> VirtualRig:
     base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
-    config = with_overlay(with_overlay(base, QUICK), {"planner": {"deform": {"kind": "rsband"}}} | overlay)
+    config = with_overlay(with_overlay(base, QUICK), {"planner": {"local_planner": {"kind": "rsband"}}} | overlay)
 
     async def main(clock: VirtualClock) -> VirtualRig:
         rig = VirtualRig(config, clock)

@@ -34,7 +34,7 @@ def test_a_box_put_onto_the_route_is_passed_by_deformation(kind: str):
         assert (Reason.ROUTE_FREE in reasons) or kind == "teb", "whose band need not come back"
         assert Reason.PATH_BLOCKED not in reasons
 
-    rig = travel(story, planner={"deform": {"kind": kind}})
+    rig = travel(story, planner={"local_planner": {"kind": kind}})
     assert_at(rig, 6.0, 3.9, 0.0)
     assert np.ptp(rig.truth.array()[:, 2]) > 0.2, "it went round"
 
@@ -50,7 +50,7 @@ def test_without_a_deformer_the_route_is_planned_anew():
         assert Reason.PATH_BLOCKED in reasons
         assert Reason.ROUTE_DEFORMED not in reasons
 
-    assert_at(travel(story, planner={"deform": None}), 6.0, 3.9, 0.0)
+    assert_at(travel(story, planner={"local_planner": None}), 6.0, 3.9, 0.0)
 
 
 def test_where_the_hall_is_blocked_the_truck_takes_the_way_through_the_rooms():

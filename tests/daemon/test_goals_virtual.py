@@ -176,6 +176,6 @@ def test_planner_and_tracker_drive_the_same_from_wherever_they_are_placed(where:
         assert (await trip.end()).outcome is Reason.GOAL_REACHED
 
     here = travel(story).truth.array()
-    there = travel(story, placement={"planner": where, "deformer": where, "tracker": where}).truth.array()
+    there = travel(story, placement={"planner": where, "local_planner": where, "tracker": where}).truth.array()
     assert here.shape == there.shape
     assert np.abs(here - there).max() < 1e-9

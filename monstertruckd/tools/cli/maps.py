@@ -121,11 +121,12 @@ def load_command(
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import yaml_text
     from monstertruckd.config.load import load_truck
+    from monstertruckd.config.migrate import VERSION
 
     load(place)
     values = {
         "include": str(config.resolve()),
-        "version": 1,
+        "version": VERSION,
         "slam": {"mode": "localisation", "map": str(place.resolve())},
     }
     replace_file(output, yaml_text(values))

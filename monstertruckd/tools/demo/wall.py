@@ -20,6 +20,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.config.load import load_tree
+from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.operator import drive_lap
 from monstertruckd.tools.status.screen import draw
@@ -98,7 +99,7 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
     by_path = (role for role, device in given.get("devices", {}).items() if device and "hub" not in device["port"])
     overlay: dict[str, Any] = {
         "include": str(config.resolve()),
-        "version": 1,
+        "version": VERSION,
         "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in by_path},
         "machine": str(here / "machine"),
         "zenoh": {"listen": [endpoint]},

@@ -14,6 +14,8 @@ from monstertruck_runtime.errors import ConfigError, InputError, TruckError
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
+from monstertruckd.config.edit import YamlText
+from monstertruckd.config.migrate import bring_up_to_date
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.recorder.reader import CONFIG, LogMessage, attached_config
 from monstertruckd.tools.replay_check.goals import GoalRecord
@@ -103,8 +105,10 @@ def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:
     if values is None:
         raise InputError(f"{log}: {CONFIG} is not attached: expected a log that the daemon recorded")
     values.pop(SIMULATION, None)
+    text = YamlText(json.dumps(values, ensure_ascii=False), log / CONFIG)  # every JSON text is one of YAML 1.2
+    bring_up_to_date(text, None)
     try:
-        return TruckConfig.model_validate_json(json.dumps(values))
+        return TruckConfig.model_validate_json(text.text)
     except ValidationError as error:
         faults = error.errors(include_url=False)
         lines = (f"{log}: {CONFIG}: {'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in faults)

@@ -51,7 +51,7 @@ class MapperConfig(Schema):
     """Odometry that moves faster is ignored, m/s, with an allowance in m (stamps come in bursts)."""
     most_keys: Count = 4000
     """Most keyframes; beyond, the most redundant are pruned."""
-    thinning: Positive = 0.1
+    pruning: Positive = 0.1
     """Share of the keyframes that one pruning removes."""
     most_scans: Count = 200_000
     """Most scans of the trajectory; beyond, every second one is dropped."""

@@ -285,7 +285,7 @@ class KeyframeMap:
             its pose in the frame of that one, (n, 3).
         """
         gone, stand_in, edges, spread, odometry = pruned(
-            self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.thinning
+            self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.pruning
         )
         offset = between(self.poses[stand_in], self.poses)
         number = np.cumsum(~gone) - 1

@@ -44,9 +44,9 @@ class LocalConfig(Schema):
 
     clearance: Share = 0.02
     """A route with something nearer than this beside it is deformed, m; what the gate keeps beside the truck."""
-    rejoin: Share = 0.03
+    rejoin_clearance: Share = 0.03
     """More than that is needed to go back to the route, m..."""
-    beside: Positive = 0.06
+    rejoin_distance: Positive = 0.06
     """...and the truck may be this far from it, m, counting 0.3 m a radian."""
     patience: Positive = 2.0
     """Seconds without a way round something after which the route counts as blocked."""
@@ -69,7 +69,7 @@ class PlannerConfig(Schema):
     """Greatest axle angle of routes, rad; what the truck has beyond is left to the tracker"""
     map: Path | None = None
     """map_server YAML file to plan on where there is no slam"""
-    deform: AnyLocalPlanner | None = None
+    local_planner: AnyLocalPlanner | None = None
     """What leads the truck round things that stand on its route; null = the route is planned anew"""
     local: LocalConfig = LocalConfig()
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
@@ -94,9 +94,9 @@ class PlannerConfig(Schema):
     """Metres along the path that are progress."""
     look_ahead: Positive = 1.5
     """Way ahead that is compared with the newest scan, m."""
-    sightings: Annotated[int, Field(ge=1)] = 3
-    """Looks in a row that have to show the way blocked."""
-    ladder: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
+    blocked_scans: Annotated[int, Field(ge=1)] = 3
+    """Consecutive scans that have to show the path blocked."""
+    recovery: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
     """Recovery behaviours, tried in turn before the goal is given up"""
     wait: Positive = 5.0
     """Seconds of the behaviour "wait"."""

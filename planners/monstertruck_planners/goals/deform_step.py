@@ -204,13 +204,13 @@ class DeformStep:
 
     def _set_up(self, setup: Setup) -> None:
         config = setup.config
-        if config.deform is None:
-            raise InputError("deforming: expected planner.deform")
+        if config.local_planner is None:
+            raise InputError("deforming: expected planner.local_planner")
         self._setup, self._way = setup, None
         self._vehicle = Vehicle.truck(
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
-        self._planner = make_local_planner(self._vehicle, config.deform)
+        self._planner = make_local_planner(self._vehicle, config.local_planner)
         self._window = Window()
         if config.map is not None:
             world = load_map(config.map)
@@ -245,11 +245,11 @@ class DeformStep:
         """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked."""
         local, guide, at = setup.config.local, self._guide, self._place
         deformed = self._rest is not None
-        if deformed and pose_distance(guide.poses[at], here) > local.beside:
+        if deformed and pose_distance(guide.poses[at], here) > local.rejoin_distance:
             return False
         end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
         way = np.vstack((here, guide.poses[at + 1 : end]))
-        margin = local.clearance + (local.rejoin if deformed else 0.0)
+        margin = local.clearance + (local.rejoin_clearance if deformed else 0.0)
         relative = poses_relative(moved(way, -self._vehicle.reference), pose)
         return first_contact(setup.footprint, relative, points, margin) is None
 

@@ -117,7 +117,7 @@ class GoalRun:
     """Metres of the present path driven when progress was last observed."""
     moved: float = 0.0
     """When progress was last seen, s."""
-    sightings: int = 0
+    blocked_scans: int = 0
     """Looks in a row that showed the way blocked."""
     blocks: int = 0
     nearest: float = math.inf
@@ -226,10 +226,10 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         run = replace(run, best=observed.along, moved=observed.now)
     if not backing:
         run = _progressed(run, observed.left, config)
-    run = replace(run, sightings=run.sightings + 1 if observed.blocked else 0)
-    if run.sightings >= config.sightings and not backing:
+    run = replace(run, blocked_scans=run.blocked_scans + 1 if observed.blocked else 0)
+    if run.blocked_scans >= config.blocked_scans and not backing:
         text = "the newest scan shows something on the route"
-        run = replace(run, blocks=run.blocks + 1, sightings=0)
+        run = replace(run, blocks=run.blocks + 1, blocked_scans=0)
         if run.blocks > BLOCKS:
             return _recover(run, Reason.PATH_BLOCKED, text, config)
         report = Report(Reason.PATH_BLOCKED, Severity.WARNING, f"goal {run.number}: {text}; plans anew")
@@ -272,9 +272,9 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
 
 def _recover(run: GoalRun, reason: Reason, text: str, config: PlannerConfig) -> Step:
     """Start the next recovery behaviour."""
-    if run.next_recovery >= len(config.ladder):
+    if run.next_recovery >= len(config.recovery):
         return _end(run, reason, text or reason.text)
-    behaviour = config.ladder[run.next_recovery]
+    behaviour = config.recovery[run.next_recovery]
     run = replace(run, next_recovery=run.next_recovery + 1, recoveries=run.recoveries + 1)
     run = replace(run, recovery_distance=run.nearest)
     why = f"{reason.text}{f' ({text})' if text else ''}"
@@ -298,7 +298,7 @@ def _plan(run: GoalRun, config: PlannerConfig, *, clear: bool = False, afresh: b
 
 
 def _set_off(run: GoalRun, phase: GoalPhase) -> GoalRun:
-    return replace(_enter(run, phase), moved=run.now, best=0.0, sightings=0)
+    return replace(_enter(run, phase), moved=run.now, best=0.0, blocked_scans=0)
 
 
 def _enter(run: GoalRun, phase: GoalPhase) -> GoalRun:

@@ -231,8 +231,10 @@ class PlanningStep:
         self._route = result.path
         if result.path is not None:
             return answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"]))
-        if result.poses is None or self._setup.config.deform is None:
-            return PlanAnswer(Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.deform")
+        if result.poses is None or self._setup.config.local_planner is None:
+            return PlanAnswer(
+                Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.local_planner"
+            )
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)

@@ -37,7 +37,7 @@ LOCAL_PLANNERS: Final = Catalog(
 """A local planner is made from the vehicle and its settings; it is a ``LocalPlanner``."""
 
 AnyLocalPlanner = Annotated[LocalPlannerConfig, LOCAL_PLANNERS.section()]
-"""The configuration's section `planner.deform`."""
+"""The configuration's section `planner.local_planner`."""
 
 
 def make_local_planner(vehicle: "Vehicle", config: LocalPlannerConfig) -> "LocalPlanner":

@@ -57,7 +57,7 @@ class HybridConfig(DriveCosts):
     """Hybrid-A* with improvement until the budget is used up."""
 
     kind: Literal["hybrid"] = "hybrid"
-    greed: AtLeastOne = 2.0
+    heuristic_weight: AtLeastOne = 2.0
     """Heuristic weight: a greater one finds a first route sooner."""
     narrow_margin: NotNegative = 0.03
     """Least margin, used where the configured one leaves no way, m."""
@@ -77,7 +77,7 @@ class LatticeConfig(DriveCosts):
     """On the cost of a metre backward."""
     reverse_turn_factor: AtLeastOne = 5.0
     """On the cost of a turn or translation backward."""
-    greed: AtLeastOne = 2.0
+    heuristic_weight: AtLeastOne = 2.0
     """Heuristic weight of the first search; it falls to 1 while there is time."""
 
 

@@ -202,8 +202,8 @@ class _PlanningRun:
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "alternatives": 0}
         self.problem = SearchProblem(
-            self.field, self.footprint, self.layer, planner.table, self.start, self.goal, self.config.greed, budget,
-            self.statistics,
+            self.field, self.footprint, self.layer, planner.table, self.start, self.goal,
+            self.config.heuristic_weight, budget, self.statistics,
         )  # fmt: skip
 
     def route(self) -> RouteResult:

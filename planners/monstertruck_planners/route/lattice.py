@@ -366,7 +366,7 @@ class LatticePlanner:
         if to_go.cost[row, column] >= UNREACHED:
             return RouteResult(Reason.GOAL_UNREACHABLE, text="no way is wide enough")
         best, cost, statistics = None, np.inf, {"expanded": 0.0}
-        for weight in (config.greed, 0.5 * (1 + config.greed), 1.0):
+        for weight in (config.heuristic_weight, 0.5 * (1 + config.heuristic_weight), 1.0):
             segments, found, reason = self._search(field, layer, to_go, ends, budget, weight, cost, statistics)
             if segments is None:
                 break

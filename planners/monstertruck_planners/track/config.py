@@ -65,7 +65,7 @@ class TrackerConfig(Schema):
     steering_rate: Positive = 1.0
     """Greatest turning rate of the axles, rad/s."""
 
-    turn_within: Positive = 0.05
+    steering_distance: Positive = 0.05
     """Way in which the axles can turn as the path asks at the speed chosen, m."""
 
     @property

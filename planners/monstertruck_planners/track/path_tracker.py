@@ -172,8 +172,8 @@ class SpeedProfile:
     def __init__(self, config: TrackerConfig, reference: Reference) -> None:
         s = reference.places
         allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), LEAST)
-        change = np.maximum(reference.axle_change(config.turn_within), LEAST)
-        turning = config.turn_within * config.steering_rate / change
+        change = np.maximum(reference.axle_change(config.steering_distance), LEAST)
+        turning = config.steering_distance * config.steering_rate / change
         gained = 2 * config.deceleration * s
         least = np.minimum.accumulate((np.minimum(allowed, turning**2) + gained)[::-1])[::-1]
         self._rows = np.column_stack((s, np.maximum(least - gained, 0.0)))

@@ -1,6 +1,7 @@
 """YAML with origins: merging, and one clear line for every mistake."""
 
 from pathlib import Path
+from time import process_time
 from typing import Annotated, ClassVar, Literal
 
 import pytest
@@ -29,7 +30,7 @@ class Sonar(Schema):
 
 class Root(Schema):
     FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("map",),)
-    version: Literal[1]
+    version: Literal[2]
     name: str
     wheel: Wheel = Wheel()
     sensors: tuple[Annotated[Lidar | Sonar, Field(discriminator="kind")], ...] = ()
@@ -51,7 +52,7 @@ def complaint(folder: Path, text: str) -> str:
 
 def test_a_good_file(tmp_path: Path):
     config, tree = load_config(
-        write(tmp_path, "version: 1\nname: t\nwheel:\n  radius: 0.1\nsensors:\n  - {kind: sonar, cone: 1}\n"), Root
+        write(tmp_path, "version: 2\nname: t\nwheel:\n  radius: 0.1\nsensors:\n  - {kind: sonar, cone: 1}\n"), Root
     )
     assert config.wheel == Wheel(radius=0.1)
     assert config.sensors == (Sonar(cone=1.0),)
@@ -62,34 +63,34 @@ def test_a_good_file(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "line", "expected"),
     [
-        ("version: 1\nname: t\nwhele: {}\n", 3, "whele: unknown key (did you mean wheel?)"),
-        ("version: 1\nname: t\nwheel:\n  radios: 1\n", 4, "wheel.radios: unknown key (did you mean radius?)"),
-        ("version: 1\nname: t\nwheel:\n  zzz: 1\n", 4, "wheel.zzz: unknown key; known here: count, radius"),
+        ("version: 2\nname: t\nwhele: {}\n", 3, "whele: unknown key (did you mean wheel?)"),
+        ("version: 2\nname: t\nwheel:\n  radios: 1\n", 4, "wheel.radios: unknown key (did you mean radius?)"),
+        ("version: 2\nname: t\nwheel:\n  zzz: 1\n", 4, "wheel.zzz: unknown key; known here: count, radius"),
         (
-            "version: 1\nname: t\nwheel:\n  radius: 75\n",
+            "version: 2\nname: t\nwheel:\n  radius: 75\n",
             4,
             "equal to 1, found 75 (Metres from hub to ground)",
         ),
-        ("version: 1\nname: t\nwheel:\n  radius: 7.5 cm\n", 4, "found '7.5 cm' (Metres from hub to ground)"),
-        ("version: 1\nname: t\nwheel:\n  count: 1.5\n", 4, "wheel.count: "),
-        ("version: 1\n", 1, "name: missing; it has no default"),
-        ("version: 2\nname: t\n", 1, "version: expected 1, found 2"),
-        ("name: t\n", 1, "version: expected 1, found None"),
-        ("version: 1\nname: t\nname: u\n", 3, "name: given twice in one section"),
-        ("version: 1\nname: t\nmap: nowhere.yaml\n", 3, "map: no such file"),
-        ("version: 1\nname: t\ninclude: nowhere.yaml\n", 3, "include: no such file"),
-        ("version: 1\nname: t\ninclude: 7\n", 3, "include: expected a file name or a list"),
-        ("version: 1\nname: t\nwheel: [1]\n", 3, "wheel: "),
-        ("version: 1\nname: [t\n", 3, "not valid YAML"),
+        ("version: 2\nname: t\nwheel:\n  radius: 7.5 cm\n", 4, "found '7.5 cm' (Metres from hub to ground)"),
+        ("version: 2\nname: t\nwheel:\n  count: 1.5\n", 4, "wheel.count: "),
+        ("version: 2\n", 1, "name: missing; it has no default"),
+        ("version: 3\nname: t\n", 1, "version: expected 1 to 2, found 3"),
+        ("name: t\n", 1, "version: expected 1 to 2, found None"),
+        ("version: 2\nname: t\nname: u\n", 3, "name: given twice in one section"),
+        ("version: 2\nname: t\nmap: nowhere.yaml\n", 3, "map: no such file"),
+        ("version: 2\nname: t\ninclude: nowhere.yaml\n", 3, "include: no such file"),
+        ("version: 2\nname: t\ninclude: 7\n", 3, "include: expected a file name or a list"),
+        ("version: 2\nname: t\nwheel: [1]\n", 3, "wheel: "),
+        ("version: 2\nname: [t\n", 3, "not valid YAML"),
         ("- 1\n", 1, "expected a mapping of sections, found a list"),
-        ("version: 1\nname: t\n? [a]\n: 1\n", 3, "a key must be plain text"),
-        ("version: 1\nname: t\nsensors:\n  - {kind: radar}\n", 4, "sensors.0"),
-        ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "sensors.0.beems: unknown key"),
-        ("version: 1\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "known here: cone, kind"),
-        ("version: 1\nname: 2026-11-21\n", 1, "neither text, number, list nor mapping"),
-        ("version: 1\nname: a\x01\n", 1, "not valid YAML"),
-        ("version: 1\nname: t\nspare: yes\n", 3, "found 'yes': write true or false"),
-        ("version: 1\nname: .nan\nwheel:\n  radius: .nan\n", 2, "name: "),
+        ("version: 2\nname: t\n? [a]\n: 1\n", 3, "a key must be plain text"),
+        ("version: 2\nname: t\nsensors:\n  - {kind: radar}\n", 4, "sensors.0"),
+        ("version: 2\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "sensors.0.beems: unknown key"),
+        ("version: 2\nname: t\nsensors:\n  - kind: sonar\n    beems: 3\n", 5, "known here: cone, kind"),
+        ("version: 2\nname: 2026-11-21\n", 1, "neither text, number, list nor mapping"),
+        ("version: 2\nname: a\x01\n", 2, "not valid YAML: character"),
+        ("version: 2\nname: t\nspare: yes\n", 3, "found 'yes': write true or false"),
+        ("version: 2\nname: .nan\nwheel:\n  radius: .nan\n", 2, "name: "),
     ],
 )
 def test_every_mistake_names_file_line_and_expectation(tmp_path: Path, text: str, line: int, expected: str):
@@ -98,13 +99,50 @@ def test_every_mistake_names_file_line_and_expectation(tmp_path: Path, text: str
     assert expected in said
 
 
+BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "expected"),
+    [
+        ("version: 2\na: &a [*a]\n", 2, "an alias in its own anchor"),
+        ("version: 2\na: &a {b: {c: *a}}\n", 2, "an alias in its own anchor"),
+        (BOMB, 3, "more than 20000 values"),
+        ("# mine\n%YAML 1.1\n---\nversion: 2\nspare: yes\n", 2, "%YAML 1.1: expected YAML 1.2"),
+        ("version: 2\nname: a\0b\n", 2, r"not valid YAML: character '\x00' is not allowed"),
+        ("version: 2\nname:\n  " + "[" * 5000, 3, "nested more than 50 times"),
+        ("version: 2\nname:\n" + "".join(f"{' ' * n}a:\n" for n in range(1, 900)), 51, "nested more than 50 times"),
+        ("name: " + "x" * 50_000_000, 1, "50000006 bytes: expected a configuration of at most 1000000"),
+    ],
+    ids=["cycle", "deep cycle", "bomb", "YAML 1.1", "NUL", "flow", "block", "size"],
+)
+def test_hostile_text_is_one_clear_line_within_a_second(tmp_path: Path, text: str, line: int, expected: str):
+    file = write(tmp_path, text)
+    begin = process_time()
+    with pytest.raises(ConfigError) as caught:
+        load_config(file, Root)
+    assert process_time() - begin < 1
+    assert str(caught.value).startswith(f"{file}:{line}: ")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_yaml_1_2_may_be_declared_and_values_repeated(tmp_path: Path):
+    config, _ = load_config(write(tmp_path, "%YAML 1.2\n---\nversion: 2\nname: &n t\nwheel: {radius: 0.1}\n"), Root)
+    assert config.name == "t"
+    tree = load_tree(write(tmp_path, "a: &a {b: [1, 2]}\nc: *a\nd: *a\n"))
+    assert tree.data == {name: {"b": [1, 2]} for name in "acd"}
+
+
 def test_numbers_are_those_of_yaml_1_2(tmp_path: Path):
-    config, _ = load_config(write(tmp_path, "version: 1\nname: t\nwheel: {radius: 1e-1, count: 0o17}\n"), Root)
+    config, _ = load_config(write(tmp_path, "version: 2\nname: t\nwheel: {radius: 1e-1, count: 0o17}\n"), Root)
     assert config.wheel == Wheel(radius=0.1, count=15)
 
 
 def test_several_mistakes_are_several_lines(tmp_path: Path):
-    said = complaint(tmp_path, "version: 1\nname: 3\nwheel:\n  radios: 1\n  count: many\n")
+    said = complaint(tmp_path, "version: 2\nname: 3\nwheel:\n  radios: 1\n  count: many\n")
     assert len(said.splitlines()) == 3
 
 
@@ -119,7 +157,7 @@ def test_an_unreadable_file_is_named(tmp_path: Path):
 def test_includes_merge_deeply_and_later_wins(tmp_path: Path):
     write(tmp_path, "wheel: {radius: 0.2, count: 3}\nname: base\n", "base.yaml")
     write(tmp_path, "wheel: {count: 6}\nsensors: [{kind: lidar}]\n", "more.yaml")
-    top = write(tmp_path, "include: [base.yaml, more.yaml]\nversion: 1\nwheel:\n  radius: 0.3\n")
+    top = write(tmp_path, "include: [base.yaml, more.yaml]\nversion: 2\nwheel:\n  radius: 0.3\n")
     config, tree = load_config(top, Root)
     assert config.name == "base"
     assert config.wheel == Wheel(radius=0.3, count=6)
@@ -127,11 +165,22 @@ def test_includes_merge_deeply_and_later_wins(tmp_path: Path):
     assert [str(origin.file.name) for origin in origins.values() if origin] == ["truck.yaml", "more.yaml", "base.yaml"]
 
 
+def test_another_kind_drops_the_keys_of_the_included_one(tmp_path: Path):
+    write(tmp_path, "tracker: {kind: pure_pursuit, lookahead: 0.3}\n", "base.yaml")
+    write(tmp_path, "include: base.yaml\ntracker:\n  kind: lqr\n", "other.yaml")
+    write(tmp_path, "include: base.yaml\ntracker: {kind: pure_pursuit, speed: 0.1}\n", "same.yaml")
+    other, same = load_tree(tmp_path / "other.yaml"), load_tree(tmp_path / "same.yaml")
+    assert other.data["tracker"] == {"kind": "lqr"}
+    assert ("tracker", "lookahead") not in other.origins
+    assert str(other.origins["tracker", "kind"]) == f"{tmp_path / 'other.yaml'}:3"
+    assert same.data["tracker"] == {"kind": "pure_pursuit", "lookahead": 0.3, "speed": 0.1}
+
+
 def test_files_are_relative_to_the_file_that_names_them(tmp_path: Path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "arena.yaml").touch()
     write(tmp_path, "map: arena.yaml\n", "sub/maps.yaml")
-    config, _ = load_config(write(tmp_path, "include: sub/maps.yaml\nversion: 1\nname: t\n"), Root)
+    config, _ = load_config(write(tmp_path, "include: sub/maps.yaml\nversion: 2\nname: t\n"), Root)
     assert config.map == tmp_path / "sub" / "arena.yaml"
 
 

@@ -1,5 +1,6 @@
 """Older configuration files become present ones, in steps, with their comments and with a way back."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -7,8 +8,10 @@ import pytest
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruckd.config.edit import YamlText
-from monstertruckd.config.load import load_config, load_tree
+from monstertruckd.config.load import load_config, load_tree, load_truck
 from monstertruckd.config.migrate import Step, carry_out, plan
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.replay_check.recorded import recorded_config
 from tests.unit.config.test_loading import Root
 
 OLD = """# my robot
@@ -108,9 +111,79 @@ def test_a_hole_in_the_chain_is_said(old: Path):
         plan(old, {0: _to_robot}, 2)
 
 
-def test_an_old_file_names_the_command_that_mends_it(old: Path):
-    with pytest.raises(ConfigError, match=r"version: expected 1, found 0; `monstertruckd config migrate .*old\.yaml`"):
+def test_a_version_without_a_way_up_is_refused(old: Path):
+    with pytest.raises(ConfigError, match=r"old\.yaml:2: version: expected 1 to 2, found 0"):
         load_config(old, Root)
+
+
+RELEASE_0_1_0 = """version: 1
+robot: rover
+include: {base}
+planner:
+  map: {map}
+  deform: {{ kind: rsband }}  # round obstacles
+  ladder: [wait, replan]
+  "sightings": 4
+  local: {{ beside: 0.07, rejoin: 0.02 }}
+  route: {{ kind: hybrid, greed: 1.5 }}
+placement: {{ deformer: loop }}
+gate:
+  obstacle: {{ beside: 0.03 }}
+slam:
+  mapper: {{ thinning: 0.2 }}
+tracker:
+  kind: lqr
+  turn_within: 0.06
+"""
+
+
+@pytest.fixture
+def release_0_1_0(tmp_path: Path) -> Path:
+    """A configuration with every key that has another name since."""
+    configs = Path(__file__).resolve().parents[3] / "configs"
+    file = tmp_path / "truck.yaml"
+    file.write_text(RELEASE_0_1_0.format(base=configs / "truck.yaml", map=configs / "worlds" / "rooms.yaml"))
+    return file
+
+
+def check_0_1_0(config: TruckConfig) -> None:
+    planner = config.planner
+    assert planner is not None
+    assert planner.local_planner is not None
+    assert planner.local_planner.kind == "rsband"
+    assert (planner.recovery, planner.blocked_scans) == (("wait", "replan"), 4)
+    assert (planner.local.rejoin_distance, planner.local.rejoin_clearance) == (0.07, 0.02)
+    assert planner.route.heuristic_weight == 1.5
+    assert config.placement.local_planner == "loop"
+    assert config.gate.obstacle.side_clearance == 0.03
+    assert config.slam is not None
+    assert config.slam.mapper.pruning == 0.2
+    assert config.tracker is not None
+    assert config.tracker.steering_distance == 0.06
+
+
+def test_a_configuration_of_0_1_0_is_read_as_it_is(release_0_1_0: Path):
+    before = release_0_1_0.read_text()
+    config, tree = load_truck(release_0_1_0)
+    check_0_1_0(config)
+    assert str(tree.origin(("planner", "recovery"))) == f"{release_0_1_0}:7"
+    assert release_0_1_0.read_text() == before
+
+
+def test_a_configuration_of_0_1_0_is_migrated(release_0_1_0: Path):
+    carry_out(plan(release_0_1_0))
+    text = release_0_1_0.read_text()
+    assert text.startswith("version: 2\n")
+    assert "  local_planner: { kind: rsband }  # round obstacles\n  recovery: [wait, replan]\n" in text
+    assert plan(release_0_1_0) == []
+    check_0_1_0(load_truck(release_0_1_0)[0])
+
+
+def test_the_configuration_in_a_log_of_0_1_0_is_read(release_0_1_0: Path):
+    values = load_tree(release_0_1_0).data | {"version": 1}
+    values["planner"] |= {"ladder": values["planner"].pop("recovery")}
+    values["gate"] = {"obstacle": {"beside": 0.03}}
+    check_0_1_0(recorded_config(Path("run.mcap"), {"config.json": json.dumps(values).encode()}))
 
 
 def test_edits_touch_nothing_else():

@@ -233,7 +233,7 @@ def test_a_stale_odometry_does_not_spoil_the_map():
 
 def test_the_map_stays_bounded_and_right():
     truth = rounds(420, 3.0)
-    mapper = Mapper(MapperConfig(most_keys=90, thinning=0.1, most_scans=300))
+    mapper = Mapper(MapperConfig(most_keys=90, pruning=0.1, most_scans=300))
     steps = drive(mapper, ROOM, truth, drifting(truth))
     assert any(MappingEvent.PRUNED in step.events for step in steps)
     assert len(mapper.map) <= 90

@@ -53,7 +53,7 @@ def room() -> Grid:
 
 def begun(route: np.ndarray = ROUTE, directions: np.ndarray | None = None) -> tuple[DeformStep, DeformTask]:
     """A step, and its first task."""
-    config = PlannerConfig(deform=RsbandConfig())
+    config = PlannerConfig(local_planner=RsbandConfig())
     setup = Setup(config, FourWheelSteering(), Footprint(), ORIGIN)
     way = Way(1, route, np.ones(len(route)) if directions is None else directions)
     return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way)
@@ -129,7 +129,7 @@ def test_a_setup_with_a_deformer_comes_first():
     with pytest.raises(InputError, match="setup"):
         step.step(DeformTask(first.scan, ORIGIN))
     setup = Setup(PlannerConfig(), FourWheelSteering(), Footprint(), ORIGIN)
-    with pytest.raises(InputError, match=r"planner\.deform"):
+    with pytest.raises(InputError, match=r"planner\.local_planner"):
         step.step(DeformTask(first.scan, ORIGIN, setup))
     assert first.setup is not None
     assert step.step(DeformTask(first.scan, ORIGIN, first.setup)).finding == "idle"

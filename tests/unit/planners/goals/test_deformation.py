@@ -60,7 +60,7 @@ class Stage:
         self.told: list[tuple[Finding, Finding]] = []
         self.events: list[Reason] = []
         self.deformation = RouteDeformation(
-            Setup(PlannerConfig(deform=RsbandConfig()), FourWheelSteering(), Footprint()),
+            Setup(PlannerConfig(local_planner=RsbandConfig()), FourWheelSteering(), Footprint()),
             clock, self.actor, scan=self.scans, pose=self.poses, grid=None,
             events=lambda reason, *_, **__: self.events.append(reason),
         )  # fmt: skip

@@ -104,7 +104,7 @@ def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
 def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     story = Story()
     story.tell(answer=WAY)
-    assert story.tell(CONFIG.sightings - 1, blocked=True, along=0.2) == ()
+    assert story.tell(CONFIG.blocked_scans - 1, blocked=True, along=0.2) == ()
     actions = story.tell(blocked=True, along=0.3)
     assert (told(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
@@ -157,7 +157,7 @@ def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
 
 
 def test_a_failed_escape_is_the_next_rung():
-    story = Story(PlannerConfig(ladder=("back_out", "wait")))
+    story = Story(PlannerConfig(recovery=("back_out", "wait")))
     story.tell(answer=PlanAnswer(Reason.START_BLOCKED))
     story.tell(answer=PlanAnswer(Reason.STUCK, "both ends"))
     assert story.phase is GoalPhase.WAITING

@@ -79,14 +79,16 @@ def test_one_spot_is_as_one_of_many():
 
 
 def test_the_pace_lets_every_curve_ahead_be_reached_slowly_enough():
-    config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, turn_within=0.1, steering_rate=0.5)
+    config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, steering_distance=0.1, steering_rate=0.5)
     found = course(path(figure_eight(), closed=True), "front")
     pace = SpeedProfile(config, found)
     s = found.places
     speed = np.array([pace.at(place) for place in s.tolist()])
     curvature = np.maximum(np.abs(found.at(s).curvature), 1e-6)
     assert (speed**2 * curvature <= config.lateral_acceleration + 1e-9).all()
-    assert (speed * found.axle_change(config.turn_within) <= config.turn_within * config.steering_rate + 1e-9).all()
+    assert (
+        speed * found.axle_change(config.steering_distance) <= config.steering_distance * config.steering_rate + 1e-9
+    ).all()
     assert (np.diff(speed**2) >= -2 * config.deceleration * np.diff(s) - 1e-9).all()
     for i in range(0, len(s), 25):  # and no slower than that
         bound = np.minimum(

@@ -34,7 +34,7 @@ def room() -> Grid:
 def deform_tasks() -> list[DeformTask]:
     """Something stands on a straight route, seen three times."""
     poses = np.column_stack((np.arange(1.0, 5.01, 0.05), np.full(81, 1.5), np.zeros(81)))
-    setup = Setup(PlannerConfig(deform=RsbandConfig()), TRUCK, BODY, (0.14, 0.0, 0.0))
+    setup = Setup(PlannerConfig(local_planner=RsbandConfig()), TRUCK, BODY, (0.14, 0.0, 0.0))
     ranges = np.full(241, np.inf)
     ranges[110:125] = 1.2
     scan = LaserScan(

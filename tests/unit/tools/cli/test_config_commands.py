@@ -71,13 +71,13 @@ def older(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_migrate_writes_and_says_so(older: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     assert run(monkeypatch, "config", "migrate", str(older), "--dry-run") == 0
-    assert "-bot: rover  # mine\n+version: 1\n+robot: rover  # mine\n" in capsys.readouterr().out
+    assert "-bot: rover  # mine\n+version: 2\n+robot: rover  # mine\n" in capsys.readouterr().out
     assert run(monkeypatch, "config", "migrate", str(older), "--json") == 0
     (file,) = json.loads(capsys.readouterr().out)["files"]
     assert (file["version"], file["previous"]) == (0, f"{older}.v0")
-    assert older.read_text() == "version: 1\nrobot: rover  # mine\n"
+    assert older.read_text() == "version: 2\nrobot: rover  # mine\n"
     assert run(monkeypatch, "config", "migrate", str(older)) == 0
-    assert capsys.readouterr().err == f"{older}: up to date, version 1\n"
+    assert capsys.readouterr().err == f"{older}: up to date, version 2\n"
 
 
 TRUCK = """version: 1
