@@ -299,26 +299,49 @@ class ScanPoints:
         return self._newest[1]
 
 
+TILE = 64
+"""Edge of the squares by which changes of a grid are found, cells."""
+
+Box = tuple[int, int, int, int]
+"""First row, first column, and those after the last."""
+
+
+def boxes_of(mask: NDArray[np.bool_]) -> list[Box]:
+    """Boxes that hold all marked cells of a grid (rows, columns), one for each square of TILE cells with any."""
+    boxes = []
+    for row in np.flatnonzero(np.logical_or.reduceat(mask.any(axis=1), np.arange(0, len(mask), TILE))) * TILE:
+        strip = mask[row : row + TILE]
+        columns = np.arange(0, mask.shape[1], TILE)
+        for column in np.flatnonzero(np.logical_or.reduceat(strip.any(axis=0), columns)) * TILE:
+            rows_in, columns_in = np.nonzero(strip[:, column : column + TILE])
+            top, left, bottom, right = rows_in.min(), columns_in.min(), rows_in.max() + 1, columns_in.max() + 1
+            boxes.append((int(row + top), int(column + left), int(row + bottom), int(column + right)))
+    return boxes
+
+
 class DistanceField:
     """Distance to the nearest occupied cell of a grid, and footprint-true checks on it.
 
     Obstacles are the squares of occupied cells; everything outside the grid is occupied.
-    Built in workers only: the constructor loads scipy, the checks load numba.
+    Built in workers only: it loads numba.
 
     Args:
         occupied: shape (rows, columns), bool, row 0 at the lowest y.
         resolution: metres per cell.
         origin: pose (x, y, yaw) of the outer corner of cell (0, 0).
+        previous: of the same place before: only the surroundings of what differs are computed again.
 
     Raises:
         InputError: a grid that is not two-dimensional, or empty, or a resolution not above zero.
     """
 
     def __init__(
-        self, occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self,
+        occupied: NDArray[np.bool_],
+        resolution: float,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        previous: "DistanceField | None" = None,
     ) -> None:
-        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - workers only
-
         if occupied.ndim != 2 or occupied.size == 0 or not resolution > 0:
             msg = (
                 f"grid of shape {occupied.shape}, resolution {resolution} m: "
@@ -329,8 +352,42 @@ class DistanceField:
         self.origin = origin
         # One ring of occupied cells stands for everything outside.
         self._occupied: NDArray[np.bool_] = np.pad(occupied, 1, constant_values=True)
-        distance = np.asarray(distance_transform_edt(~self._occupied, sampling=resolution))
-        self._distance: NDArray[np.float32] = distance.astype(np.float32)
+        self._distance: NDArray[np.float32]
+        self.changes: list[Box] | None = None
+        """Parts of the grid with its ring in which the field may differ from ``previous``; None: everywhere."""
+        if previous is not None and previous.same_place(self._occupied.shape, resolution, origin):
+            self._update(previous)
+        else:
+            self._compute()
+
+    def same_place(self, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float]) -> bool:
+        """Whether this field is of a grid of that shape (with its ring), resolution and origin."""
+        return (self._occupied.shape, self.resolution, self.origin) == (shape, resolution, origin)
+
+    def _compute(self) -> None:
+        from monstertruck_planners.distance_kernels import fill_distances  # noqa: PLC0415 - workers only
+
+        whole = (0, 0, *self._occupied.shape)
+        self._distance = np.empty(self._occupied.shape, np.float32)
+        fill_distances(self._occupied, self.resolution, whole, whole, self._distance)
+
+    def _update(self, previous: "DistanceField") -> None:
+        from monstertruck_planners.distance_kernels import update_distances  # noqa: PLC0415 - workers only
+
+        before = previous.data()
+        boxes = boxes_of(self._occupied != before.occupied)
+        if 2 * sum((box[2] - box[0]) * (box[3] - box[1]) for box in boxes) > self._occupied.size:
+            self._compute()
+            return
+        self._distance = before.distance
+        self.changes = []
+        if boxes:
+            # One box after the other: each update starts from distances that are right for the cells before it.
+            occupied, self._distance = before.occupied.copy(), before.distance.copy()
+            for box in boxes:
+                part = np.s_[box[0] : box[2], box[1] : box[3]]
+                occupied[part] = self._occupied[part]
+                self.changes.append(update_distances(self._distance, occupied, self.resolution, box))
 
     @classmethod
     def from_grid(cls, grid: Grid, *, unknown_blocks: bool = True) -> "DistanceField":

@@ -32,6 +32,11 @@ MANY_TIMERS: Final = 100
 """From so many on, cancelled timers are cleared away."""
 
 
+def processor_time() -> float:
+    """Processor time of the calling thread, s: what a computation has used, whatever else the computer does."""
+    return time.thread_time()
+
+
 class Clock(Protocol):
     """What a service may know of time."""
 

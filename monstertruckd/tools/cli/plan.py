@@ -49,7 +49,7 @@ def plan(
     ] = SteeringChoice.BOTH,
     via: ViaOption = None,
     unknown: Annotated[UnknownChoice, typer.Option(help="How unknown cells are regarded.")] = UnknownChoice.BLOCKED,
-    budget: Annotated[float, typer.Option(min=0.01, help="Time for the route and its improvement, s.")] = 1.0,
+    budget: Annotated[float, typer.Option(min=0.01, help="Processor time for the route and its improvement, s.")] = 1.0,
     reproducible: Annotated[
         bool, typer.Option("--reproducible", help="Limit the work instead of the time: equal inputs give equal routes.")
     ] = False,
@@ -62,7 +62,7 @@ def plan(
     """
     from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
     from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
-    from monstertruck_runtime.clock import SECOND, WallClock
+    from monstertruck_runtime.clock import processor_time
     from monstertruck_runtime.map_files import load_map
 
     world = load_map(map_file)
@@ -70,10 +70,9 @@ def plan(
     vehicle = Vehicle.truck(steering.value)
     settings: Any = ROUTE_PLANNERS.find(planner).settings_class()
     planning = make_planner(vehicle, settings(kind=planner, budget=budget, unknown=unknown.value))
-    clock = WallClock()
     if not reproducible:
         warm_up(planning)
-    now = None if reproducible else (lambda: clock.now() / SECOND)
+    now = None if reproducible else processor_time
     result = _route(planning, route_map, vehicle, (parse_pose(start), parse_pose(goal)), via or [], now)
     if picture is not None:
         _draw(picture, world, vehicle, result, map_file.stem)

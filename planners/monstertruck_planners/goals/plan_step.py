@@ -21,7 +21,7 @@ from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
-from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_runtime.clock import processor_time
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import Steering
@@ -116,23 +116,25 @@ class StaticMap:
         cells: shape (rows, columns), percent, -1 unknown; row 0 at the lowest y.
         resolution: m.
         origin: pose of the outer corner of cell (0, 0).
+        previous: the map before: only what differs is computed again.
     """
 
-    def __init__(self, cells: Cells, resolution: float, origin: Pose) -> None:
+    def __init__(self, cells: Cells, resolution: float, origin: Pose, previous: "StaticMap | None" = None) -> None:
         self.cells = cells
         self.resolution = resolution
         self.origin = origin
-        self._walls = DistanceField(cells >= OCCUPIED, resolution, origin)
+        self.walls = DistanceField(cells >= OCCUPIED, resolution, origin, previous.walls if previous else None)
+        """Distance to the map's obstacles."""
 
     @classmethod
-    def of(cls, grid: Grid) -> "StaticMap":
+    def of(cls, grid: Grid, previous: "StaticMap | None" = None) -> "StaticMap":
         """Of a message."""
         cells = grid.cells.reshape(grid.height, grid.width)
-        return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
+        return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), previous)
 
     def unexplained(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
         """Whether no obstacle of the map explains each point (n, 2): it is further than ``tolerance`` from all, m."""
-        return np.asarray(self._walls.lookup(points) > tolerance + self.resolution / 2)
+        return np.asarray(self.walls.lookup(points) > tolerance + self.resolution / 2)
 
     def with_points(self, points: Array) -> Cells:
         """Cells with the points' ones occupied."""
@@ -158,6 +160,7 @@ class PlanningStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._map: StaticMap | None = None
+        self._route_map: RouteMap | None = None
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
         self._now: Clock | None = None
@@ -173,7 +176,7 @@ class PlanningStep:
         if self._setup is None:
             raise InputError("planning: expected a setup before anything else")
         if task.grid is not None:
-            self._map = StaticMap.of(task.grid)
+            self._map = StaticMap.of(task.grid, self._map)
         if self._map is None:
             return PlanAnswer(Reason.NO_MAP, "no map yet")
         places = [value for place in task.via for value in place if value is not None]
@@ -193,8 +196,7 @@ class PlanningStep:
         self._planner = make_planner(self._vehicle, config.route)
         self._tight = make_planner(self._vehicle, config.route.model_copy(update={"margin": 0.0}))
         if setup.timed:
-            clock = WallClock()
-            self._now = lambda: clock.now() / SECOND
+            self._now = processor_time
         if config.map is not None:
             world = load_map(config.map)
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
@@ -217,8 +219,12 @@ class PlanningStep:
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
         cells = static_map.with_points(points) if len(points) else static_map.cells
-        route_map = RouteMap.from_cells(
-            cells, static_map.resolution, static_map.origin, self._setup.config.route.unknown
+        self._route_map = route_map = RouteMap.from_cells(
+            cells,
+            static_map.resolution,
+            static_map.origin,
+            self._setup.config.route.unknown,
+            previous=self._route_map,
         )
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])

@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from dataclasses import dataclass, replace
+from dataclasses import field as attribute
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceField, Footprint
+from monstertruck_planners.collision import OCCUPIED, Box, DiscFootprint, DistanceField, Footprint, boxes_of
+from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.config import DriveCosts, GoalConfig, Unknown
+from monstertruck_planners.route.heuristic import COARSE_CELL, CellRule, fill_cell_costs
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from monstertruck_planners.route.search import CostLayer
@@ -22,9 +25,40 @@ from monstertruck_schemas.reasons import Reason
 Clock = Callable[[], float]
 
 
+TerrainWeights = tuple[float, float, float]
+"""Extra cost of a metre on unknown ground, for each radian of tilt, for each metre of roughness, m."""
+
+
+class RouteCosts(NamedTuple):
+    """What ground costs a vehicle."""
+
+    terrain: TerrainWeights
+    clearance: float
+    """Distance from the footprint's side to obstacles at which a metre costs nothing more, m."""
+    clearance_cost: float
+    """Extra cost of a metre in contact, m."""
+    closed: float
+    """Least distance of the vehicle's point to obstacles, m."""
+    side: float
+    """Half the width of the footprint, m."""
+    wide: float
+    """Distance to obstacles that leaves room for turning, m."""
+
+    @classmethod
+    def of(cls, vehicle: "Vehicle", config: DriveCosts) -> "RouteCosts":
+        """Of a vehicle, with the weights of a configuration."""
+        footprint = vehicle.footprint.data()
+        side = footprint.half_width or footprint.radius
+        return cls(
+            (config.unknown_cost, config.tilt_cost, config.roughness_cost), config.clearance or 1.0,
+            config.clearance_cost if config.clearance > 0.0 else 0.0, footprint.inscribed + config.margin, side,
+            side + 0.25 * vehicle.radius,
+        )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class RouteMap:
-    """Map to plan on.
+    """Map to plan on. Costs of its cells are computed when they are first asked for, and kept.
 
     Args:
         field: obstacles.
@@ -40,6 +74,10 @@ class RouteMap:
     unknown: NDArray[np.bool_] | None = None
     tilt: Array | None = None
     roughness: Array | None = None
+    terrains: dict[TerrainWeights, NDArray[np.float32]] = attribute(default_factory=dict, init=False, repr=False)
+    """Computed so far: extra cost of a metre in each cell of the ringed grid."""
+    coarse: dict[RouteCosts, NDArray[np.int16]] = attribute(default_factory=dict, init=False, repr=False)
+    """Computed so far: see ``cell_costs``."""
 
     def __post_init__(self) -> None:
         shape = tuple(n - 2 for n in self.field.data().occupied.shape)
@@ -52,36 +90,87 @@ class RouteMap:
     def from_cells(
         cls, cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None,
+        previous: "RouteMap | None" = None,
     ) -> "RouteMap":  # fmt: skip
-        """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y."""
+        """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y.
+
+        ``previous`` is the map before: what was computed for it is kept where nothing differs.
+        """
         occupied = cells >= OCCUPIED
         unseen = cells < 0
         if unknown == "blocked":
             occupied = occupied | unseen
-        return cls(DistanceField(occupied, resolution, origin), unseen if unknown == "dear" else None, tilt, roughness)
+        distances = DistanceField(occupied, resolution, origin, previous.field if previous else None)
+        result = cls(distances, unseen if unknown == "dear" else None, tilt, roughness)
+        if previous is not None and distances.changes is not None:
+            result._take_over(previous, distances.changes)
+        return result
 
-    def cost_layer(self, costs: DriveCosts, contact: float) -> CostLayer:
-        """Extra costs of all cells.
+    def _take_over(self, previous: "RouteMap", changes: list[Box]) -> None:
+        """Costs of the map before, computed again where something differs."""
+        for name in ("unknown", "tilt", "roughness"):
+            new, old = getattr(self, name), getattr(previous, name)
+            if (new is None) != (old is None):
+                return
+            if new is not None and new is not old:
+                changes = changes + [(r + 1, c + 1, r1 + 1, c1 + 1) for r, c, r1, c1 in boxes_of(new != old)]
+        factor = self.coarse_factor
+        for weights, terrain in previous.terrains.items():
+            self.terrains[weights] = terrain.copy()
+            for box in changes:
+                self._fill_terrain(weights, self.terrains[weights], box)
+        for costs, cells in previous.coarse.items():
+            self.coarse[costs] = cells.copy()
+            layer, rule = self.cost_layer(costs), self._rule(costs)
+            for r, c, r1, c1 in changes:
+                box = (r // factor, c // factor, -(-r1 // factor), -(-c1 // factor))
+                fill_cell_costs(self.field.data().distance, layer, rule, box, self.coarse[costs])
 
-        Args:
-            costs: weights.
-            contact: distance to a cell's centre at which the footprint's side touches it, m.
-        """
-        data = self.field.data()
-        cost = np.zeros((0, 0), np.float32)
-        for amount, weight in (
-            (self.unknown, costs.unknown_cost),
-            (self.tilt, costs.tilt_cost),
-            (self.roughness, costs.roughness_cost),
-        ):
-            if amount is not None and weight > 0.0:
-                if not cost.size:
-                    cost = np.zeros(data.distance.shape, np.float32)
-                cost[1:-1, 1:-1] += weight * np.abs(amount)
-        if costs.clearance > 0.0 and costs.clearance_cost > 0.0:
-            near = costs.clearance_cost * np.clip(1.0 - (data.distance - contact) / costs.clearance, 0.0, 1.0)
-            cost = near.astype(np.float32) + (cost if cost.size else np.float32(0.0))
-        return CostLayer(cost)
+    @property
+    def coarse_factor(self) -> int:
+        """Cells of the grid per cell of the coarse one, each way."""
+        return max(round(COARSE_CELL / self.field.resolution), 1)
+
+    @property
+    def coarse_cell(self) -> float:
+        """Size of a coarse cell, m."""
+        return self.coarse_factor * self.field.resolution
+
+    def cost_layer(self, costs: RouteCosts) -> CostLayer:
+        """Extra costs in all cells."""
+        terrain = self.terrains.get(costs.terrain)
+        if terrain is None:
+            terrain = self.terrains[costs.terrain] = np.zeros(self._terrain_shape(costs.terrain), np.float32)
+            self._fill_terrain(costs.terrain, terrain, (0, 0, *terrain.shape))
+        contact = costs.side + 0.5 * self.field.resolution
+        return CostLayer(terrain, contact, costs.clearance, costs.clearance_cost)
+
+    def cell_costs(self, costs: RouteCosts) -> NDArray[np.int16]:
+        """Cost of a straight step into each coarse cell, 0 = closed; read-only."""
+        cells = self.coarse.get(costs)
+        if cells is None:
+            distance, factor = self.field.data().distance, self.coarse_factor
+            cells = self.coarse[costs] = np.empty([-(-n // factor) for n in distance.shape], np.int16)
+            fill_cell_costs(distance, self.cost_layer(costs), self._rule(costs), (0, 0, *cells.shape), cells)
+        return cells
+
+    def _rule(self, costs: RouteCosts) -> CellRule:
+        return CellRule(self.coarse_factor, costs.closed, costs.side, costs.wide)
+
+    def _weighted_layers(self, weights: TerrainWeights) -> list[tuple[NDArray[Any], float]]:
+        amounts = (self.unknown, self.tilt, self.roughness)
+        return [(a, w) for a, w in zip(amounts, weights, strict=True) if a is not None and w > 0.0]
+
+    def _terrain_shape(self, weights: TerrainWeights) -> tuple[int, int]:
+        rows, columns = self.field.data().distance.shape
+        return (rows, columns) if self._weighted_layers(weights) else (0, 0)
+
+    def _fill_terrain(self, weights: TerrainWeights, terrain: NDArray[np.float32], box: Box) -> None:
+        """Write a box of the costs of the ground; the ring costs nothing."""
+        top, left, bottom, right = (np.clip(v, 1, n - 1) for v, n in zip(box, 2 * terrain.shape, strict=True))
+        if terrain.size:
+            inner, outer = np.s_[top - 1 : bottom - 1, left - 1 : right - 1], np.s_[top:bottom, left:right]
+            terrain[outer] = sum(weight * np.abs(amount[inner]) for amount, weight in self._weighted_layers(weights))
 
 
 @dataclass(frozen=True)
@@ -130,12 +219,16 @@ class Vehicle:
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
+WARM_UP_EFFORT = 200
+"""See ``GoalConfig.effort``."""
+
+
 class Budget:
     """Limit of a planner: seconds, or an amount of work.
 
     Args:
         seconds: from now on, if there is a clock.
-        now: the clock, monotonic, s.
+        now: the clock, s; of processor time, so that a busy computer does not shorten the search.
         effort: nodes expanded and smoothing trials, if there is no clock.
     """
 
@@ -169,7 +262,7 @@ class RouteResult:
     """Metres, with all extra costs."""
     text: str = ""
     """Detail of the reason."""
-    statistics: dict[str, float] = field(default_factory=dict)
+    statistics: dict[str, float] = attribute(default_factory=dict)
 
     @property
     def ok(self) -> bool:
@@ -210,7 +303,7 @@ class RoutePlanner(Protocol):
             route_map: obstacles and costs.
             start: in the map's frame, m, rad.
             goal: the same.
-            now: clock for the budget, s; None: the budget is an amount of work, and the result is reproducible.
+            now: clock for the budget, s, of processor time; None: the budget is an amount of work, and the result is reproducible.
         """
 
 
@@ -237,7 +330,9 @@ def check_endpoints(
         return RouteResult(Reason.START_BLOCKED, text=f"start {_format_pose(a)}: the footprint overlaps an obstacle")
     if not field.inside(b[:2]):
         return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_format_pose(b)}: off the map")
-    candidates = np.vstack((b, *(b + d for d in _tolerance_offsets(position, yaw))))
+    if field.free(footprint, b[None], margin)[0]:
+        return Endpoints(a, b)
+    candidates = np.vstack([b + d for d in _tolerance_offsets(position, yaw)])
     free = field.free(footprint, candidates, margin)
     if not free.any():
         return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_format_pose(b)}: the footprint overlaps an obstacle")
@@ -263,4 +358,5 @@ def warm_up(planner: RoutePlanner) -> None:
     """Plan once on a small map, so that numba compiles everything (or reads its cache) beforehand."""
     cells = np.zeros((80, 80), np.int8)
     cells[38:42, 36:44] = 100
-    planner.plan(RouteMap.from_cells(cells, 0.1), (2.0, 4.0, 0.0), (6.0, 4.0, 1.0))
+    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT})
+    make_planner(planner.vehicle, config).plan(RouteMap.from_cells(cells, 0.1), (2.0, 4.0, 0.0), (6.0, 4.0, 1.0))

@@ -17,7 +17,7 @@ class GoalConfig(Schema):
     """Shared by all route planners."""
 
     budget: Positive = 1.0
-    """Time for a route and its improvement, s, if there is a clock."""
+    """Processor time for a route and its improvement, s, if there is a clock."""
     effort: Annotated[int, Field(gt=0)] = 60_000
     """Nodes expanded and smoothing trials, if there is no clock: equal inputs then give equal routes."""
     position_tolerance: NotNegative = 0.05

@@ -40,20 +40,18 @@ class GridAstarPlanner:
             return ends
         field = route_map.field.data()
         cell_cost = self._cell_costs(field.distance)
-        row, column = heuristic.cell_at(field, field.resolution, ends.start[0], ends.start[1])
-        goal_row, goal_column = heuristic.cell_at(field, field.resolution, ends.goal[0], ends.goal[1])
-        cost, step = heuristic.dijkstra(
-            cell_cost, heuristic.EVERYWHERE, goal_row, goal_column, row * cell_cost.shape[1] + column, 1.0
-        )
-        if cost[row, column] >= heuristic.UNREACHED:
+        start, goal = (heuristic.cell_at(field, field.resolution, *pose[:2]) for pose in (ends.start, ends.goal))
+        to_go = heuristic.cost_to_go(cell_cost, field.resolution, goal, start, least=int(config.neutral))
+        cost = heuristic.cost_at(to_go, *start)
+        if cost >= heuristic.UNREACHED:
             return RouteResult(Reason.GOAL_UNREACHABLE, text="no way over free cells")
-        cells = heuristic.cells_to_goal(step, row, column)
+        cells = heuristic.cells_to_goal(to_go.step, *start)
         across, along = (cells[:, 1] + 0.5) * field.resolution, (cells[:, 0] + 0.5) * field.resolution
         points = np.column_stack(
             (field.x + across * field.cos - along * field.sin, field.y + across * field.sin + along * field.cos)
         )
         poses = _headed(points, ends.start, ends.goal)
-        metres = float(cost[row, column]) * field.resolution / config.neutral
+        metres = float(cost) * field.resolution / config.neutral
         return RouteResult(
             Reason.OK, poses=poses, cost=metres, statistics={"first_s": budget.elapsed, "cells": float(len(cells))}
         )

@@ -17,15 +17,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import Box
 from monstertruck_planners.collision_kernels import FieldData
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
+from monstertruck_planners.route.search import CostLayer, clearance_cost, extra_cost
 
 UNIT = 100
 """Cost of a step to the next column or row in the open."""
 
 UNREACHED = 2**30
-BUCKETS = 1024
-"""More than the greatest cost of a step."""
+BUCKETS = 2048
+"""More than an estimate may grow with a step: by the greatest cost of a step and by that of a step in the open."""
 
 NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
 """Column and row of each neighbour, counter-clockwise."""
@@ -43,105 +45,172 @@ TABLE_SPACING = 0.25
 TABLE_HEADINGS = 36
 
 
-EVERYWHERE: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)
-"""For ``dijkstra``: the whole grid."""
+OVERRUN = 1.3
+"""The cost to go is known where the way from start to goal over a cell costs up to this factor on the shortest..."""
+
+OVERRUN_CELLS = 80
+"""...and the cost of that many cells more."""
+
+USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
+"""Fields of a spread's state: entries used, entries waiting, estimate it has come to, greatest estimate regarded."""
 
 
 class CostToGo(NamedTuple):
-    """Shortest ways to the goal over the ringed grid of a field."""
+    """Shortest ways to the goal over the ringed grid of a field.
+
+    A* from the goal to the start, which goes on whenever the cost of a cell is asked for that it has not come to: in
+    the open few cells round the shortest way are visited. Its open list is one of buckets (Dial). Source: D. Silver,
+    "Cooperative pathfinding", 2005 (reverse resumable A*).
+    """
 
     cost: NDArray[np.int32]
-    """In 1/UNIT cells; UNREACHED where no way is known."""
+    """In 1/UNIT cells, see ``cost_at``; UNREACHED where no way is known."""
     step: NDArray[np.int8]
     """Index of the next neighbour on the way, -1 at the goal."""
     cell_cost: NDArray[np.int16]
     """Cost of a straight step into the cell, 0 = closed."""
     cell: float
     """Size, m."""
+    start: tuple[int, int]
+    """Row and column the estimates lead to."""
+    least: int
+    """No straight step costs less; 0: no estimates, all ways are followed alike."""
+    head: NDArray[np.int32]
+    """Newest entry of each bucket, -1 = none."""
+    following: NDArray[np.int32]
+    """Next entry in the bucket."""
+    cell_of: NDArray[np.int32]
+    """Flat index of each entry's cell."""
+    state: NDArray[np.int64]
+    """See ``USED``."""
+
+
+class CellRule(NamedTuple):
+    """What coarse cells cost a vehicle, by their distance to obstacles."""
+
+    factor: int
+    """Fine cells per coarse one, each way."""
+    closed: float
+    """Nearer than this no pose can be free, m: 0."""
+    side: float
+    """Nearer than this only the footprint's ends may be, m: four times UNIT."""
+    wide: float
+    """From here on UNIT, half as much more at ``side``, m."""
 
 
 @njit(cache=True)
-def cell_costs(
-    field: FieldData, extra_cost: NDArray[np.float32], factor: int, closed: float, side: float, wide: float
-) -> NDArray[np.int16]:
+def fill_cell_costs(
+    distance: NDArray[np.float32], layer: CostLayer, rule: CellRule, box: Box, result: NDArray[np.int16]
+) -> None:
     """Cost of a straight step into each coarse cell.
 
     Args:
-        field: the fine grid.
-        extra_cost: of a metre in each of its cells, see ``search.CostLayer``.
-        factor: fine cells per coarse one, each way.
-        closed: nearer to obstacles than this no pose can be free, m: 0.
-        side: nearer than this only the footprint's ends may be, m: four times UNIT.
-        wide: from here on UNIT, half as much more at ``side``, m.
+        distance: of the fine grid with its ring, m.
+        layer: its extra costs.
+        rule: see above.
+        box: coarse cells that are written.
+        result: shape of the coarse grid, receives the costs; 0 = closed.
     """
-    rows, columns = field.distance.shape
-    height, width = (rows + factor - 1) // factor, (columns + factor - 1) // factor
-    result = np.zeros((height, width), np.int16)
-    for row in range(height):
-        for column in range(width):
+    rows, columns = distance.shape
+    factor = rule.factor
+    for row in range(box[0], box[2]):
+        for column in range(box[1], box[3]):
             best, extra = np.float32(0.0), np.inf
             for r in range(row * factor, min((row + 1) * factor, rows)):
                 for c in range(column * factor, min((column + 1) * factor, columns)):
-                    best = max(best, field.distance[r, c])
-                    if extra_cost.size > 0:
-                        extra = min(extra, extra_cost[r, c])
-            if best < closed:
+                    best = max(best, distance[r, c])
+                    if layer.terrain.size > 0:
+                        extra = min(extra, extra_cost(distance, layer, r, c))
+            result[row, column] = 0
+            if best < rule.closed:
                 continue
+            if layer.terrain.size == 0:
+                extra = clearance_cost(layer, float(best))
             cost = 4.0
-            if best >= side:
-                cost = 1.0 + 0.5 * max(wide - float(best), 0.0) / (wide - side)
-            if extra_cost.size > 0:
-                cost *= 1.0 + extra
-            result[row, column] = int(UNIT * min(cost, MAX_CELL_COST))
-    return result
+            if best >= rule.side:
+                cost = 1.0 + 0.5 * max(rule.wide - float(best), 0.0) / (rule.wide - rule.side)
+            result[row, column] = int(UNIT * min(cost * (1.0 + extra), MAX_CELL_COST))
 
 
-@njit(cache=True)
-def dijkstra(
-    cell_cost: NDArray[np.int16], allowed: NDArray[np.bool_], goal_row: int, goal_column: int, stop: int, overrun: float
-) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-    """Dijkstra's search with buckets (Dial) from the goal's cell.
+def cost_to_go(
+    cell_cost: NDArray[np.int16], cell: float, goal: tuple[int, int], start: tuple[int, int],
+    least: int = UNIT, overrun: float = OVERRUN,
+) -> CostToGo:  # fmt: skip
+    """Ways from the start, and from cells round the way, to the goal; both are cells of the grid.
 
     Args:
         cell_cost: see ``CostToGo``.
-        allowed: the cells to stay in, or EVERYWHERE.
-        goal_row: where the search begins.
-        goal_column: the same.
-        stop: flat index of a cell; -1 for none. The search ends at ``overrun`` times its cost, and some cells.
-        overrun: see above.
-
-    Returns:
-        Cost and next step of every cell.
+        cell: m.
+        goal: row and column.
+        start: the same.
+        least: see ``CostToGo``.
+        overrun: see ``OVERRUN``; inf: all cells.
     """
     rows, columns = cell_cost.shape
-    fenced = allowed.size > 0
-    cost = np.full((rows, columns), UNREACHED, np.int32)
-    step = np.full((rows, columns), -1, np.int8)
-    head = np.full(BUCKETS, -1, np.int32)
     most = 8 * rows * columns + 1
-    following, cell_of = np.empty(most, np.int32), np.empty(most, np.int32)
-    used, waiting = 1, 1
-    cost[goal_row, goal_column] = 0
-    cell_of[0], following[0], head[0] = goal_row * columns + goal_column, -1, 0
-    level, limit = 0, UNREACHED
-    while waiting > 0 and level <= limit:
-        bucket = level % BUCKETS
-        entry = head[bucket]
-        if entry < 0:
-            level += 1
-            continue
-        head[bucket] = following[entry]
+    to_go = CostToGo(
+        np.full((rows, columns), UNREACHED, np.int32), np.full((rows, columns), -1, np.int8), cell_cost, cell, start,
+        least, np.full(BUCKETS, -1, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
+        np.array([1, 1, 0, UNREACHED]),
+    )  # fmt: skip
+    to_go.cost[goal] = 0
+    to_go.state[LEVEL] = _estimate(to_go, *goal)
+    bucket = int(to_go.state[LEVEL]) % BUCKETS
+    to_go.cell_of[0], to_go.following[0], to_go.head[bucket] = goal[0] * columns + goal[1], -1, 0
+    shortest = cost_at(to_go, *start)
+    if shortest < UNREACHED and overrun < inf:
+        to_go.state[LIMIT] = int(overrun * shortest) + OVERRUN_CELLS * UNIT
+    return to_go
+
+
+@njit(cache=True)
+def _estimate(to_go: CostToGo, row: int, column: int) -> int:
+    """Least cost from a cell to the start, no obstacles regarded."""
+    across, along = abs(column - to_go.start[1]), abs(row - to_go.start[0])
+    few, many = min(across, along), max(across, along)
+    return to_go.least * (many - few) + to_go.least * 141 // 100 * few
+
+
+@njit(cache=True)
+def cost_at(to_go: CostToGo, row: int, column: int) -> int:
+    """Cost from a cell of the grid to the goal, in 1/UNIT cells; UNREACHED where no way is known."""
+    if to_go.cell_cost[row, column] == 0 and to_go.cost[row, column] > 0:
+        return UNREACHED
+    while to_go.cost[row, column] + _estimate(to_go, row, column) > to_go.state[LEVEL]:
+        if to_go.state[WAITING] == 0 or to_go.state[LEVEL] >= to_go.state[LIMIT]:
+            break
+        _settle_level(to_go)
+    return int(to_go.cost[row, column])
+
+
+@njit(cache=True)
+def complete(to_go: CostToGo) -> None:
+    """Visit all cells up to the limit."""
+    while to_go.state[WAITING] > 0 and to_go.state[LEVEL] < to_go.state[LIMIT]:
+        _settle_level(to_go)
+
+
+@njit(cache=True)
+def _settle_level(to_go: CostToGo) -> None:
+    """Follow all ways whose estimate is the present one, then go on to the next."""
+    rows, columns = to_go.cell_cost.shape
+    cost, step, cell_cost, state = to_go.cost, to_go.step, to_go.cell_cost, to_go.state
+    level = state[LEVEL]
+    bucket = level % BUCKETS
+    used, waiting = state[USED], state[WAITING]
+    while to_go.head[bucket] >= 0:
+        entry = to_go.head[bucket]
+        to_go.head[bucket] = to_go.following[entry]
         waiting -= 1
-        flat = cell_of[entry]
+        flat = to_go.cell_of[entry]
         row, column = flat // columns, flat % columns
-        if cost[row, column] != level:
+        known = cost[row, column]
+        if known + _estimate(to_go, row, column) != level:
             continue
-        if flat == stop:
-            limit = min(limit, int(overrun * level) + 40 * UNIT)
         here = int(cell_cost[row, column])
         for k in range(8):
             r, c = row + NEIGHBOURS[k, 1], column + NEIGHBOURS[k, 0]
-            if not (0 <= r < rows and 0 <= c < columns) or cell_cost[r, c] == 0 or (fenced and not allowed[r, c]):
+            if not (0 <= r < rows and 0 <= c < columns) or cell_cost[r, c] == 0:
                 continue
             there = int(cell_cost[r, c])
             step_cost = there + here if here > 0 else 2 * there
@@ -151,14 +220,15 @@ def dijkstra(
                 step_cost = step_cost * 141 // 200
             else:
                 step_cost //= 2
-            if level + step_cost < cost[r, c]:
-                cost[r, c] = level + step_cost
+            if known + step_cost < cost[r, c]:
+                cost[r, c] = known + step_cost
                 step[r, c] = (k + 4) & 7
-                cell_of[used], following[used] = r * columns + c, head[(level + step_cost) % BUCKETS]
-                head[(level + step_cost) % BUCKETS] = used
+                into = (known + step_cost + _estimate(to_go, r, c)) % BUCKETS
+                to_go.cell_of[used], to_go.following[used] = r * columns + c, to_go.head[into]
+                to_go.head[into] = used
                 used += 1
                 waiting += 1
-    return cost, step
+    state[USED], state[WAITING], state[LEVEL] = used, waiting, level + 1
 
 
 @njit(cache=True)
@@ -250,7 +320,10 @@ def heuristic_cost(
     """The greater of both heuristics, m; inf where no way to the goal is known."""
     row, column = cell_at(field, to_go.cell, x, y)
     rows, columns = to_go.cost.shape
-    if not (0 <= row < rows and 0 <= column < columns) or to_go.cost[row, column] >= UNREACHED:
+    if not (0 <= row < rows and 0 <= column < columns):
         return inf
-    grid_cost = to_go.cost[row, column] * to_go.cell / UNIT
+    cells = cost_at(to_go, row, column)
+    if cells >= UNREACHED:
+        return inf
+    grid_cost = cells * to_go.cell / UNIT
     return float(max(grid_cost, _reeds_shepp_length(table, radius, x, y, yaw, goal)))

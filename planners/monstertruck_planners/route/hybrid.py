@@ -13,7 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.route import heuristic, search
-from monstertruck_planners.route.api import Budget, Clock, Endpoints, RouteMap, RouteResult, Vehicle, check_endpoints
+from monstertruck_planners.route.api import (
+    Budget,
+    Clock,
+    Endpoints,
+    RouteCosts,
+    RouteMap,
+    RouteResult,
+    Vehicle,
+    check_endpoints,
+)
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.corridors import cheapest_unmarked, close_narrow_gaps, mark_corridor
 from monstertruck_planners.route.hybrid_search import (
@@ -53,9 +62,6 @@ FIRST_NODES = 512
 
 GROWTH = 2
 """Of the nodes expanded in a turn, from one round to the next."""
-
-OVERRUN = 1.3
-"""The cost to go is known up to this factor on the cost of the start."""
 
 NARROW = 0.06
 """Nearer than this and half the footprint's width to obstacles a cell may belong to a narrow gap, m."""
@@ -109,7 +115,8 @@ class HybridPlanner:
         self.reeds_shepp = vehicle.reeds_shepp(self.config)
         self.table = heuristic.reeds_shepp_table(vehicle.crab_angle)
         self.footprint = vehicle.footprint.data()
-        self.side = self.footprint.half_width or self.footprint.radius
+        self.costs = RouteCosts.of(vehicle, self.config)
+        self._models = {resolution: self._motion_model(resolution) for resolution in RESOLUTIONS}
         self._narrower = [HybridPlanner(vehicle, narrow) for narrow in narrower_configs(self.config)]
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
@@ -153,15 +160,14 @@ class HybridPlanner:
     def cost(self, route_map: RouteMap, path: MotionPath) -> float:
         """Cost of a path, m."""
         segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
-        field, layer = route_map.field.data(), self.cost_layer(route_map)
+        field, layer = route_map.field.data(), route_map.cost_layer(self.costs)
         return float(search.segments_cost(field, layer, model, path.start, segments, len(segments), 0.0))
-
-    def cost_layer(self, route_map: RouteMap) -> search.CostLayer:
-        """Extra costs on a map."""
-        return route_map.cost_layer(self.config, self.side + 0.5 * route_map.field.resolution)
 
     def motion_model(self, resolution: Resolution) -> search.MotionModel:
         """The vehicle's limits and costs, with motion primitives of a resolution."""
+        return self._models.get(resolution) or self._motion_model(resolution)
+
+    def _motion_model(self, resolution: Resolution) -> search.MotionModel:
         radius, crab = self.vehicle.radius, self.vehicle.crab_angle
         length = resolution.primitive * radius
         primitives = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
@@ -195,9 +201,9 @@ class _PlanningRun:
         self.footprint = planner.footprint
         self.start, self.goal = ends.start, ends.goal
         self.field = route_map.field.data()
-        self.layer = planner.cost_layer(route_map)
-        self.factor = max(round(heuristic.COARSE_CELL / self.field.resolution), 1)
-        self.cell = self.factor * self.field.resolution
+        self.layer = route_map.cost_layer(planner.costs)
+        self.factor, self.cell = route_map.coarse_factor, route_map.coarse_cell
+        self.route_map = route_map
         self.model = planner.motion_model(RESOLUTIONS[0])
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "alternatives": 0}
@@ -227,20 +233,16 @@ class _PlanningRun:
 
     @cached_property
     def cell_cost(self) -> NDArray[np.int16]:
-        """Cost of entering each coarse cell."""
-        side = self.planner.side
-        return heuristic.cell_costs(
-            self.field, self.layer.cost, self.factor,
-            self.footprint.inscribed + self.config.margin, side, side + 0.25 * self.vehicle.radius,
-        )  # fmt: skip
+        """Cost of entering each coarse cell; narrow gaps are closed here."""
+        return self.route_map.cell_costs(self.planner.costs).copy()
 
     def _cost_to_go(
-        self, allowed: NDArray[np.bool_] = heuristic.EVERYWHERE, overrun: float = OVERRUN
+        self, cell_cost: NDArray[np.int16] | None = None, overrun: float = heuristic.OVERRUN
     ) -> heuristic.CostToGo:
-        row, column = self._cell_of(self.start)
-        stop = row * self.cell_cost.shape[1] + column
-        cost, step = heuristic.dijkstra(self.cell_cost, allowed, *self._cell_of(self.goal), stop, overrun)
-        return heuristic.CostToGo(cost, step, self.cell_cost, self.cell)
+        cell_cost = self.cell_cost if cell_cost is None else cell_cost
+        return heuristic.cost_to_go(
+            cell_cost, self.cell, self._cell_of(self.goal), self._cell_of(self.start), overrun=overrun
+        )
 
     def _direct(self) -> Array | None:
         """The best motion without obstacles, if it is free."""
@@ -265,7 +267,7 @@ class _PlanningRun:
         fine = self._search_run(to_go, RESOLUTIONS[1])
         segments = self._run_in_turns(fine, coarse)
         if segments is None and fine.exhausted:
-            fine = self._search_run(self._cost_to_go(overrun=1e4), RESOLUTIONS[2])
+            fine = self._search_run(self._cost_to_go(overrun=math.inf), RESOLUTIONS[2])
             segments = fine.run(MAX_NODES, self.attempt.reserve)
         if segments is not None:
             return segments, Reason.OK, ""
@@ -286,14 +288,14 @@ class _PlanningRun:
         return None
 
     def _reachable(self, to_go: heuristic.CostToGo) -> bool:
-        return bool(to_go.cost[self._cell_of(self.start)] < heuristic.UNREACHED)
+        return heuristic.cost_at(to_go, *self._cell_of(self.start)) < heuristic.UNREACHED
 
     def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
         """Close the narrow gaps on the shortest way, on the next one around these, and so on; False: there are none."""
         corridor, checked = np.zeros(self.cell_cost.shape, np.bool_), np.zeros(self.cell_cost.shape, np.bool_)
         # Without a margin to spare, gaps that may be just wide enough are left to the search.
         margin = self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
-        wide = self.planner.side + self.config.margin + NARROW
+        wide = self.planner.costs.side + self.config.margin + NARROW
         any_closed = False
         for _ in range(GAP_ROUNDS):
             for width in (0.0, GAP_CORRIDOR / self.cell):
@@ -376,17 +378,21 @@ class _PlanningRun:
         """First routes along all alternatives to the shortest way, the shortest first."""
         to_go = self._cost_to_go()
         columns = self.cell_cost.shape[1]
-        from_start, back = heuristic.dijkstra(self.cell_cost, heuristic.EVERYWHERE, *self._cell_of(self.start), -1, 1.0)
+        start, goal = self._cell_of(self.start), self._cell_of(self.goal)
+        from_start = heuristic.cost_to_go(self.cell_cost, self.cell, start, goal)
+        for ways in (to_go, from_start):
+            heuristic.complete(ways)
         known = np.zeros(self.cell_cost.shape, np.bool_)
         width = ALTERNATIVE_DISTANCE * self.vehicle.radius / self.cell
-        limit = int(ALTERNATIVE_LENGTH * to_go.cost[self._cell_of(self.start)])
-        while (cell := cheapest_unmarked(to_go.cost, from_start, known, limit)) >= 0:
+        limit = int(ALTERNATIVE_LENGTH * to_go.cost[start])
+        while (cell := cheapest_unmarked(to_go.cost, from_start.cost, known, limit)) >= 0:
             corridor = np.zeros(self.cell_cost.shape, np.bool_)
-            for step in (to_go.step, back):
+            for step in (to_go.step, from_start.step):
                 mark_corridor(corridor, step, cell // columns, cell % columns, width)
                 mark_corridor(known, step, cell // columns, cell % columns, width)
             self.statistics["alternatives"] += 1
             # From further off the expansion to the goal is not tried: it would leave the corridor.
             near = 3.0 * self.vehicle.radius
-            segments = self._search_run(self._cost_to_go(corridor), RESOLUTIONS[0], near).run(search.CHUNK)
+            inside = self._cost_to_go(np.where(corridor, self.cell_cost, np.int16(0)))
+            segments = self._search_run(inside, RESOLUTIONS[0], near).run(search.CHUNK)
             yield NO_SEGMENTS if segments is None else segments

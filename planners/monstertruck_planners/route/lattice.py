@@ -18,17 +18,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData
-from monstertruck_planners.route.api import Budget, Clock, Endpoints, RouteMap, RouteResult, Vehicle, check_endpoints
+from monstertruck_planners.route.api import (
+    Budget,
+    Clock,
+    Endpoints,
+    RouteCosts,
+    RouteMap,
+    RouteResult,
+    Vehicle,
+    check_endpoints,
+)
 from monstertruck_planners.route.config import LatticeConfig
 from monstertruck_planners.route.heuristic import (
-    COARSE_CELL,
-    EVERYWHERE,
     UNIT,
     UNREACHED,
     CostToGo,
     cell_at,
-    cell_costs,
-    dijkstra,
+    cost_at,
+    cost_to_go,
 )
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
@@ -235,9 +242,12 @@ def _open_state(
     pose = np.empty(3)
     _pose_of(lattice, where, pose)
     r, c = cell_at(field, to_go.cell, pose[0], pose[1])
-    if not (0 <= r < to_go.cost.shape[0] and 0 <= c < to_go.cost.shape[1]) or to_go.cost[r, c] >= UNREACHED:
+    if not (0 <= r < to_go.cost.shape[0] and 0 <= c < to_go.cost.shape[1]):
         return
-    left = to_go.cost[r, c] * to_go.cell / UNIT
+    cells = cost_at(to_go, r, c)
+    if cells >= UNREACHED:
+        return
+    left = cells * to_go.cell / UNIT
     if cost + left >= bound:
         return
     i = _bucket_of(states, column, row, heading)
@@ -295,8 +305,7 @@ def expand(
             if not segments_free(field, footprint, model, pose, pieces, used):
                 continue
             cost = lattice.primitives.cost[heading, k]
-            if layer.cost.size > 0:
-                cost += layer_cost(field, layer, pose[0], pose[1], pose[2], pieces[0, 0], pieces[0, 1], pieces[0, 2])
+            cost += layer_cost(field, layer, pose[0], pose[1], pose[2], pieces[0, 0], pieces[0, 1], pieces[0, 2])
             shift = lattice.primitives.shift[heading, k]
             column, row = states.place[n, 0] + shift[0], states.place[n, 1] + shift[1]
             _open_state(field, to_go, lattice, states, heuristic_weight, bound, column, row,
@@ -359,11 +368,11 @@ class LatticePlanner:
         if isinstance(ends, RouteResult):
             return ends
         field = route_map.field.data()
-        side = self._footprint.half_width or self._footprint.radius
-        layer = route_map.cost_layer(config, side + 0.5 * field.resolution)
-        to_go = self._cost_to_go(field, layer, side, ends)
-        row, column = cell_at(field, to_go.cell, ends.start[0], ends.start[1])
-        if to_go.cost[row, column] >= UNREACHED:
+        costs = RouteCosts.of(self.vehicle, config)
+        layer, cell = route_map.cost_layer(costs), route_map.coarse_cell
+        start, goal = (cell_at(field, cell, pose[0], pose[1]) for pose in (ends.start, ends.goal))
+        to_go = cost_to_go(route_map.cell_costs(costs), cell, goal, start, overrun=inf)
+        if cost_at(to_go, *start) >= UNREACHED:
             return RouteResult(Reason.GOAL_UNREACHABLE, text="no way is wide enough")
         best, cost, statistics = None, np.inf, {"expanded": 0.0}
         for weight in (config.heuristic_weight, 0.5 * (1 + config.heuristic_weight), 1.0):
@@ -379,15 +388,6 @@ class LatticePlanner:
         path = MotionPath(ends.start, best, self.vehicle.steering, self.vehicle.reference)
         statistics.setdefault("first_length", path.length)
         return RouteResult(Reason.OK, path, cost=cost, statistics=statistics)
-
-    def _cost_to_go(self, field: FieldData, layer: CostLayer, side: float, ends: Endpoints) -> CostToGo:
-        factor = max(round(COARSE_CELL / field.resolution), 1)
-        cell = factor * field.resolution
-        wide = side + 0.25 * self.vehicle.radius
-        cell_cost = cell_costs(field, layer.cost, factor, self._footprint.inscribed, side, wide)
-        row, column = cell_at(field, cell, ends.goal[0], ends.goal[1])
-        cost, step = dijkstra(cell_cost, EVERYWHERE, row, column, -1, 1.0)
-        return CostToGo(cost, step, cell_cost, cell)
 
     def _search(
         self, field: FieldData, layer: CostLayer, to_go: CostToGo, ends: Endpoints, budget: Budget, weight: float,

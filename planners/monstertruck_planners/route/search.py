@@ -68,9 +68,32 @@ def drop(keys: Array, items: IntArray, size: int) -> int:
 
 
 class CostLayer(NamedTuple):
-    """Extra cost per metre of every cell of a field's ringed grid; an empty array: no extra cost."""
+    """Extra cost per metre in the cells of a field's ringed grid."""
 
-    cost: NDArray[np.float32]
+    terrain: NDArray[np.float32]
+    """Of the ground in each cell; an empty array: none."""
+    contact: float
+    """Distance to an obstacle's centre at which the footprint's side touches it, m..."""
+    clearance: float
+    """...and beyond that the distance at which it costs nothing more, above 0 m."""
+    clearance_cost: float
+    """Of a metre in contact."""
+
+
+@njit(cache=True)
+def clearance_cost(layer: CostLayer, distance: float) -> float:
+    """Extra cost of a metre at a distance from obstacles."""
+    near = 1.0 - (distance - layer.contact) / layer.clearance
+    return layer.clearance_cost * min(max(near, 0.0), 1.0)
+
+
+@njit(cache=True)
+def extra_cost(distance: NDArray[np.float32], layer: CostLayer, row: int, column: int) -> float:
+    """Extra cost of a metre in a cell."""
+    cost = clearance_cost(layer, distance[row, column])
+    if layer.terrain.size > 0:
+        cost += layer.terrain[row, column]
+    return cost
 
 
 @njit(cache=True)
@@ -78,7 +101,9 @@ def layer_cost(
     field: FieldData, layer: CostLayer, x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
 ) -> float:
     """Extra cost of a motion segment: the layer summed at the middles of pieces of about SPACING."""
-    rows, columns = layer.cost.shape
+    if layer.terrain.size == 0 and layer.clearance_cost == 0.0:
+        return 0.0
+    rows, columns = field.distance.shape
     pieces = max(ceil(abs(length) / SPACING), 1)
     total = 0.0
     for i in range(pieces):
@@ -87,7 +112,7 @@ def layer_cost(
         r = int((dy * field.cos - dx * field.sin) / field.resolution)
         c = int((dx * field.cos + dy * field.sin) / field.resolution)
         if 0 <= r < rows and 0 <= c < columns:
-            total += layer.cost[r, c]
+            total += extra_cost(field.distance, layer, r, c)
     return total * abs(length) / pieces
 
 
@@ -128,8 +153,7 @@ def segments_cost(
         if length * direction < 0.0:
             total += model.weights[1] * model.radius
         direction = length
-        if layer.cost.size > 0:
-            total += layer_cost(field, layer, x, y, yaw, length, segments[i, 1], segments[i, 2])
+        total += layer_cost(field, layer, x, y, yaw, length, segments[i, 1], segments[i, 2])
         x, y, yaw = advance(x, y, yaw, length, segments[i, 1], segments[i, 2])
     return total
 
