@@ -123,7 +123,8 @@ class StaticMap:
         self.cells = cells
         self.resolution = resolution
         self.origin = origin
-        self.walls = DistanceField(cells >= OCCUPIED, resolution, origin, previous.walls if previous else None)
+        known = None if previous is None else previous.walls
+        self.walls: DistanceField = DistanceField(cells >= OCCUPIED, resolution, origin, known)
         """Distance to the map's obstacles."""
 
     @classmethod

@@ -303,7 +303,8 @@ class RoutePlanner(Protocol):
             route_map: obstacles and costs.
             start: in the map's frame, m, rad.
             goal: the same.
-            now: clock for the budget, s, of processor time; None: the budget is an amount of work, and the result is reproducible.
+            now: clock of the budget, s of processor time; None: the budget is an amount of work, and the result is
+                reproducible.
         """
 
 
