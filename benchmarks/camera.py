@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.webcam.driver import complete
 from monstertruck_drivers.webcam.emulator import Renderer
-from monstertruck_drivers.webcam.packets import Packet, PacketKind, PacketParser
+from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, PacketParser
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime import wire
@@ -98,7 +98,7 @@ def loop_cost(pictures: int = 300) -> tuple[float, float]:
     """Median and greatest processor time, ms, from a picture's bytes to the bytes of its message."""
     mode = Mode(640, 480, 15.0)
     jpeg = Renderer(mode).jpeg(np.linspace(1.0, 4.0, mode.width), 0)
-    data = Packet(PacketKind.PICTURE, 0, 0, jpeg).encode()
+    data = CameraPacket(PacketKind.PICTURE, 0, 0, jpeg).encode()
     costs = []
     for number in range(pictures):
         parser, begin = PacketParser(), process_time()

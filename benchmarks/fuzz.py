@@ -89,7 +89,7 @@ def parsers() -> dict[str, Stream | Whole]:
     sentences = [os4000.frame(text) for text in ("C320.5P1.2R-0.4T22.5", "C0.0P-12.3R45.6", "C359.9P0.0R0.0T-3.0")]
     commands = [maestro.Encoder().set_target(c, q) for c, q in ((0, 6000), (1, 5756), (2, 8000))]
     status = [ax12.Packet(unit, 0, rng.bytes(size)) for unit, size in ((1, 0), (2, 8), (1, 2))]
-    pictures = [packets.Packet(packets.PacketKind.PICTURE, n, n * 1000, rng.bytes(200)) for n in range(3)]
+    pictures = [packets.CameraPacket(packets.PacketKind.PICTURE, n, n * 1000, rng.bytes(200)) for n in range(3)]
     return {
         "scip": Stream(
             scip.ScipParser, [(data, scip.ScipParser().feed(data)[0]) for data in replies], held=2 * scip.MAX_REPLY

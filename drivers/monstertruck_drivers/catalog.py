@@ -37,7 +37,7 @@ class Duty(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Role:
+class RoleSpec:
     """What a device is for, whatever its kind."""
 
     name: str
@@ -55,9 +55,9 @@ class Role:
     """Rank among the devices that start again behind a returned hub."""
 
 
-def _shaft(index: int) -> Role:
+def _shaft(index: int) -> RoleSpec:
     ordinal = ("first", "second", "third", "fourth")[index]
-    return Role(
+    return RoleSpec(
         name=SHAFTS[index].value,
         duty=Duty.ACTUATOR,
         doc=f"Controller of the body's {ordinal} driven shaft{', if it has one' if index else ''}",
@@ -67,7 +67,7 @@ def _shaft(index: int) -> Role:
     )
 
 
-LIDAR: Final = Role(
+LIDAR: Final = RoleSpec(
     name=DeviceRole.LIDAR.value,
     duty=Duty.SENSOR,
     doc="Laser scanner",
@@ -76,7 +76,7 @@ LIDAR: Final = Role(
     start=12,
 )
 DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
-STEERING: Final = Role(
+STEERING: Final = RoleSpec(
     name=DeviceRole.STEERING.value,
     duty=Duty.ACTUATOR,
     doc="Servo controller of the axles, which may measure the battery as well",
@@ -84,7 +84,7 @@ STEERING: Final = Role(
     reads={"commands": topics.CMD_STEERING, "drive": topics.DRIVE},
     start=10,
 )
-COMPASS: Final = Role(
+COMPASS: Final = RoleSpec(
     name=DeviceRole.COMPASS.value,
     duty=Duty.SENSOR,
     doc="Heading and tilt",
@@ -92,7 +92,7 @@ COMPASS: Final = Role(
     frame=True,
     start=11,
 )
-STABILISER: Final = Role(
+STABILISER: Final = RoleSpec(
     name=DeviceRole.STABILISER.value,
     duty=Duty.SENSOR,
     doc=(
@@ -103,7 +103,7 @@ STABILISER: Final = Role(
     frame=True,
     start=13,
 )
-CAMERA: Final = Role(
+CAMERA: Final = RoleSpec(
     name=DeviceRole.CAMERA.value,
     duty=Duty.SENSOR,
     doc="Supervision camera",
@@ -111,17 +111,17 @@ CAMERA: Final = Role(
     frame=True,
     start=14,
 )
-BATTERY: Final = Role(
+BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
     doc="Pack voltage by a converter of the kernel's Industrial-IO; instead of the servo controller's input",
     writes={"out": topics.BATTERY},
     reads={"drive": topics.DRIVE},
 )
-LINK: Final = Role(
+LINK: Final = RoleSpec(
     name=DeviceRole.LINK.value, duty=Duty.MONITOR, doc="Wi-Fi or Ethernet of the computer", writes={"out": topics.LINK}
 )
-HOST: Final = Role(
+HOST: Final = RoleSpec(
     name=DeviceRole.HOST.value, duty=Duty.MONITOR, doc="Load and heat of the computer", writes={"out": topics.HOST}
 )
 OUR_ROLES: Final = (
@@ -159,7 +159,7 @@ class DeviceKind(Plugin):
     topics, ``events`` and ``name``.
     """
 
-    roles: tuple[Role, ...]
+    roles: tuple[RoleSpec, ...]
     """What it can be used for."""
     emulator: str
     """Place ``module:function`` of its ``EmulatorFactory``."""
@@ -172,7 +172,7 @@ class DeviceKind(Plugin):
     usb: UsbIdentity | None = None
 
     @property
-    def role(self) -> Role:
+    def role(self) -> RoleSpec:
         """What it is used for first of all."""
         return self.roles[0]
 
@@ -235,7 +235,7 @@ class DeviceCatalog(Catalog[DeviceKind]):
         return None
 
     @property
-    def roles(self) -> Mapping[str, Role]:
+    def roles(self) -> Mapping[str, RoleSpec]:
         """Roles by name, in the order in which they are listed and started."""
         len(self)  # reads the entry points
         return self._roles

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
-from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, Role
+from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import place
@@ -131,7 +131,7 @@ def _section(base: type[Schema], name: str, *, monitors: bool) -> Any:
     return create_model(name, __base__=base, __module__=__name__, __doc__=base.__doc__, **fields)
 
 
-def _choice(role: Role, *, monitors: bool) -> Any:
+def _choice(role: RoleSpec, *, monitors: bool) -> Any:
     """One of the kinds that fill a role."""
     kinds = {kind.name: kind.settings_class() for kind in DEVICES.of_role(role.name)}
     models = {name: model if monitors else Device[model] for name, model in kinds.items()}  # type: ignore[valid-type]

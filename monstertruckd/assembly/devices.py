@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from monstertruck_drivers.catalog import DEVICES, Duty, Role
+from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
 from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort, kind_of
 from monstertruck_drivers.link import BAUD, Port, SerialPort
@@ -133,7 +133,7 @@ def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]
 
 
 def _publisher(
-    role: Role, name: str, roles: Mapping[str, Role], config: TruckConfig, bus: Bus
+    role: RoleSpec, name: str, roles: Mapping[str, RoleSpec], config: TruckConfig, bus: Bus
 ) -> Publisher[Any] | None:
     """Write end of one of a role's topics; None where it is another configured role's own."""
     topic = role.writes[name]

@@ -9,7 +9,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import Setup
-from monstertruck_planners.goals.path_publisher import Inputs, Outputs
+from monstertruck_planners.goals.path_publisher import GoalInputs, GoalOutputs
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
@@ -131,7 +131,7 @@ def build_goals(
         ),
         deceleration=config.tracker.deceleration,
         max_age=config.gate.max_request_age,
-        inputs=Inputs(
+        inputs=GoalInputs(
             goals=bus.subscribe(topics.REQ_GOAL, fifo(4)),
             controls=bus.subscribe(topics.REQ_GOAL_CONTROL, fifo(4)),
             gate=bus.subscribe(topics.GATE, latest()),
@@ -141,7 +141,7 @@ def build_goals(
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         ),
-        outputs=Outputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
+        outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),
     )
 

@@ -31,7 +31,7 @@ from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.sensors import Assessment, SensorMonitor, SteeringCheck
 from monstertruckd.gate.sources import Source, Sources
-from monstertruckd.gate.states import EventLog, GateEvent, States
+from monstertruckd.gate.states import EventLog, GateEvent, GateStateMachine
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
 
 URGENT: Final = frozenset(
@@ -133,7 +133,7 @@ class Gate:
         self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check)
         self._events = EventLog(config.event_interval)
         self._stops = StopLog(self._outages)
-        self._states = States(self._events, latched=latched)
+        self._states = GateStateMachine(self._events, latched=latched)
         self._known: dict[Reason, int] = {}
         """What stops or slows the truck, and since when (ns)."""
         self._ticked: int | None = None

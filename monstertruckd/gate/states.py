@@ -87,7 +87,7 @@ class EventLog:
         return events
 
 
-class States:
+class GateStateMachine:
     """Disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 
     Args:

@@ -77,7 +77,7 @@ class LossyQueueHandler(logging.handlers.QueueHandler):
             self.lost += 1
 
 
-class LogWriter:
+class LogOutputThread:
     """The thread that writes; a stuck output never keeps the process from ending.
 
     Args:
@@ -140,7 +140,7 @@ def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ)
     return named == f"{status.st_dev}:{status.st_ino}"
 
 
-def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogWriter:
+def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogOutputThread:
     """Send all logging to ``stream`` from a thread; ``stop()`` of what is returned writes what still waits."""
     output = logging.StreamHandler(stream)
     output.setFormatter(PlainFormatter(journal=read_by_journal(stream)))
@@ -148,4 +148,4 @@ def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogWriter:
     root = logging.getLogger()
     root.setLevel(logging.DEBUG if verbose else logging.INFO)
     root.addHandler(handler)
-    return LogWriter(handler, output)
+    return LogOutputThread(handler, output)

@@ -23,8 +23,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
-from monstertruckd.recorder.log_file import Entry, LogFile, disk_reason
-from monstertruckd.recorder.ring import Retention, Ring, Snapshot
+from monstertruckd.recorder.log_file import LogEntry, LogFile, disk_reason
+from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
 log = logging.getLogger(__name__)
 
@@ -193,8 +193,8 @@ class BlackBox:
         self._last: dict[Reason, int] = {}
         """When the newest box with a trip of this reason is due."""
         self._pending: list[_Pending] = []
-        self._frozen: list[tuple[_Pending, Snapshot]] = []
-        self._taken: asyncio.Queue[tuple[_Pending, Snapshot] | None] = asyncio.Queue()
+        self._frozen: list[tuple[_Pending, RingSnapshot]] = []
+        self._taken: asyncio.Queue[tuple[_Pending, RingSnapshot] | None] = asyncio.Queue()
         self._wake = asyncio.Event()
         self._closing = False
         self._hurry = threading.Event()
@@ -248,7 +248,7 @@ class BlackBox:
         """
         sequence = self._sequences[topic.name]
         self._sequences[topic.name] = sequence + 1
-        self.ring.add(Entry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
+        self.ring.add(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
 
     def trip(self, trip: Trip) -> str | None:
         """Note a trip of the gate.
@@ -307,7 +307,7 @@ class BlackBox:
         while (taken := await self._taken.get()) is not None:
             await self._save(*taken)
 
-    async def _save(self, pending: _Pending, entries: Snapshot) -> None:
+    async def _save(self, pending: _Pending, entries: RingSnapshot) -> None:
         first = pending.trips[0]
         metadata = {
             **self._metadata,
@@ -339,7 +339,7 @@ class BlackBox:
     def _failed(self, error: OSError, what: str) -> None:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
-    def _write(self, name: str, entries: Snapshot, metadata: Mapping[str, str]) -> None:
+    def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str]) -> None:
         """In a thread with pauses for the control loop, unless the daemon waits for it to end."""
         offloaded = threading.get_ident() != self._loop_thread
         part = self._folder.begin(name)

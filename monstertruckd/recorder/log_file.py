@@ -55,7 +55,7 @@ _COMPRESSION: Final = {
 }
 
 
-class Entry(NamedTuple):
+class LogEntry(NamedTuple):
     """A message to be logged."""
 
     topic: Topic[Any]
@@ -122,7 +122,7 @@ class LogFile:
         """Bytes in the file."""
         return self._output.size
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LogEntry) -> None:
         """Put a message into the open chunk."""
         before = self._output.size
         self._writer.add_message(

@@ -18,7 +18,7 @@ from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
-from monstertruckd.recorder.log_file import Entry, LogFile, LogFolder, disk_reason
+from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, disk_reason
 from monstertruckd.recorder.repair import in_use, start_repair
 
 _DIGEST_FRAME = struct.Struct("<qII")
@@ -63,7 +63,7 @@ class LogWriter:
         self._attachments = attachments
         self._metadata = metadata
         self._folder = LogFolder(Path(config.directory))
-        self._retained: dict[str, Entry] = {}
+        self._retained: dict[str, LogEntry] = {}
         """Newest of every retained topic: the head of the next file, so that each file stands alone."""
         self._file = self._open(start)
         self._synced = start
@@ -84,7 +84,7 @@ class LogWriter:
         else:
             self._file.abandon()
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: LogEntry) -> None:
         """Add one message; closes chunk and file when they are due."""
         self.tick(entry.log_time)
         age = entry.log_time - self._file.start
@@ -190,8 +190,8 @@ class Recorder:
         self._metadata = dict(metadata or {})
         self._digest = digest
         self._deterministic = deterministic
-        self._batch: list[Entry] = []
-        self._queue: queue.SimpleQueue[list[Entry] | None] = queue.SimpleQueue()
+        self._batch: list[LogEntry] = []
+        self._queue: queue.SimpleQueue[list[LogEntry] | None] = queue.SimpleQueue()
         self._written = 0
         """Counted by the thread alone."""
         self._progress = threading.Event()
@@ -246,7 +246,7 @@ class Recorder:
         self._bytes += len(payload)
         if not self._batch and not self._deterministic:
             self._loop.call_later(_BATCH_SECONDS, self._hand_over)
-        self._batch.append(Entry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
+        self._batch.append(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
         if len(self._batch) >= _BATCH:
             self._hand_over()
 

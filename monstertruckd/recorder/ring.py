@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.topics import Topic
-from monstertruckd.recorder.log_file import Entry
+from monstertruckd.recorder.log_file import LogEntry
 
 BLOCK: Final = 256 * 1024
 """Bytes of entries that are freed together."""
@@ -58,14 +58,14 @@ class _Block:
         """Log time of the entry that begins there."""
         return int(_HEAD.unpack_from(self.data, at)[0])
 
-    def entry(self, at: int, topics: list[Topic[Any]]) -> Entry:
+    def entry(self, at: int, topics: list[Topic[Any]]) -> LogEntry:
         """The entry that begins there."""
         log_time, stamp, sequence, topic, length = _HEAD.unpack_from(self.data, at)
         begin = at + _HEAD.size
-        return Entry(topics[topic], log_time, stamp, sequence, self.data[begin : begin + length])
+        return LogEntry(topics[topic], log_time, stamp, sequence, self.data[begin : begin + length])
 
 
-def _length(entry: Entry) -> int:
+def _length(entry: LogEntry) -> int:
     return _HEAD.size + len(entry.payload)
 
 
@@ -79,7 +79,7 @@ class _View:
     """Where the first entry begins in the first block."""
     count: int
 
-    def __iter__(self) -> Iterator[Entry]:
+    def __iter__(self) -> Iterator[LogEntry]:
         left, at = self.count, self.at
         for block in self.blocks:
             while left and at < block.used:
@@ -90,7 +90,7 @@ class _View:
             at = 0
 
 
-class Snapshot:
+class RingSnapshot:
     """Everything a ring kept at one instant, by log time; put in order only when iterated over, in any thread.
 
     Args:
@@ -98,14 +98,14 @@ class Snapshot:
         views: of the parts; the first one that is not empty begins the window.
     """
 
-    def __init__(self, heads: tuple[Entry, ...], views: tuple[_View, ...]) -> None:
+    def __init__(self, heads: tuple[LogEntry, ...], views: tuple[_View, ...]) -> None:
         self._heads = heads
         self._views = views
 
     def __len__(self) -> int:
         return len(self._heads) + sum(view.count for view in self._views)
 
-    def __iter__(self) -> Iterator[Entry]:
+    def __iter__(self) -> Iterator[LogEntry]:
         begin = next((entry.log_time for view in self._views for entry in view), 0)
         heads = [head._replace(log_time=begin) for head in self._heads]
         return merge(heads, *self._views, key=attrgetter("log_time"))
@@ -136,7 +136,7 @@ class _Part:
     def __len__(self) -> int:
         return self._count
 
-    def append(self, entry: Entry) -> bool:
+    def append(self, entry: LogEntry) -> bool:
         """Add the newest entry; whether that took another block."""
         topic, log_time, stamp, sequence, payload = entry
         length = len(payload)
@@ -158,7 +158,7 @@ class _Part:
         self._count += 1
         return grown
 
-    def popleft(self) -> Entry:
+    def popleft(self) -> LogEntry:
         """Take out the oldest entry."""
         entry = self._blocks[0].entry(self._at, self._topics)
         self._at += _length(entry)
@@ -204,7 +204,7 @@ class Ring:
         self._sampled = _Part(span.everything, block)
         self._part_of: dict[str, _Part] = {}
         self._period = round(span.picture_period * SECOND)
-        self._heads: dict[str, Entry] = {}
+        self._heads: dict[str, LogEntry] = {}
         self._newest = 0
         """Log time of the newest message."""
         self._next_expiry = 0
@@ -216,7 +216,7 @@ class Ring:
         """Bytes taken by blocks; the newest message of each retained topic comes on top."""
         return self._rest.size + self._journal.size + self._sampled.size + self._fresh.size
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: LogEntry) -> None:
         """Add the newest message, and remove what is too old or too much."""
         part = self._part_of.get(entry.topic.name)
         if part is None:
@@ -226,11 +226,11 @@ class Ring:
         if grown or entry.log_time >= self._next_expiry:
             self._trim()
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> RingSnapshot:
         """Everything kept; takes no longer however much it is than a list of its blocks."""
         self._trim()
         parts = (self._rest, self._journal, self._sampled, self._fresh)
-        return Snapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
+        return RingSnapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
 
     def _part(self, topic: Topic[Any]) -> _Part:
         part = self._journal if topic.group == JOURNAL else self._rest
@@ -262,6 +262,6 @@ class Ring:
         parts = (self._sampled, self._fresh, self._rest, self._journal)
         return next((part for part in parts if len(part) > 1), None)
 
-    def _drop(self, entry: Entry) -> None:
+    def _drop(self, entry: LogEntry) -> None:
         if entry.topic.retained:
             self._heads[entry.topic.name] = entry

@@ -32,7 +32,7 @@ class Threshold:
     """Seconds beyond ``set`` before it begins."""
 
 
-class Alarm:
+class ThresholdAlarm:
     """On and off with hysteresis and dwell.
 
     Args:

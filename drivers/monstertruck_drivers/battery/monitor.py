@@ -10,7 +10,7 @@ import numpy as np
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
-from monstertruck_runtime.thresholds import Alarm, Dwell, Threshold
+from monstertruck_runtime.thresholds import Dwell, Threshold, ThresholdAlarm
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback
@@ -66,7 +66,7 @@ class BatteryJudge:
         self._critical = Dwell(config.critical_after)
         self._collapsed = Dwell(config.collapsed_after)
         self._clear = Dwell(config.clear_after)
-        self._over = Alarm(Threshold(config.overcharged, config.overcharged_clear, config.overcharged_after))
+        self._over = ThresholdAlarm(Threshold(config.overcharged, config.overcharged_clear, config.overcharged_after))
 
     def update(self, time_ns: int, voltage: float, current: float | None = None) -> Verdict:
         """Take one sample.

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, ObjectError, read_identity
-from monstertruck_drivers.epos.objects import Entry
+from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
@@ -313,10 +313,10 @@ class _Session:
                 return
             await self._act()
 
-    async def _read(self, entry: Entry) -> int:
+    async def _read(self, entry: ObjectEntry) -> int:
         return (await self._read_row(entry))[0]
 
-    async def _read_row(self, *entries: Entry) -> list[int]:
+    async def _read_row(self, *entries: ObjectEntry) -> list[int]:
         values: list[int] = []
 
         def take(value: int) -> bool:

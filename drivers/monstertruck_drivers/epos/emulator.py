@@ -24,8 +24,8 @@ from monstertruck_drivers.epos.protocol import (
     Frame,
     FrameError,
     NmtCommand,
+    ObjectSegment,
     Opcode,
-    Segment,
     State,
     answer,
     body_size,
@@ -303,12 +303,12 @@ class EposEmulator:
             raise AccessRefusedError(od.WRONG_NODE)
         return address & 0xFF
 
-    def _segment(self, toggle: bool) -> Segment:
+    def _segment(self, toggle: bool) -> ObjectSegment:
         data, expected = self._long
         if toggle is not expected:
             raise AccessRefusedError(od.TOGGLE_ERROR)
         self._long = data[SEGMENT_BYTES:], not toggle
-        return Segment(data[:SEGMENT_BYTES], toggle, len(data) > SEGMENT_BYTES)
+        return ObjectSegment(data[:SEGMENT_BYTES], toggle, len(data) > SEGMENT_BYTES)
 
     def _network(self, request: Frame) -> None:
         if request.words in ((0, NmtCommand.RESET_NODE), (self._node, NmtCommand.RESET_NODE)):

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.objects import Entry, abort_text
+from monstertruck_drivers.epos.objects import ObjectEntry, abort_text
 from monstertruck_drivers.epos.protocol import (
     ANSWER,
     READY,
@@ -99,7 +99,7 @@ class Exchanger:
         self.ended = 0
         """Instant of the last byte of the newest complete exchange."""
 
-    async def read(self, entry: Entry, attempts: int = 1) -> int:
+    async def read(self, entry: ObjectEntry, attempts: int = 1) -> int:
         """Value of an object.
 
         Raises:
@@ -109,7 +109,7 @@ class Exchanger:
         """
         return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
 
-    async def read_row(self, entries: Sequence[Entry], take: Callable[[int], bool]) -> None:
+    async def read_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> None:
         """Read objects one right after the other, until ``take``, which gets every value at once, says False.
 
         Nor does a row go on without a reader.
@@ -119,7 +119,7 @@ class Exchanger:
         """
         await self._transact(self._run_row(entries, take))
 
-    async def write(self, entry: Entry, value: int, attempts: int = 1) -> None:
+    async def write(self, entry: ObjectEntry, value: int, attempts: int = 1) -> None:
         """Set an object.
 
         Raises:
@@ -128,7 +128,7 @@ class Exchanger:
         """
         await self._answer(write_request(entry, value, self._node), entry, attempts, value)
 
-    async def read_long(self, entry: Entry) -> bytes:
+    async def read_long(self, entry: ObjectEntry) -> bytes:
         """Raw bytes of an object of more than 32 bits, by segments.
 
         Raises:
@@ -167,7 +167,7 @@ class Exchanger:
         if self._flight is not None:
             self._flight.cancel()
 
-    async def _answer(self, request: Frame, entry: Entry, attempts: int, value: int | None = None) -> Frame:
+    async def _answer(self, request: Frame, entry: ObjectEntry, attempts: int, value: int | None = None) -> Frame:
         for left in reversed(range(attempts)):
             try:
                 frame = await self._transact(self._run(request))
@@ -184,7 +184,7 @@ class Exchanger:
             raise ObjectError(f"{self._link.name}: {subject}", code)
         return frame
 
-    def _value(self, entry: Entry, frame: Frame) -> int:
+    def _value(self, entry: ObjectEntry, frame: Frame) -> int:
         if len(frame.words) != 4:
             raise ProtocolError(f"{self._link.name}: {entry}: answer of {len(frame.words)} words")
         return entry.decode(join(frame.words[2], frame.words[3]))
@@ -216,7 +216,7 @@ class Exchanger:
     def _quiet(self) -> int:
         return self._clock.now() + int(QUIET * SECOND)
 
-    def _run_row(self, entries: Sequence[Entry], take: Callable[[int], bool]) -> Steps[None]:
+    def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
         self._hurried = False
         for entry in entries:
             self._link.discard()
@@ -334,7 +334,7 @@ class _HeldUpError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class ControllerIdentity:
     """Settings of a controller; None = it does not know the object."""
 
     software: int
@@ -369,7 +369,7 @@ class Identity:
         Raises:
             DeviceMismatchError: driving would be wrong by a factor, or with a motor of another kind.
         """
-        expected: tuple[tuple[Entry, int | None, int | None], ...] = (
+        expected: tuple[tuple[ObjectEntry, int | None, int | None], ...] = (
             (od.ENCODER_PULSES, self.encoder_pulses_per_turn, config.encoder_pulses_per_turn),
             (od.MOTOR_TYPE, self.motor_type, config.motor_type),
             (od.VELOCITY_NOTATION, self.velocity_notation, od.RPM),
@@ -383,7 +383,7 @@ class Identity:
             raise DeviceMismatchError("; ".join(wrong))
 
 
-async def read_identity(line: Exchanger) -> Identity:
+async def read_identity(line: Exchanger) -> ControllerIdentity:
     """Ask the controller.
 
     Raises:
@@ -391,7 +391,7 @@ async def read_identity(line: Exchanger) -> Identity:
         DeviceTimeoutError, ProtocolError, DeviceLostError: as ``Exchanger.read``.
     """
 
-    async def ask(entry: Entry) -> int | None:
+    async def ask(entry: ObjectEntry) -> int | None:
         try:
             return await line.read(entry, ATTEMPTS)
         except ObjectError:
@@ -400,7 +400,7 @@ async def read_identity(line: Exchanger) -> Identity:
     software = await ask(od.SOFTWARE_VERSION)
     if software is None:
         raise WrongDeviceError(f"controller without {od.SOFTWARE_VERSION}: not an EPOS 24/1, or not this node")
-    return Identity(
+    return ControllerIdentity(
         software=software,
         hardware=await ask(od.HARDWARE_VERSION),
         motor_type=await ask(od.MOTOR_TYPE),

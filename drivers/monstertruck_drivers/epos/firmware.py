@@ -7,11 +7,11 @@ import numpy as np
 
 from monstertruck_drivers.emulation import MotorPlant, MotorReading
 from monstertruck_drivers.epos import objects as od
-from monstertruck_drivers.epos.objects import OBJECTS, Entry
+from monstertruck_drivers.epos.objects import OBJECTS, ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State
 from monstertruck_runtime.clock import SECOND
 
-DEFAULTS: dict[Entry, int] = {
+DEFAULTS: dict[ObjectEntry, int] = {
     od.NODE_ID: 1,
     od.RS232_RATE: 3,
     od.SOFTWARE_VERSION: 0x2024,
@@ -38,7 +38,7 @@ DEFAULTS: dict[Entry, int] = {
 VOLATILE = (od.CONTROLWORD, od.TARGET_VELOCITY, od.MODE)
 """Never stored: 0 (mode: its default) after power-up."""
 
-RANGES: dict[Entry, tuple[int, int]] = {
+RANGES: dict[ObjectEntry, tuple[int, int]] = {
     od.NODE_ID: (1, 127),
     od.RS232_RATE: (0, 5),
     od.MODE: (-6, 6),
@@ -136,7 +136,7 @@ class Firmware:
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
         self.quick_stop_input = False
-        self._live: dict[Entry, Callable[[MotorReading], int]] = {
+        self._live: dict[ObjectEntry, Callable[[MotorReading], int]] = {
             od.STATUSWORD: self._statusword,
             od.POSITION: self._position,
             od.VELOCITY: self._velocity,
@@ -171,7 +171,7 @@ class Firmware:
         self._set(State.NOT_READY)
 
     @staticmethod
-    def _factory() -> dict[Entry, int]:
+    def _factory() -> dict[ObjectEntry, int]:
         return {entry: DEFAULTS.get(entry, 0) for entry in OBJECTS.values()}
 
     # Objects
@@ -216,14 +216,14 @@ class Firmware:
         self.advance()
         self._apply(entry, value)
 
-    def _find(self, index: int, sub: int) -> Entry:
+    def _find(self, index: int, sub: int) -> ObjectEntry:
         entry = OBJECTS.get((index, sub))
         if entry is None:
             known = any(index == known for known, _ in OBJECTS)
             raise AccessRefusedError(od.NO_SUBINDEX if known else od.NO_OBJECT)
         return entry
 
-    def _measured(self, entry: Entry, reading: MotorReading) -> int:
+    def _measured(self, entry: ObjectEntry, reading: MotorReading) -> int:
         if entry in od.ERROR_HISTORY:
             return self._history[entry.sub - 1] if entry.sub <= len(self._history) else 0
         live = self._live.get(entry)
@@ -247,7 +247,7 @@ class Firmware:
             word |= TARGET_REACHED
         return word | (STANDSTILL if abs(reading.rpm) < VELOCITY_WINDOW else 0)
 
-    def _apply(self, entry: Entry, value: int) -> None:
+    def _apply(self, entry: ObjectEntry, value: int) -> None:
         match entry:
             case od.CONTROLWORD:
                 self._control(value)

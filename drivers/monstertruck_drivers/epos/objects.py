@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entry:
+class ObjectEntry:
     """One object: its address, width in bits, sign and access (``ro``, ``wo``, ``rw``); there is one of each."""
 
     name: str
@@ -42,54 +42,56 @@ class Entry:
         return f"0x{self.index:04X}/{self.sub} ({self.name})"
 
 
-ERROR_REGISTER = Entry("error register", 0x1001, 0, 8, access="ro")
-ERROR_COUNT = Entry("number of errors", 0x1003, 0, 8)
+ERROR_REGISTER = ObjectEntry("error register", 0x1001, 0, 8, access="ro")
+ERROR_COUNT = ObjectEntry("number of errors", 0x1003, 0, 8)
 HISTORY_SIZE = 5
-ERROR_HISTORY = tuple(Entry(f"error history {sub}", 0x1003, sub, 32, access="ro") for sub in range(1, HISTORY_SIZE + 1))
-STORE = Entry("save all parameters", 0x1010, 1, 32)
-RESTORE = Entry("restore default parameters", 0x1011, 1, 32)
-NODE_ID = Entry("node id", 0x2000, 0, 8)
-RS232_RATE = Entry("RS232 rate code", 0x2002, 0, 16)
-SOFTWARE_VERSION = Entry("software version", 0x2003, 1, 16, access="ro")
-HARDWARE_VERSION = Entry("hardware version", 0x2003, 2, 16, access="ro")
-SERIAL_NUMBER = Entry("serial number", 0x2004, 0, 64, access="ro")
-RS232_TIMEOUT = Entry("RS232 frame timeout", 0x2005, 0, 16)
-CURRENT_AVERAGED = Entry("current averaged", 0x2027, 0, 16, signed=True, access="ro")
-VELOCITY_AVERAGED = Entry("velocity averaged", 0x2028, 0, 32, signed=True, access="ro")
-DIGITAL_INPUTS = Entry("digital input state", 0x2071, 1, 16, access="ro")
-INPUT_MASK = Entry("digital input mask", 0x2071, 2, 16)
-INPUT_POLARITY = Entry("digital input polarity", 0x2071, 3, 16)
-INPUT_EXECUTION = Entry("digital input execution mask", 0x2071, 4, 16)
-ENCODER_PULSES = Entry("encoder pulses per turn", 0x2210, 1, 16)
-SENSOR_TYPE = Entry("position sensor type", 0x2210, 2, 16)
-SENSOR_POLARITY = Entry("position sensor polarity", 0x2210, 4, 16)
-CONTROLWORD = Entry("controlword", 0x6040, 0, 16)
-STATUSWORD = Entry("statusword", 0x6041, 0, 16, access="ro")
-MODE = Entry("mode of operation", 0x6060, 0, 8, signed=True)
-MODE_DISPLAY = Entry("mode of operation display", 0x6061, 0, 8, signed=True, access="ro")
-POSITION = Entry("position actual", 0x6064, 0, 32, signed=True, access="ro")
-VELOCITY_DEMAND = Entry("velocity demand", 0x606B, 0, 32, signed=True, access="ro")
-VELOCITY = Entry("velocity actual", 0x606C, 0, 32, signed=True, access="ro")
-CURRENT = Entry("current actual", 0x6078, 0, 16, signed=True, access="ro")
-MAX_VELOCITY = Entry("maximal profile velocity", 0x607F, 0, 32)
-ACCELERATION = Entry("profile acceleration", 0x6083, 0, 32)
-DECELERATION = Entry("profile deceleration", 0x6084, 0, 32)
-QUICK_STOP_DECELERATION = Entry("quick stop deceleration", 0x6085, 0, 32)
-PROFILE_TYPE = Entry("motion profile type", 0x6086, 0, 16, signed=True)
-VELOCITY_NOTATION = Entry("velocity notation", 0x608B, 0, 8, signed=True)
-TARGET_VELOCITY = Entry("target velocity", 0x60FF, 0, 32, signed=True)
-MOTOR_TYPE = Entry("motor type", 0x6402, 0, 16)
-CONTINUOUS_CURRENT = Entry("continuous current limit", 0x6410, 1, 16)
-PEAK_CURRENT = Entry("output current limit", 0x6410, 2, 16)
-POLE_PAIRS = Entry("pole pairs", 0x6410, 3, 8)
-MOTOR_MAX_SPEED = Entry("maximal motor speed", 0x6410, 4, 16)
-THERMAL_TIME = Entry("thermal time constant", 0x6410, 5, 16)
+ERROR_HISTORY = tuple(
+    ObjectEntry(f"error history {sub}", 0x1003, sub, 32, access="ro") for sub in range(1, HISTORY_SIZE + 1)
+)
+STORE = ObjectEntry("save all parameters", 0x1010, 1, 32)
+RESTORE = ObjectEntry("restore default parameters", 0x1011, 1, 32)
+NODE_ID = ObjectEntry("node id", 0x2000, 0, 8)
+RS232_RATE = ObjectEntry("RS232 rate code", 0x2002, 0, 16)
+SOFTWARE_VERSION = ObjectEntry("software version", 0x2003, 1, 16, access="ro")
+HARDWARE_VERSION = ObjectEntry("hardware version", 0x2003, 2, 16, access="ro")
+SERIAL_NUMBER = ObjectEntry("serial number", 0x2004, 0, 64, access="ro")
+RS232_TIMEOUT = ObjectEntry("RS232 frame timeout", 0x2005, 0, 16)
+CURRENT_AVERAGED = ObjectEntry("current averaged", 0x2027, 0, 16, signed=True, access="ro")
+VELOCITY_AVERAGED = ObjectEntry("velocity averaged", 0x2028, 0, 32, signed=True, access="ro")
+DIGITAL_INPUTS = ObjectEntry("digital input state", 0x2071, 1, 16, access="ro")
+INPUT_MASK = ObjectEntry("digital input mask", 0x2071, 2, 16)
+INPUT_POLARITY = ObjectEntry("digital input polarity", 0x2071, 3, 16)
+INPUT_EXECUTION = ObjectEntry("digital input execution mask", 0x2071, 4, 16)
+ENCODER_PULSES = ObjectEntry("encoder pulses per turn", 0x2210, 1, 16)
+SENSOR_TYPE = ObjectEntry("position sensor type", 0x2210, 2, 16)
+SENSOR_POLARITY = ObjectEntry("position sensor polarity", 0x2210, 4, 16)
+CONTROLWORD = ObjectEntry("controlword", 0x6040, 0, 16)
+STATUSWORD = ObjectEntry("statusword", 0x6041, 0, 16, access="ro")
+MODE = ObjectEntry("mode of operation", 0x6060, 0, 8, signed=True)
+MODE_DISPLAY = ObjectEntry("mode of operation display", 0x6061, 0, 8, signed=True, access="ro")
+POSITION = ObjectEntry("position actual", 0x6064, 0, 32, signed=True, access="ro")
+VELOCITY_DEMAND = ObjectEntry("velocity demand", 0x606B, 0, 32, signed=True, access="ro")
+VELOCITY = ObjectEntry("velocity actual", 0x606C, 0, 32, signed=True, access="ro")
+CURRENT = ObjectEntry("current actual", 0x6078, 0, 16, signed=True, access="ro")
+MAX_VELOCITY = ObjectEntry("maximal profile velocity", 0x607F, 0, 32)
+ACCELERATION = ObjectEntry("profile acceleration", 0x6083, 0, 32)
+DECELERATION = ObjectEntry("profile deceleration", 0x6084, 0, 32)
+QUICK_STOP_DECELERATION = ObjectEntry("quick stop deceleration", 0x6085, 0, 32)
+PROFILE_TYPE = ObjectEntry("motion profile type", 0x6086, 0, 16, signed=True)
+VELOCITY_NOTATION = ObjectEntry("velocity notation", 0x608B, 0, 8, signed=True)
+TARGET_VELOCITY = ObjectEntry("target velocity", 0x60FF, 0, 32, signed=True)
+MOTOR_TYPE = ObjectEntry("motor type", 0x6402, 0, 16)
+CONTINUOUS_CURRENT = ObjectEntry("continuous current limit", 0x6410, 1, 16)
+PEAK_CURRENT = ObjectEntry("output current limit", 0x6410, 2, 16)
+POLE_PAIRS = ObjectEntry("pole pairs", 0x6410, 3, 8)
+MOTOR_MAX_SPEED = ObjectEntry("maximal motor speed", 0x6410, 4, 16)
+THERMAL_TIME = ObjectEntry("thermal time constant", 0x6410, 5, 16)
 
-OBJECTS: dict[tuple[int, int], Entry] = {
+OBJECTS: dict[tuple[int, int], ObjectEntry] = {
     (entry.index, entry.sub): entry
     for value in list(globals().values())
     for entry in (value if isinstance(value, tuple) else (value,))
-    if isinstance(entry, Entry)
+    if isinstance(entry, ObjectEntry)
 }
 """Every object of this module by (index, subindex)."""
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from monstertruck_drivers.epos.objects import CONTROLWORD, Entry
+from monstertruck_drivers.epos.objects import CONTROLWORD, ObjectEntry
 
 BAUD = 38400
 """Of the RS232 line, as set at the author's controller."""
@@ -108,12 +108,12 @@ def decode_body(opcode: int, body: bytes) -> Frame:
     return Frame(opcode, tuple(words))
 
 
-def read_request(entry: Entry, node: int) -> Frame:
+def read_request(entry: ObjectEntry, node: int) -> Frame:
     """ReadObject."""
     return Frame(Opcode.READ, (entry.index, (node << 8) | entry.sub))
 
 
-def write_request(entry: Entry, value: int, node: int) -> Frame:
+def write_request(entry: ObjectEntry, value: int, node: int) -> Frame:
     """WriteObject.
 
     Raises:
@@ -127,7 +127,7 @@ def nmt_request(command: NmtCommand, node: int) -> Frame:
     return Frame(Opcode.NMT, (node, command))
 
 
-def segmented_read_request(entry: Entry, node: int) -> Frame:
+def segmented_read_request(entry: ObjectEntry, node: int) -> Frame:
     """InitiateSegmentedRead: the segments follow with ``segment_request``."""
     return Frame(Opcode.INITIATE_SEGMENTED_READ, (entry.index, (node << 8) | entry.sub))
 
@@ -138,7 +138,7 @@ def segment_request(toggle: bool) -> Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class ObjectSegment:
     """One piece of a long object."""
 
     data: bytes
@@ -153,7 +153,7 @@ class Segment:
         return struct.unpack(f"<{len(raw) // 2}H", raw)
 
 
-def decode_segment(words: Sequence[int]) -> Segment:
+def decode_segment(words: Sequence[int]) -> ObjectSegment:
     """Segment from the words after the error code.
 
     Raises:
@@ -162,7 +162,7 @@ def decode_segment(words: Sequence[int]) -> Segment:
     raw = struct.pack(f"<{len(words)}H", *words)
     if not raw or len(raw) < 1 + (raw[0] & 0x3F):
         raise FrameError("segment shorter than its length")
-    return Segment(raw[1 : 1 + (raw[0] & 0x3F)], bool(raw[0] & 0x40), bool(raw[0] & 0x80))
+    return ObjectSegment(raw[1 : 1 + (raw[0] & 0x3F)], bool(raw[0] & 0x40), bool(raw[0] & 0x80))
 
 
 def answer(error: int = 0, *data: int) -> Frame:

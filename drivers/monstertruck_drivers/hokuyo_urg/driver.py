@@ -2,9 +2,9 @@
 
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
-    Outcome,
     Reply,
     ScanBlock,
+    StatusMeaning,
     classify,
     decode_scan,
     scan_command,
@@ -99,29 +99,29 @@ class HokuyoDriver:
             self.dropped += session.parser.rejected - rejected
             if reply.answers_scan(command):
                 outcome = classify(command, reply.status)
-                if outcome is Outcome.DATA and (block := self._decode(reply, shape, bad)) is not None:
+                if outcome is StatusMeaning.DATA and (block := self._decode(reply, shape, bad)) is not None:
                     if first:
                         ready()
                         self._tell_ready(sensor)
                     bad, first = 0, False
                     due = self._deadline(config.stale_periods * interval)
                     self._publish(block, self._stamp(mapping, block, session.arrival), geometry, session.arrival)
-                elif outcome is Outcome.DATA:
+                elif outcome is StatusMeaning.DATA:
                     bad += 1
                 else:
                     due = self._deadline(await self._other_status(session, reply.status, outcome, interval))
             if bad > config.max_bad_scans:
                 raise ProtocolError(f"{self._port.name}: {bad} damaged scans in a row")
 
-    async def _other_status(self, session: ScipSession, status: str, outcome: Outcome, interval: float) -> float:
+    async def _other_status(self, session: ScipSession, status: str, outcome: StatusMeaning, interval: float) -> float:
         """React to a scan block without data; returns the seconds to wait for the next scan."""
-        if outcome is Outcome.VERIFYING:
+        if outcome is StatusMeaning.VERIFYING:
             self._tell(Severity.WARNING, f"sensor verifies a suspected fault, status {status}", status=status)
             return self._config.verify_timeout
-        if outcome is Outcome.RESUMED:
+        if outcome is StatusMeaning.RESUMED:
             self._tell(Severity.INFO, "sensor resumed after verification", reason=Reason.DEVICE_READY, status=status)
             return self._config.first_scan_periods * interval
-        if outcome is Outcome.FAULT:
+        if outcome is StatusMeaning.FAULT:
             await session.reset()
             raise DeviceFaultError(f"{self._port.name}: sensor reports hardware trouble, status {status}")
         raise ProtocolError(f"{self._port.name}: status {status} within a stream of scans")

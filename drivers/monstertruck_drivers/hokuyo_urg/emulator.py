@@ -38,7 +38,7 @@ LEAST_MM: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class ScanOrder:
     """A scan somebody asked for."""
 
     command: str
@@ -59,7 +59,7 @@ class Order:
         return f"{self.prefix}{self.left or 0:02d}" + (f";{self.tag}" if self.tag else "")
 
 
-def parse_order(text: str, tag: str = "") -> Order | str:
+def parse_order(text: str, tag: str = "") -> ScanOrder | str:
     """Parse MD, MS, GD or GS; a refusal is its two-character status."""
     command, digits = text[:2], text[2:]
     multi = command[0] == "M"
@@ -75,19 +75,19 @@ def parse_order(text: str, tag: str = "") -> Order | str:
         return "04"
     if end < start:
         return "05"
-    return Order(command, start, end, max(cluster, 1), skip, count or None, text[:13], tag)
+    return ScanOrder(command, start, end, max(cluster, 1), skip, count or None, text[:13], tag)
 
 
-def parse_scip1_order(text: str) -> Order | None:
+def parse_scip1_order(text: str) -> ScanOrder | None:
     """Parse G of SCIP 1.1; None if it is refused."""
     digits = text[1:]
     if text[:1] != "G" or len(digits) != 8 or not digits.isdigit():
         return None
     start, end, cluster = int(digits[:3]), int(digits[3:6]), int(digits[6:])
-    return Order("G", start, end, max(cluster, 1)) if start <= end <= LAST_STEP else None
+    return ScanOrder("G", start, end, max(cluster, 1)) if start <= end <= LAST_STEP else None
 
 
-def scan_lines(order: Order, counter: int, revolution: NDArray[np.int32]) -> list[bytes]:
+def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) -> list[bytes]:
     """Lines of a scan after its status: time line (not in SCIP 1.1) and data.
 
     Args:
@@ -186,7 +186,7 @@ class HokuyoEmulator:
         self._steps = (min_step, max_step)
         self._born = clock.now()
         self._fragile = self._cut = self._laser_broken = self._seri_quirk = False
-        self._order: Order | None = None
+        self._order: ScanOrder | None = None
         self._statuses: deque[int] = deque()
         self._pending: list[str] = []
         self._requests: asyncio.Queue[tuple[str, bool]] = asyncio.Queue()
@@ -196,7 +196,7 @@ class HokuyoEmulator:
         self._timer_zero = self._time() - timer_start * 1_000_000
         if state == "streaming":
             self._laser = True
-            self._order = Order("MD", *self._steps, prefix=f"MD{min_step:04d}{max_step:04d}010")
+            self._order = ScanOrder("MD", *self._steps, prefix=f"MD{min_step:04d}{max_step:04d}010")
 
     # Emulator protocol
 
@@ -310,7 +310,7 @@ class HokuyoEmulator:
         late = self._rng.uniform(0.0, self._jitter) if self._jitter > 0 else 0.0
         return self._world_time(begin + self._sweep()) + round(late * SECOND)
 
-    def _send_scan(self, end: DeviceEnd, order: Order, begin: int) -> None:
+    def _send_scan(self, end: DeviceEnd, order: ScanOrder, begin: int) -> None:
         self._skipped += 1
         if self._skipped <= order.skip:
             return
@@ -325,13 +325,13 @@ class HokuyoEmulator:
         if order.left == 0:
             self._order, self._laser = None, False
 
-    def _send_status(self, end: DeviceEnd, order: Order, code: int) -> None:
+    def _send_status(self, end: DeviceEnd, order: ScanOrder, code: int) -> None:
         end.write(build_reply(order.echo, f"{code:02d}"))
         self._verifying = 21 <= code <= 49
         if 50 <= code <= 97:
             self._order, self._laser = None, False
 
-    def _data(self, order: Order, begin: int) -> list[bytes]:
+    def _data(self, order: ScanOrder, begin: int) -> list[bytes]:
         return scan_lines(order, self._counter(begin), self._measure(begin))
 
     # Requests

@@ -282,7 +282,7 @@ class ScipParser:
 # Statuses
 
 
-class Outcome(Enum):
+class StatusMeaning(Enum):
     """What a status asks of the host."""
 
     OK = auto()
@@ -304,32 +304,37 @@ class Outcome(Enum):
     """Our own mistake: retrying cannot help."""
 
 
-def classify(command: str, status: str) -> Outcome:
+def classify(command: str, status: str) -> StatusMeaning:
     """Judge ``status`` of the reply to ``command`` (its first characters suffice)."""
     if len(status) == 1:
-        return Outcome.OK if status == "0" else Outcome.BAD_REQUEST
-    shared = {"00": Outcome.OK, "0A": Outcome.FAULT, "0B": Outcome.BUSY, "0I": Outcome.UPDATE_MODE}
+        return StatusMeaning.OK if status == "0" else StatusMeaning.BAD_REQUEST
+    shared = {
+        "00": StatusMeaning.OK,
+        "0A": StatusMeaning.FAULT,
+        "0B": StatusMeaning.BUSY,
+        "0I": StatusMeaning.UPDATE_MODE,
+    }
     if status in shared:
         return shared[status]
     if command.startswith("BM"):
-        return {"01": Outcome.FAULT, "02": Outcome.ALREADY}.get(status, Outcome.BAD_REQUEST)
+        return {"01": StatusMeaning.FAULT, "02": StatusMeaning.ALREADY}.get(status, StatusMeaning.BAD_REQUEST)
     if command.startswith("TM"):
-        return Outcome.ALREADY if status in ("02", "03") else Outcome.BAD_REQUEST
+        return StatusMeaning.ALREADY if status in ("02", "03") else StatusMeaning.BAD_REQUEST
     if command.startswith("SS"):
-        return Outcome.ALREADY if status == "03" else Outcome.BAD_REQUEST
+        return StatusMeaning.ALREADY if status == "03" else StatusMeaning.BAD_REQUEST
     if status.isdigit() and command[:2] in ("MD", "MS", "GD", "GS"):
         code = int(status)
         if code == 99:
-            return Outcome.DATA
+            return StatusMeaning.DATA
         if code == 98:
-            return Outcome.RESUMED
+            return StatusMeaning.RESUMED
         if code >= 50:
-            return Outcome.FAULT
+            return StatusMeaning.FAULT
         if code >= 21:
-            return Outcome.VERIFYING
+            return StatusMeaning.VERIFYING
         if code == 10:
-            return Outcome.LASER_OFF
-    return Outcome.BAD_REQUEST
+            return StatusMeaning.LASER_OFF
+    return StatusMeaning.BAD_REQUEST
 
 
 # Scans

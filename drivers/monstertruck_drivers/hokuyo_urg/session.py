@@ -12,9 +12,9 @@ from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
     COUNTER_BITS,
     COUNTER_MASK,
-    Outcome,
     Reply,
     ScipParser,
+    StatusMeaning,
     classify,
     decode_counter,
     line_sum,
@@ -33,7 +33,7 @@ from monstertruck_runtime.errors import (
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class LidarIdentity:
     """Answer to VV (or V)."""
 
     vendor: str
@@ -122,9 +122,9 @@ def build_fields(fields: Mapping[str, str | int]) -> list[bytes]:
     return lines
 
 
-def parse_identity(fields: dict[str, str]) -> Identity:
+def parse_identity(fields: dict[str, str]) -> LidarIdentity:
     """Fields of VV; a missing one is empty, as old units leave some out."""
-    return Identity(*(fields.get(key, "") for key in ("VEND", "PROD", "FIRM", "PROT", "SERI")))
+    return LidarIdentity(*(fields.get(key, "") for key in ("VEND", "PROD", "FIRM", "PROT", "SERI")))
 
 
 def parse_parameters(fields: dict[str, str]) -> Parameters:
@@ -280,7 +280,7 @@ class Sensor:
     """What the handshake found."""
 
     dialect: Dialect
-    identity: Identity
+    identity: LidarIdentity
     parameters: Parameters
     state: InternalState | None
     """None in SCIP 1.1."""
@@ -323,7 +323,7 @@ class ScipSession:
             DeviceLostError: the link went down.
         """
         reply = await self._ask_once(command)
-        if classify(command, reply.status) is Outcome.BUSY:
+        if classify(command, reply.status) is StatusMeaning.BUSY:
             with contextlib.suppress(ProtocolError):
                 await self._drain()
             reply = await self._ask_once(command)
@@ -338,9 +338,9 @@ class ScipSession:
         """
         reply = await self.ask(command)
         outcome = classify(command, reply.status)
-        if outcome is Outcome.FAULT:
+        if outcome is StatusMeaning.FAULT:
             raise DeviceFaultError(f"{self._link.name}: {command} answered with fault {reply.status}")
-        if outcome not in (Outcome.OK, Outcome.ALREADY):
+        if outcome not in (StatusMeaning.OK, StatusMeaning.ALREADY):
             raise ProtocolError(f"{self._link.name}: {command} refused with status {reply.status}")
         return reply
 
@@ -431,12 +431,12 @@ class ScipSession:
                 continue
             if reply.scip1:
                 switched = await self.ask("SCIP2.0")
-                accepted = classify("SCIP2.0", switched.status) is Outcome.OK
+                accepted = classify("SCIP2.0", switched.status) is StatusMeaning.OK
                 return Dialect.SCIP2 if accepted else Dialect.SCIP1
             outcome = classify("QT", reply.status)
-            if outcome is Outcome.OK:
+            if outcome is StatusMeaning.OK:
                 return Dialect.SCIP2
-            await self.ask("RS" if outcome is Outcome.UPDATE_MODE else "TM2")
+            await self.ask("RS" if outcome is StatusMeaning.UPDATE_MODE else "TM2")
         if self._heard and not self.parser.replies:
             raise WrongDeviceError(f"{self._link.name}: what answers does not speak SCIP")
         raise DeviceTimeoutError(f"{self._link.name}: no answer to QT")

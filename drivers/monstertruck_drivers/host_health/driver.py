@@ -7,7 +7,7 @@ from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
 from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.thresholds import Alarm, Threshold
+from monstertruck_runtime.thresholds import Threshold, ThresholdAlarm
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth
 from monstertruck_schemas.reasons import Reason
@@ -47,11 +47,11 @@ class HostHealthDriver:
         self._offload = computer.machine.offload
         self._before: Reading | None = None
         self._alarms = {
-            Reason.HOST_HOT: Alarm(Threshold(config.hot, config.hot_clear, config.after)),
-            Reason.HOST_THROTTLED: Alarm(Threshold(0.5, 0.25, config.after)),
-            Reason.HOST_BUSY: Alarm(Threshold(config.busy, config.busy_clear, config.busy_after)),
-            Reason.MEMORY_LOW: Alarm(Threshold(config.memory, config.memory_clear, config.after)),
-            Reason.DISK_LOW: Alarm(Threshold(config.disk, config.disk_clear, config.after)),
+            Reason.HOST_HOT: ThresholdAlarm(Threshold(config.hot, config.hot_clear, config.after)),
+            Reason.HOST_THROTTLED: ThresholdAlarm(Threshold(0.5, 0.25, config.after)),
+            Reason.HOST_BUSY: ThresholdAlarm(Threshold(config.busy, config.busy_clear, config.busy_after)),
+            Reason.MEMORY_LOW: ThresholdAlarm(Threshold(config.memory, config.memory_clear, config.after)),
+            Reason.DISK_LOW: ThresholdAlarm(Threshold(config.disk, config.disk_clear, config.after)),
         }
 
     async def run(self, ready: Ready) -> None:

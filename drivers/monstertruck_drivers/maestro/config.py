@@ -48,7 +48,7 @@ class ServoConfig(Schema):
         return math.radians((quarters / 4 - self.centre_us) * self.direction / self.scale_us_per_deg)
 
 
-class BatteryConfig(PackConfig):
+class BatteryInputConfig(PackConfig):
     """Pack voltage through a divider on an analog input."""
 
     channel: Channel = 5
@@ -77,7 +77,7 @@ class MaestroConfig(Schema):
     kind: Literal["maestro"] = "maestro"
     front: ServoConfig = ServoConfig(channel=1)
     rear: ServoConfig = ServoConfig(channel=0)
-    battery: BatteryConfig | None = BatteryConfig()
+    battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second both pulses and the error word are read."""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0

@@ -5,7 +5,7 @@ from typing import Final
 
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
-from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
@@ -213,7 +213,7 @@ class MaestroDriver:
 class BatteryInput:
     """The analog input the battery hangs on."""
 
-    def __init__(self, config: BatteryConfig, monitor: BatteryMonitor) -> None:
+    def __init__(self, config: BatteryInputConfig, monitor: BatteryMonitor) -> None:
         self.channel = config.channel
         self._config = config
         self._monitor = monitor

@@ -15,9 +15,9 @@ from monstertruck_drivers.maestro.protocol import (
     CHANNELS,
     OUTPUT_THRESHOLD,
     Code,
-    Command,
     Decoder,
     Error,
+    ServoCommand,
 )
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -253,7 +253,7 @@ class MaestroEmulator:
         self._tell_outputs()
         return answers
 
-    def _obey(self, command: Command) -> bytes:
+    def _obey(self, command: ServoCommand) -> bytes:
         code, data = command.code, command.data
         if code in CHANNEL_COMMANDS and data[0] >= CHANNELS:
             self._fail(Error.PROTOCOL)

@@ -139,7 +139,7 @@ class Encoder:
         return self.command(Code.GET_ERRORS)
 
 
-class Command(NamedTuple):
+class ServoCommand(NamedTuple):
     """One complete, correct command as the device sees it."""
 
     code: Code
@@ -165,9 +165,9 @@ class Decoder:
     _packet: bytearray = field(default_factory=bytearray)
     _skipping: bool = False
 
-    def feed(self, data: bytes) -> list[Command | Error]:
+    def feed(self, data: bytes) -> list[ServoCommand | Error]:
         """Everything that became complete, in order."""
-        out: list[Command | Error] = []
+        out: list[ServoCommand | Error] = []
         for byte in data:
             if byte >= 0x80 and not self._is_mini_ssc_value(byte):
                 if self._packet:
@@ -186,10 +186,10 @@ class Decoder:
     def _is_mini_ssc_value(self, byte: int) -> bool:
         return len(self._packet) == 2 and self._packet[0] == MINI_SSC_START and byte != MINI_SSC_START
 
-    def _complete(self) -> Command | Error | None:
+    def _complete(self) -> ServoCommand | Error | None:
         packet = self._packet
         if packet[0] == MINI_SSC_START:
-            return Command(Code.MINI_SSC, tuple(self._take()[1:])) if len(packet) == 3 else None
+            return ServoCommand(Code.MINI_SSC, tuple(self._take()[1:])) if len(packet) == 3 else None
         head = 1
         if packet[0] == POLOLU_START:
             if len(packet) == 2 and packet[1] != self.device:
@@ -205,7 +205,7 @@ class Decoder:
         whole = self._take()
         if self.crc and crc7(whole[:-1]) != whole[-1]:
             return Error.CRC
-        return Command(Code(code), tuple(whole[head : head + DATA_BYTES[code]]))
+        return ServoCommand(Code(code), tuple(whole[head : head + DATA_BYTES[code]]))
 
     def _take(self) -> bytes:
         whole = bytes(self._packet)

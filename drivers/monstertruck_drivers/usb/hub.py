@@ -14,7 +14,16 @@ from typing import Final
 
 from monstertruck_drivers.computer import Machine, Watcher
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
-from monstertruck_drivers.usb.tree import DEVICES, Snapshot, UsbDevice, ancestors, parent_of, place, read_tree, sort_key
+from monstertruck_drivers.usb.tree import (
+    DEVICES,
+    TreeSnapshot,
+    UsbDevice,
+    ancestors,
+    parent_of,
+    place,
+    read_tree,
+    sort_key,
+)
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
@@ -107,7 +116,7 @@ class HubCoordinator:
 
     # What the watching service tells
 
-    def update(self, snapshot: Snapshot) -> None:
+    def update(self, snapshot: TreeSnapshot) -> None:
         """Take a new look at the tree into account, and whatever has come due since the last one."""
         now = self._clock.now()
         for name in sorted(self._slots.keys() | snapshot.devices.keys(), key=sort_key):

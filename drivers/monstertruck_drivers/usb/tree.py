@@ -60,7 +60,7 @@ class UsbDevice:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class TreeSnapshot:
     """The whole tree at one look."""
 
     devices: dict[str, UsbDevice]
@@ -118,7 +118,7 @@ def sort_key(name: str) -> tuple[int, ...]:
     return tuple(int(number) for number in re.findall(r"\d+", name))
 
 
-def read_tree(sysfs: Sysfs) -> Snapshot:
+def read_tree(sysfs: Sysfs) -> TreeSnapshot:
     """Look at every hub and device. Devices that vanish while being read are left out."""
     entries = sysfs.names(DEVICES)
     interfaces: dict[str, list[Node]] = {}
@@ -134,7 +134,7 @@ def read_tree(sysfs: Sysfs) -> Snapshot:
             devices[name] = device
             if device.hub:
                 over_current |= _over_current(sysfs, name)
-    return Snapshot(devices, over_current)
+    return TreeSnapshot(devices, over_current)
 
 
 def read_device(sysfs: Sysfs, name: str) -> UsbDevice | None:

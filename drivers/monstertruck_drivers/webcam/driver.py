@@ -3,7 +3,7 @@
 from typing import Final
 
 from monstertruck_drivers.webcam.config import WebcamConfig
-from monstertruck_drivers.webcam.source import Frame, FrameSource, FrameStream, Mode
+from monstertruck_drivers.webcam.source import CameraFrame, FrameSource, FrameStream, Mode
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
@@ -140,7 +140,7 @@ class WebcamDriver:
                 ready()
                 limit, seen = self._clock.now() + round(patience * SECOND), 0
 
-    def _publish(self, frame: Frame) -> bool:
+    def _publish(self, frame: CameraFrame) -> bool:
         received = self._clock.now()
         try:
             if frame.damaged:

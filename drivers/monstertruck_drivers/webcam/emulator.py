@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.emulation import EmulatorSetup, ViewSource
-from monstertruck_drivers.webcam.packets import Packet, PacketKind, encode_mode
+from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, encode_mode
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
@@ -214,14 +214,14 @@ class WebcamEmulator:
 
     def _open(self, end: DeviceEnd, width: float, height: float, rate: float) -> None:
         if self._refusal:
-            end.write(Packet(PacketKind.REFUSED, self._refusal).encode())
+            end.write(CameraPacket(PacketKind.REFUSED, self._refusal).encode())
             return
         size = min(SIZES, key=lambda offered: abs(offered[0] - width) + abs(offered[1] - height))
         granted = Mode(*size, min(max(rate, 1.0), RATE_MAX))
         self._renderer, self._rate = Renderer(granted), granted.rate
         self._session += 1
         self._wanted.set()
-        end.write(Packet(PacketKind.GRANTED, payload=encode_mode(granted)).encode())
+        end.write(CameraPacket(PacketKind.GRANTED, payload=encode_mode(granted)).encode())
 
     async def _stream(self, end: DeviceEnd) -> None:
         while True:
@@ -242,7 +242,7 @@ class WebcamEmulator:
             return
         ranges = self._ranges(stamp, renderer.angles)
         data = self._damaged(await self._offload(lambda: renderer.jpeg(ranges, number)))
-        packet = Packet(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
+        packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
         for at in range(0, len(packet), CHUNK):
             await self._clock.sleep(CHUNK_PAUSE)
             end.write(packet[at : at + CHUNK])

@@ -33,7 +33,7 @@ class PacketKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Packet:
+class CameraPacket:
     """One packet."""
 
     kind: PacketKind
@@ -76,15 +76,15 @@ class PacketParser:
         whole = HEADER_SIZE if self._header is None else self._header[3]
         return max(whole - len(self._buffer), 1)
 
-    def feed(self, data: bytes) -> list[Packet]:
+    def feed(self, data: bytes) -> list[CameraPacket]:
         """Everything that became complete, in order."""
         self._buffer += data
-        packets: list[Packet] = []
+        packets: list[CameraPacket] = []
         while (packet := self._next()) is not None:
             packets.append(packet)
         return packets
 
-    def _next(self) -> Packet | None:
+    def _next(self) -> CameraPacket | None:
         if self._header is None and not self._find_header():
             return None
         assert self._header is not None
@@ -94,7 +94,7 @@ class PacketParser:
         payload = bytes(self._buffer[:length])
         del self._buffer[:length]
         self._header = None
-        return Packet(kind, number, stamp, payload)
+        return CameraPacket(kind, number, stamp, payload)
 
     def _find_header(self) -> bool:
         while True:

@@ -5,8 +5,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port, SerialPort
-from monstertruck_drivers.webcam.packets import Packet, PacketKind, PacketParser, decode_mode
-from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, FrameSource, FrameStream, Mode, device_error
+from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, PacketParser, decode_mode
+from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, FrameSource, FrameStream, Mode, device_error
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError
@@ -65,14 +65,14 @@ class RenderedStream:
         self._link = link
         self._parser = parser
 
-    async def next(self) -> Frame:
+    async def next(self) -> CameraFrame:
         """Wait for a picture, see ``FrameStream``."""
-        picture: Packet | None = None
+        picture: CameraPacket | None = None
         while picture is None:
             for packet in self._parser.feed(await self._link.read(least=min(self._parser.missing, MOST))):
                 if packet.kind is PacketKind.PICTURE:
                     picture = packet
-        return Frame(picture.stamp, picture.number, picture.payload)
+        return CameraFrame(picture.stamp, picture.number, picture.payload)
 
     async def __aenter__(self) -> Self:
         return self

@@ -29,7 +29,7 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class CameraFrame:
     """One picture as the camera gave it: not checked yet."""
 
     stamp: int | None
@@ -47,7 +47,7 @@ class FrameStream(Protocol):
     mode: Mode
     """What it granted, not always what was asked for."""
 
-    async def next(self) -> Frame:
+    async def next(self) -> CameraFrame:
         """Wait for a picture newer than the last one; those in between are dropped.
 
         Raises:

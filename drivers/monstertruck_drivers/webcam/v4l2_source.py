@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from monstertruck_drivers.webcam import v4l2
-from monstertruck_drivers.webcam.source import SET_FORMAT, Frame, Mode, device_error
+from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, device_error
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
 from monstertruck_runtime.threads import Offload, in_thread
 
@@ -73,7 +73,7 @@ class Camera:
             raise
         return camera
 
-    def take(self) -> Frame | None:
+    def take(self) -> CameraFrame | None:
         """The oldest picture that is ready, if any; its buffer goes back to the kernel.
 
         Raises:
@@ -89,7 +89,7 @@ class Camera:
                 self._kernel.ioctl(self.fd, v4l2.QBUF, v4l2.buffer(filled.index))
         except BlockingIOError:
             return None
-        return Frame(filled.stamp, filled.sequence, data, damaged=bool(filled.flags & v4l2.FLAG_ERROR))
+        return CameraFrame(filled.stamp, filled.sequence, data, damaged=bool(filled.flags & v4l2.FLAG_ERROR))
 
     def stop(self) -> None:
         """Stop streaming, unmap and close; a camera that is gone is let go just the same."""
@@ -136,13 +136,13 @@ class V4l2Stream:
         self.mode = camera.mode
         self._camera = camera
         self._offload = offload
-        self._frame: Frame | None = None
+        self._frame: CameraFrame | None = None
         self._error: DeviceError | None = None
         self._news = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(camera.fd, self._readable)
 
-    async def next(self) -> Frame:
+    async def next(self) -> CameraFrame:
         """Wait for a picture, see ``FrameStream``."""
         await self._news.wait()
         if self._error is not None:

@@ -3,7 +3,7 @@
 from math import copysign, exp, floor, pi, radians
 
 from monstertruck_kinematics.polynomials import SERVO_LIMIT
-from monstertruck_sim.world.config import MotorConfig, ServoConfig
+from monstertruck_sim.world.config import MotorConfig, ServoModelConfig
 
 RPM = 2 * pi / 60
 """One revolution per minute, rad/s."""
@@ -57,7 +57,7 @@ class Servo:
         config: true pulse map and limits.
     """
 
-    def __init__(self, config: ServoConfig) -> None:
+    def __init__(self, config: ServoModelConfig) -> None:
         self._config = config
         self._left_stop = min(SERVO_LIMIT, radians(config.left_stop_deg))
         self._right_stop = -min(SERVO_LIMIT, radians(config.right_stop_deg))

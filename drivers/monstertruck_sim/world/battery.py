@@ -2,7 +2,7 @@
 
 from math import exp
 
-from monstertruck_sim.world.config import BatteryConfig
+from monstertruck_sim.world.config import BatteryModelConfig
 
 CELLS = 6
 _CELL_VOLTS = (
@@ -21,14 +21,14 @@ def rest_voltage(charge: float) -> float:
     return CELLS * (low + (high - low) * (place - below))
 
 
-class Battery:
+class BatteryModel:
     """The pack's state; ``step`` moves it on.
 
     Args:
         config: parameters and initial charge.
     """
 
-    def __init__(self, config: BatteryConfig) -> None:
+    def __init__(self, config: BatteryModelConfig) -> None:
         self._config = config
         self._slow_sag = 0.0
         self.connected = True

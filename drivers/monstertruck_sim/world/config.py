@@ -19,7 +19,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-class ServoConfig(Schema):
+class ServoModelConfig(Schema):
     """One steering servo; a positive angle turns its wheels to the left."""
 
     channel: Annotated[int, Field(ge=0, le=5)]
@@ -113,8 +113,8 @@ class SimTruckConfig(Schema):
     """Standard deviation of the random part of the longitudinal slip ratio."""
     steering: Literal["corrected", "as_published", "2016"] = "corrected"
     """Set of linkage polynomials."""
-    front_servo: ServoConfig = ServoConfig(channel=1)
-    rear_servo: ServoConfig = ServoConfig(channel=0)
+    front_servo: ServoModelConfig = ServoModelConfig(channel=1)
+    rear_servo: ServoModelConfig = ServoModelConfig(channel=0)
     motor: MotorConfig = MotorConfig()
     """Each of the motors"""
 
@@ -143,7 +143,7 @@ class SimTruckConfig(Schema):
         return self
 
 
-class BatteryConfig(Schema):
+class BatteryModelConfig(Schema):
     """6S LiPo pack and its measurement."""
 
     capacity_ah: Positive = 5.0
@@ -223,7 +223,7 @@ class Iron(Schema):
     """Share of x that shows in y, and of y in x."""
 
 
-class CompassConfig(Schema):
+class CompassModelConfig(Schema):
     """OS4000 on the body; its axes are x forward, y left, z up."""
 
     north_yaw: float = 1.5707963267948966
@@ -274,8 +274,8 @@ class WorldConfig(Schema):
     """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
     noise: bool = True
     truck: SimTruckConfig = SimTruckConfig()
-    battery: BatteryConfig = BatteryConfig()
+    battery: BatteryModelConfig = BatteryModelConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
-    compass: CompassConfig = CompassConfig()
+    compass: CompassModelConfig = CompassModelConfig()
     tilt: TiltConfig = GroundTilt()

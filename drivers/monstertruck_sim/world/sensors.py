@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, JointSource, MotorReading, PulseSource
 from monstertruck_kinematics.elementary import Array
-from monstertruck_sim.world.config import BatteryConfig, CameraConfig, CompassConfig, LidarConfig, MotorConfig
+from monstertruck_sim.world.config import BatteryModelConfig, CameraConfig, CompassModelConfig, LidarConfig, MotorConfig
 from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
 from monstertruck_sim.world.truck_plant import TruckPlant
 
@@ -138,7 +138,7 @@ class SimulatedMotor:
 class SimulatedServos:
     """``ServoPlant``: both steering servos, and the battery at the analog input."""
 
-    def __init__(self, plant: TruckPlant, config: BatteryConfig, seed: int | None) -> None:
+    def __init__(self, plant: TruckPlant, config: BatteryModelConfig, seed: int | None) -> None:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, ANALOG) if seed is not None else None
 
@@ -168,7 +168,7 @@ class SimulatedCompass:
     and by the motor's current; the heading is what a tilt compensation makes of that field, so both agree.
     """
 
-    def __init__(self, plant: TruckPlant, config: CompassConfig, seed: int | None) -> None:
+    def __init__(self, plant: TruckPlant, config: CompassModelConfig, seed: int | None) -> None:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, COMPASS, 3) if seed is not None else None
         self._phases, self._bias = [0.0, 0.0], [0.0, 0.0]

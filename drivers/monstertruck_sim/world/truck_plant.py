@@ -19,8 +19,8 @@ from monstertruck_kinematics.dynamics import SingleTrack
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.motion import integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
-from monstertruck_sim.world.battery import Battery
-from monstertruck_sim.world.config import BatteryConfig, SimTruckConfig
+from monstertruck_sim.world.battery import BatteryModel
+from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
 
 STEP_NS = 5_000_000
@@ -82,14 +82,14 @@ class TruckPlant:
     def __init__(
         self,
         config: SimTruckConfig,
-        battery: BatteryConfig,
+        battery: BatteryModelConfig,
         start: Pose,
         contact: Contact,
         tilt: Tilt,
         seed: int | None,
     ) -> None:
         self.config = config
-        self.battery = Battery(battery)
+        self.battery = BatteryModel(battery)
         self._chassis = config.chassis()
         count = len(self._chassis.shafts)
         self._mass = config.mass / count

@@ -7,7 +7,7 @@ from typing import Final
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.computer import Machine
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.tree import Snapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
+from monstertruck_drivers.usb.tree import TreeSnapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
 from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.edit import YamlText
@@ -57,7 +57,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], pa
 async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
     """Wait until one device with a node vanishes alone."""
 
-    async def look() -> Snapshot:
+    async def look() -> TreeSnapshot:
         return await machine.offload(lambda: read_tree(machine.sysfs))
 
     before = await look()
@@ -81,7 +81,7 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
         before = now
 
 
-def _lost(before: Snapshot, now: Snapshot) -> list[UsbDevice]:
+def _lost(before: TreeSnapshot, now: TreeSnapshot) -> list[UsbDevice]:
     """What is gone, or was for a moment."""
     return [
         device

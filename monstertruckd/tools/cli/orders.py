@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class OrderOutcome:
     """Outcome of an order."""
 
     order: "Order"
@@ -39,7 +39,7 @@ class Outcome:
         }
 
 
-async def give(client: "TruckClient", order: "Order") -> Outcome:
+async def give(client: "TruckClient", order: "Order") -> OrderOutcome:
     """Give an order and wait for its outcome.
 
     Raises:
@@ -49,19 +49,19 @@ async def give(client: "TruckClient", order: "Order") -> Outcome:
     from monstertruck_schemas.topics import GATE
 
     try:
-        return Outcome(order, Reason.OK, Reason.OK.text, await client.order(order))
+        return OrderOutcome(order, Reason.OK, Reason.OK.text, await client.order(order))
     except RequestRefusedError as error:
         state = await client.get_retained(GATE)
         if state is None:
             raise NoAnswerError("the robot does not publish its gate state") from error
-        return Outcome(order, error.refusal, str(error), state)
+        return OrderOutcome(order, error.refusal, str(error), state)
 
 
 def _run(name: str, robot: str, endpoint: str, *, json_output: bool) -> None:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import Order
 
-    async def main(clock: Clock) -> Outcome:
+    async def main(clock: Clock) -> OrderOutcome:
         async with TruckClient(robot, endpoint, clock=clock) as client:
             return await give(client, Order(name))
 

@@ -10,7 +10,7 @@ from monstertruck_drivers.config import AnyPort, Device
 from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.port import HubPort
-from monstertruck_drivers.usb.tree import DEVICES, Node, Snapshot, UsbDevice, ancestors, place, read_tree
+from monstertruck_drivers.usb.tree import DEVICES, Node, TreeSnapshot, UsbDevice, ancestors, place, read_tree
 from monstertruck_runtime.errors import DeviceError, PortBusyError, WrongDeviceError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
@@ -47,7 +47,9 @@ def _by_path(context: HostContext, role: str, port: AnyPort) -> Finding:
     return fine(role, str(node))
 
 
-def _by_hub(context: HostContext, tree: Snapshot, role: str, device: Device[Any], taken: set[str]) -> Iterator[Finding]:
+def _by_hub(
+    context: HostContext, tree: TreeSnapshot, role: str, device: Device[Any], taken: set[str]
+) -> Iterator[Finding]:
     port, video = device.port, device.kind.opens == "video"
     assert isinstance(port, UsbPortConfig)
     where = place(port.device)
@@ -66,7 +68,7 @@ def _by_hub(context: HostContext, tree: Snapshot, role: str, device: Device[Any]
         yield from _settings(role, port, found, node)
 
 
-def _absent(context: HostContext, tree: Snapshot, role: str, port: UsbPortConfig, taken: set[str]) -> Finding:
+def _absent(context: HostContext, tree: TreeSnapshot, role: str, port: UsbPortConfig, taken: set[str]) -> Finding:
     where = place(port.device)
     gone = next((hub for hub in [*ancestors(port.device)][::-1] if hub not in tree.devices), None)
     if gone is not None:

@@ -16,11 +16,11 @@ import numpy as np
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
-from monstertruck_drivers.maestro.protocol import Code, Command, Decoder
+from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_sim.world.config import ServoConfig
+from monstertruck_sim.world.config import ServoModelConfig
 from monstertruck_sim.world.truck_plant import TruthState
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -237,7 +237,7 @@ class Observer:
         self._steering.to_host.clear()
         for _, data in received:
             for command in self._maestro.feed(data):
-                if isinstance(command, Command) and command.code is Code.SET_TARGET and command.value:
+                if isinstance(command, ServoCommand) and command.code is Code.SET_TARGET and command.value:
                     self._pulse(now, command.data[0], command.value / 4)
 
     def _pulse(self, now: int, channel: int, pulse_us: float) -> None:
@@ -269,5 +269,5 @@ class Observer:
             self._violate(now, "obstacle", f"{self.speed:.3f} m/s towards something {room:.3f} m ahead")
 
 
-def _arm(servo: ServoConfig, pulse_us: float) -> float:
+def _arm(servo: ServoModelConfig, pulse_us: float) -> float:
     return math.radians((pulse_us - servo.centre_us) / servo.us_per_degree)

@@ -14,7 +14,7 @@ from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobi
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, correlate, merged
 from monstertruck_estimation.slam.mapping import LOST_AFTER, Mapper, MappingEvent, estimate, status_of
-from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionModel, ScanOdometry
+from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
@@ -149,7 +149,7 @@ class LocalisationEstimator:
         self._config = config
         self._submap = submap_of(saved)
         self._front = PlanarMatcher()
-        self._motion = MotionModel(config)
+        self._motion = MotionPredictor(config)
         self._global = GlobalLocaliser(self._submap, config) if start is None else None
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))

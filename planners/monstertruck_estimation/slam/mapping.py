@@ -16,7 +16,7 @@ from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import GridBuilder
 from monstertruck_estimation.slam.keyframes import KeyframeMap, Trajectory
-from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionModel, ScanOdometry, velocity
+from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
     MIN_PAIRS,
@@ -82,7 +82,7 @@ class Mapper:
         self.config = config or MapperConfig()
         self.map = KeyframeMap(self.config)
         self._front: ScanMatcher = front or PlanarMatcher()
-        self._motion = MotionModel(self.config)
+        self._motion = MotionPredictor(self.config)
         self._closer = LoopCloser()
         self._trajectory = Trajectory(self.config.most_scans)
         self._stamp: int | None = None

@@ -34,7 +34,7 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
     return vx, vy, wz
 
 
-class MotionModel:
+class MotionPredictor:
     """Predicts the motion between two scans, and adapts the noise of odometry to the matches.
 
     Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factor

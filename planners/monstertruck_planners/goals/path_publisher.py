@@ -29,7 +29,7 @@ CHECK_STEP: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class GoalInputs:
     """What the goal service reads."""
 
     goals: Mailbox[GoalRequest]
@@ -45,7 +45,7 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
-class Outputs:
+class GoalOutputs:
     """What it writes."""
 
     path: Publisher[Path]
@@ -86,7 +86,7 @@ class PathPublisher:
         deceleration: with which the tracker brakes, m/s^2.
     """
 
-    def __init__(self, clock: Clock, inputs: Inputs, outputs: Outputs, deceleration: float) -> None:
+    def __init__(self, clock: Clock, inputs: GoalInputs, outputs: GoalOutputs, deceleration: float) -> None:
         self._clock, self._in, self._out, self._deceleration = clock, inputs, outputs, deceleration
         self._paths = 0
         self.followed: FollowedPath | None = None

@@ -16,8 +16,8 @@ from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, 
 from monstertruck_planners.goals.path_publisher import (
     AT_REST,
     FollowedPath,
-    Inputs,
-    Outputs,
+    GoalInputs,
+    GoalOutputs,
     PathPublisher,
     path_blocked,
     poses_ahead,
@@ -72,8 +72,8 @@ class GoalService:
         *,
         deceleration: float,
         max_age: float,
-        inputs: Inputs,
-        outputs: Outputs,
+        inputs: GoalInputs,
+        outputs: GoalOutputs,
         deformation: RouteDeformation | None = None,
     ) -> None:
         self._setup, self._config, self._clock = setup, setup.config, clock
@@ -356,7 +356,7 @@ def _undecided(state: GoalState) -> bool:
 
 
 def goal_state(
-    run: GoalRun | None, now: int, followed: FollowedPath | None, inputs: Inputs, left: float = 0.0
+    run: GoalRun | None, now: int, followed: FollowedPath | None, inputs: GoalInputs, left: float = 0.0
 ) -> GoalState:
     """The report on a goal, its sequence number still 0; ``left`` metres of the route are ahead at least."""
     odometry = inputs.pose.latest

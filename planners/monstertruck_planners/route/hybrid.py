@@ -163,17 +163,17 @@ class HybridPlanner:
         field, layer = route_map.field.data(), route_map.cost_layer(self.costs)
         return float(search.segments_cost(field, layer, model, path.start, segments, len(segments), 0.0))
 
-    def motion_model(self, resolution: Resolution) -> search.MotionModel:
+    def motion_model(self, resolution: Resolution) -> search.VehicleMotions:
         """The vehicle's limits and costs, with motion primitives of a resolution."""
         return self._models.get(resolution) or self._motion_model(resolution)
 
-    def _motion_model(self, resolution: Resolution) -> search.MotionModel:
+    def _motion_model(self, resolution: Resolution) -> search.VehicleMotions:
         radius, crab = self.vehicle.radius, self.vehicle.crab_angle
         length = resolution.primitive * radius
         primitives = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
         if crab > 0.0:
             primitives += [(s * length, 0.0, b) for s in (1.0, -1.0) for b in (crab, -crab)]
-        return search.MotionModel(
+        return search.VehicleMotions(
             radius, crab, self.reeds_shepp.weights, self.config.swing_cost, np.array(primitives),
             np.array([16.0, 8.0, 4.0, 2.0]) * radius, search.CHECK_STEP,
             self.config.margin + search.CHECK_MARGIN,

@@ -27,7 +27,7 @@ from monstertruck_planners.route.search import (
     RUNNING,
     CostLayer,
     IntArray,
-    MotionModel,
+    VehicleMotions,
     drop,
     push,
     segments_cost,
@@ -70,7 +70,7 @@ USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
 
 @njit(cache=True)
 def _open_node(
-    field: FieldData, to_go: CostToGo, table: NDArray[np.float32], model: MotionModel, goal: Array, nodes: Nodes,
+    field: FieldData, to_go: CostToGo, table: NDArray[np.float32], model: VehicleMotions, goal: Array, nodes: Nodes,
     heuristic_weight: float, x: float, y: float, yaw: float, cost: float, parent: int, action: int, direction: float,
 ) -> None:  # fmt: skip
     """Put a pose on the open list if it is the cheapest in its cell and the goal can be reached from there."""
@@ -118,7 +118,7 @@ def _expansion_target(
 @njit(cache=True)
 def expand(
     field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, table: NDArray[np.float32],
-    model: MotionModel, goal: Array, nodes: Nodes, heuristic_weight: float, goal_range: float, count: int,
+    model: VehicleMotions, goal: Array, nodes: Nodes, heuristic_weight: float, goal_range: float, count: int,
 ) -> int:  # fmt: skip
     """Expand up to ``count`` nodes.
 
@@ -182,7 +182,7 @@ def expand(
 
 
 @njit(cache=True)
-def _trace(model: MotionModel, goal: Array, nodes: Nodes) -> Array:
+def _trace(model: VehicleMotions, goal: Array, nodes: Nodes) -> Array:
     """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, nodes.counts[LAST]
@@ -271,7 +271,7 @@ class SearchRun:
     """
 
     def __init__(
-        self, problem: SearchProblem, model: MotionModel, to_go: CostToGo, resolution: Resolution,
+        self, problem: SearchProblem, model: VehicleMotions, to_go: CostToGo, resolution: Resolution,
         goal_range: float = np.inf,
     ) -> None:  # fmt: skip
         self._problem, self._model, self._to_go, self._goal_range = problem, model, to_go, goal_range

@@ -48,7 +48,7 @@ from monstertruck_planners.route.search import (
     RUNNING,
     CostLayer,
     IntArray,
-    MotionModel,
+    VehicleMotions,
     drop,
     layer_cost,
     push,
@@ -268,7 +268,7 @@ def _open_state(
 
 @njit(cache=True)
 def expand(
-    field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, model: MotionModel,
+    field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, model: VehicleMotions,
     lattice: Lattice, goal: Array, states: LatticeStates, heuristic_weight: float, bound: float, count: int,
 ) -> int:  # fmt: skip
     """Expand up to ``count`` states; only solutions cheaper than ``bound`` (m) count.
@@ -314,7 +314,7 @@ def expand(
 
 
 @njit(cache=True)
-def _trace(model: MotionModel, lattice: Lattice, goal: Array, states: LatticeStates) -> Array:
+def _trace(model: VehicleMotions, lattice: Lattice, goal: Array, states: LatticeStates) -> Array:
     """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
     depth, n = 0, states.counts[LAST]
     while states.parent[n] >= 0:
@@ -353,7 +353,7 @@ class LatticePlanner:
         self.primitives = make_primitives(vehicle.radius, vehicle.crab_angle, self.config.cell, factors)
         self._footprint = vehicle.footprint.data()
         self._reeds_shepp = vehicle.reeds_shepp(self.config)
-        self._model = MotionModel(
+        self._model = VehicleMotions(
             vehicle.radius, vehicle.crab_angle, self._reeds_shepp.weights, 0.0, np.empty((0, 3)), np.empty(0),
             CHECK_STEP, self.config.margin + CHECK_MARGIN,
         )  # fmt: skip

@@ -116,7 +116,7 @@ def layer_cost(
     return total * abs(length) / pieces
 
 
-class MotionModel(NamedTuple):
+class VehicleMotions(NamedTuple):
     """Limits, costs and motion primitives of the vehicle."""
 
     radius: float
@@ -139,7 +139,13 @@ class MotionModel(NamedTuple):
 
 @njit(cache=True)
 def segments_cost(
-    field: FieldData, layer: CostLayer, model: MotionModel, pose: Array, segments: Array, count: int, direction: float
+    field: FieldData,
+    layer: CostLayer,
+    model: VehicleMotions,
+    pose: Array,
+    segments: Array,
+    count: int,
+    direction: float,
 ) -> float:
     """Cost of ``count`` segments driven from a pose after a segment of this direction (sign; 0: none), m."""
     total = 0.0
@@ -160,7 +166,7 @@ def segments_cost(
 
 @njit(cache=True)
 def segments_free(
-    field: FieldData, footprint: FootprintData, model: MotionModel, pose: Array, segments: Array, count: int
+    field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, segments: Array, count: int
 ) -> bool:
     """Whether ``count`` segments driven from a pose are free of collisions."""
     x, y, yaw = pose[0], pose[1], pose[2]

@@ -20,7 +20,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData
 from monstertruck_planners.route.motion import advance
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
-from monstertruck_planners.route.search import CostLayer, IntArray, MotionModel, segments_cost, segments_free
+from monstertruck_planners.route.search import CostLayer, IntArray, VehicleMotions, segments_cost, segments_free
 
 MIN_SEGMENT = 1e-9
 """Shorter segments are dropped, m."""
@@ -159,7 +159,7 @@ def shortcut(
     field: FieldData,
     footprint: FootprintData,
     layer: CostLayer,
-    model: MotionModel,
+    model: VehicleMotions,
     path: EditablePath,
     reach: float,
     shift: float,
@@ -247,7 +247,7 @@ def choose_headings(
     field: FieldData,
     footprint: FootprintData,
     layer: CostLayer,
-    model: MotionModel,
+    model: VehicleMotions,
     places: Array,
     travelled: Array,
     reach: float,
@@ -297,7 +297,7 @@ def choose_headings(
 
 
 @njit(cache=True)
-def _chain_segments(model: MotionModel, poses: Array, before: NDArray[np.int64]) -> Array:
+def _chain_segments(model: VehicleMotions, poses: Array, before: NDArray[np.int64]) -> Array:
     """Segments of the chain that ends at the last place."""
     n = len(poses)
     if before[n - 1, 0] < 0:

@@ -54,7 +54,7 @@ PUBLISHED_ORIENTATIONS: Final = BEARINGS | {"FR": trapezoid(-40, -30, -15, -10)}
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class FuzzyInputs:
     """The sub-goal seen from the truck."""
 
     bearing: float
@@ -70,7 +70,7 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
-class Outputs:
+class FuzzyOutputs:
     """Shares of the greatest values; None where no rule fired."""
 
     speed: float | None
@@ -92,11 +92,11 @@ class Rules:
     tolerance: float
     published: bool
 
-    def infer(self, inputs: Inputs) -> Outputs:
+    def infer(self, inputs: FuzzyInputs) -> FuzzyOutputs:
         """Outputs by all rules."""
         far = min(max(inputs.distance / self.near - 1.0, 0.0), 1.0)
         close = 1.0 - far
-        return Outputs(
+        return FuzzyOutputs(
             speed=mean([(close, 0.5), (far, 1.0)]),
             front=mean(self._front(inputs, close, far)),
             sideways=mean(self._sideways(inputs)),
@@ -105,7 +105,7 @@ class Rules:
     def _orientations(self) -> dict[str, Membership]:
         return PUBLISHED_ORIENTATIONS if self.published else BEARINGS
 
-    def _front(self, inputs: Inputs, close: float, far: float) -> list[tuple[float, float]]:
+    def _front(self, inputs: FuzzyInputs, close: float, far: float) -> list[tuple[float, float]]:
         forward = min(max(0.5 + inputs.direction / 0.2, 0.0), 1.0)
         fired = [(min(far, BEARINGS[term](inputs.bearing)), SHARES[turn]) for term, turn in FAR_TURNS.items()]
         for term, turn in CLOSE_TURNS.items():
@@ -115,7 +115,7 @@ class Rules:
                 fired.append((min(fits, 1.0 - forward), SHARES[OPPOSITE[turn]]))
         return fired
 
-    def _sideways(self, inputs: Inputs) -> list[tuple[float, float]]:
+    def _sideways(self, inputs: FuzzyInputs) -> list[tuple[float, float]]:
         orientation = self._orientations()
         front = max(orientation[term](inputs.orientation) for term in ("FA", "FL", "FR"))
         t = self.tolerance
@@ -182,7 +182,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         most = share * (self.config.speed if direction > 0 else self.config.reverse_speed)
         return direction * min(abs(state.target_speed), max(most, self.config.min_speed))
 
-    def _infer(self, state: TrackingState) -> tuple[Outputs, float]:
+    def _infer(self, state: TrackingState) -> tuple[FuzzyOutputs, float]:
         """What the rules say, and the direction."""
         segment, (x, y, yaw) = state.segment, state.pose
         s = min(state.s + self.config.sub_goal, segment.end)
@@ -192,5 +192,5 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         bearing = math.degrees(math.atan2(aside, ahead))
         orientation = math.degrees(math.remainder(state.reference.state(s).yaw - yaw, math.tau))
         direction = (1.0 if abs(bearing) < BEHIND else -1.0) if self._published else segment.direction
-        inputs = Inputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
+        inputs = FuzzyInputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
         return self._rules.infer(inputs), direction

@@ -7,7 +7,7 @@ from typing import get_type_hints
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_drivers.catalog import DEVICES, LIDAR, DeviceKind, Duty, Role, start_order
+from monstertruck_drivers.catalog import DEVICES, LIDAR, DeviceKind, Duty, RoleSpec, start_order
 from monstertruck_drivers.config import Device, Devices, Monitors
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
@@ -91,7 +91,7 @@ def test_a_port_without_a_baud_has_its_devices_own(tmp_path: Path, role: str, ba
     assert (device.port.baud, device.kind.name) == (baud, kind)
 
 
-SONAR = Role(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": topics.COMPASS})
+SONAR = RoleSpec(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": topics.COMPASS})
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ SONAR = Role(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": to
         ),
     ],
 )
-def test_a_role_of_another_distribution_must_fit_in(role: Role, fault: str | None):
+def test_a_role_of_another_distribution_must_fit_in(role: RoleSpec, fault: str | None):
     catalog = type(DEVICES)(*KINDS)
     kind = dataclasses.replace(DEVICES["os4000"], roles=(role,))
     found = catalog.fault(kind)

@@ -9,7 +9,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.recorder.log_file import Entry
+from monstertruckd.recorder.log_file import LogEntry
 from monstertruckd.recorder.ring import SHARE, Retention, Ring
 
 SPAN = Retention(everything=65.0, journal=300.0, pictures=10.0, picture_period=0.5)
@@ -17,11 +17,11 @@ SPAN = Retention(everything=65.0, journal=300.0, pictures=10.0, picture_period=0
 
 def picture(now, size=1000):
     image = CompressedImage(stamp=now, received=now, seq=0, data=b"\xff" * size, format="jpeg", sequence=0)
-    return Entry(t.CAMERA, now, now, 0, wire.encode(t.CAMERA, image))
+    return LogEntry(t.CAMERA, now, now, 0, wire.encode(t.CAMERA, image))
 
 
 def command(now, size=100):
-    return Entry(t.CMD_DRIVE, now, now, 0, bytes(size))
+    return LogEntry(t.CMD_DRIVE, now, now, 0, bytes(size))
 
 
 def test_old_pictures_are_thinned_out():

@@ -1,5 +1,5 @@
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.thresholds import Alarm, Dwell, Threshold
+from monstertruck_runtime.thresholds import Dwell, Threshold, ThresholdAlarm
 
 
 def test_a_dwell_needs_its_time_without_a_break():
@@ -10,7 +10,7 @@ def test_a_dwell_needs_its_time_without_a_break():
 
 
 def test_too_much_begins_after_its_dwell_and_ends_below_the_margin():
-    alarm = Alarm(Threshold(80.0, 70.0, after=1.0))
+    alarm = ThresholdAlarm(Threshold(80.0, 70.0, after=1.0))
     values = [81.0, 79.0, 81.0, 81.0, 75.0, 70.0, 75.0]
     changed = [alarm.update(t * SECOND, value) for t, value in enumerate(values)]
     assert changed == [False, False, False, True, False, True, False]
@@ -18,7 +18,7 @@ def test_too_much_begins_after_its_dwell_and_ends_below_the_margin():
 
 
 def test_too_little():
-    alarm = Alarm(Threshold(10.0, 20.0))
+    alarm = ThresholdAlarm(Threshold(10.0, 20.0))
     states = []
     for t, value in enumerate([10.0, 9.0, 15.0, 20.0, 15.0]):
         alarm.update(t, value)
@@ -27,7 +27,7 @@ def test_too_little():
 
 
 def test_without_a_value_nothing_changes():
-    alarm = Alarm(Threshold(80.0, 70.0))
+    alarm = ThresholdAlarm(Threshold(80.0, 70.0))
     assert not alarm.update(0, None)
     alarm.update(1, 90.0)
     assert not alarm.update(2, None)

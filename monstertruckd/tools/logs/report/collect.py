@@ -24,7 +24,7 @@ from monstertruckd.recorder.reader import LogMessage, LogReader
 from monstertruckd.tools.logs.messages import Progress, first_offset
 from monstertruckd.tools.logs.report.scan_map import ScanMap
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Trace
-from monstertruckd.tools.logs.report.states import States
+from monstertruckd.tools.logs.report.states import StateTimeline
 
 _SILENT_PERIODS: Final = 5
 """Nominal periods without a message that count as a silence, if the topic names no staleness limit."""
@@ -126,7 +126,7 @@ class RunSummary:
     """Real minus daemon time, ns, by the newest message."""
     traces: dict[Curve, Trace] = field(default_factory=dict)
     traffic: dict[str, Traffic] = field(default_factory=dict)
-    states: States = field(default_factory=States)
+    states: StateTimeline = field(default_factory=StateTimeline)
     events: list[Event] = field(default_factory=list)
     event_counts: dict[Severity, int] = field(default_factory=lambda: dict.fromkeys(Severity, 0))
     journal: list[LogRecord] = field(default_factory=list)

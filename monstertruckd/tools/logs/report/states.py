@@ -124,7 +124,7 @@ _NORMAL: Final = {"disarmed"}
 """Limits that the gate's row shows already."""
 
 
-class States:
+class StateTimeline:
     """Every row of the timeline, filled message by message."""
 
     def __init__(self) -> None:

@@ -9,8 +9,8 @@ from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.battery.monitor import CELL_VOLTS, BatteryJudge, charge_of
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import BatteryLevel
-from monstertruck_sim.world.battery import Battery
-from monstertruck_sim.world.config import BatteryConfig
+from monstertruck_sim.world.battery import BatteryModel
+from monstertruck_sim.world.config import BatteryModelConfig
 
 L = BatteryLevel
 
@@ -175,7 +175,7 @@ def test_limits_must_be_in_order():
 @pytest.mark.parametrize("motor_w", [0.0, 40.0, 100.0])
 def test_with_a_fitted_resistance_the_charge_is_right_to_a_tenth(motor_w: float):
     """Against the simulated pack, through its divider and a 10-bit converter, from full to a tenth."""
-    pack = Battery(BatteryConfig())
+    pack = BatteryModel(BatteryModelConfig())
     judge = BatteryJudge(PackConfig(resistance=0.12))
     rng = np.random.default_rng(0)
     time, errors = 0, []

@@ -105,7 +105,7 @@ class Rig(DriverRig):
         await self.until(lambda: abs(self.shaft_rpm + rpm) < 1 and self.newest.mode is DriveMode.ENABLED)
         await self.settle(0.2)
 
-    def writes(self, entry: od.Entry) -> list[tuple[int, int]]:
+    def writes(self, entry: od.ObjectEntry) -> list[tuple[int, int]]:
         """(instant, value) of every write of an object that arrived whole."""
         return [
             (instant, entry.decode(frame.words[2] | frame.words[3] << 16))

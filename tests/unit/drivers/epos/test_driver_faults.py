@@ -173,7 +173,7 @@ def test_other_parameters_than_configured(config: EposConfig, message: str):
 
 
 @pytest.mark.parametrize("missing", [(od.CONTROLWORD, "no EPOS 24/1"), (od.SOFTWARE_VERSION, "without 0x2003/1")])
-def test_an_object_server_that_is_no_epos(missing: tuple[od.Entry, str], monkeypatch: pytest.MonkeyPatch):
+def test_an_object_server_that_is_no_epos(missing: tuple[od.ObjectEntry, str], monkeypatch: pytest.MonkeyPatch):
     entry, message = missing
     monkeypatch.delitem(od.OBJECTS, (entry.index, entry.sub))
 

@@ -11,7 +11,7 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.firmware import Firmware, FreeMotor
-from monstertruck_drivers.epos.objects import Entry
+from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import (
     Control,
     NmtCommand,
@@ -98,7 +98,7 @@ def at(instant: list[int]) -> int:
     return instant[0]
 
 
-def get(firmware: Firmware, entry: Entry) -> int:
+def get(firmware: Firmware, entry: ObjectEntry) -> int:
     return entry.decode(firmware.read(entry.index, entry.sub))
 
 

@@ -9,7 +9,7 @@ import pytest
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import Exchanger, ObjectError
-from monstertruck_drivers.epos.protocol import Segment, answer, segment_request
+from monstertruck_drivers.epos.protocol import ObjectSegment, answer, segment_request
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, VirtualClock, VirtualLoop, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
@@ -84,7 +84,7 @@ def test_a_row_of_objects_is_read_until_it_is_enough():
             await line.read_row(entries, take)
             assert got == whole[:count]
         with pytest.raises(ObjectError):
-            await line.read_row((od.STATUSWORD, od.Entry("nothing", 0x7FFF, 0, 16)), lambda _: True)
+            await line.read_row((od.STATUSWORD, od.ObjectEntry("nothing", 0x7FFF, 0, 16)), lambda _: True)
 
     on_line(test)
 
@@ -378,7 +378,7 @@ def test_endless_or_short_segments_are_errors():
         with pytest.raises(ProtocolError, match="shorter"):
             await line.read_long(od.SERIAL_NUMBER)
 
-    with_peer(*segment_replies(*[Segment(b"ab", False, True).words] * 16))(endless)
+    with_peer(*segment_replies(*[ObjectSegment(b"ab", False, True).words] * 16))(endless)
     with_peer(*segment_replies((0x0005,)))(short)
 
 

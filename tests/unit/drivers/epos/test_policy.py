@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.driver import Odometer, Wanted, drive_mode, settled, wanted
-from monstertruck_drivers.epos.exchange import Identity
+from monstertruck_drivers.epos.exchange import ControllerIdentity
 from monstertruck_drivers.epos.protocol import State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceMismatchError
@@ -91,7 +91,7 @@ def test_the_odometer_takes_no_motion_from_a_counter_that_was_reset():
     assert odometer.update(0, 60 * SECOND, FASTEST) == 150
 
 
-IDENTITY = Identity(0x2024, None, 10, 1, 500, 0, None, None, None, None)
+IDENTITY = ControllerIdentity(0x2024, None, 10, 1, 500, 0, None, None, None, None)
 
 
 def test_identity_is_compared_with_what_is_configured():
@@ -103,7 +103,7 @@ def test_identity_is_compared_with_what_is_configured():
 
 def test_counts_per_turn_come_from_the_controller_or_the_configuration():
     assert IDENTITY.counts_per_turn(EposConfig(encoder_pulses_per_turn=None)) == 2000
-    silent = Identity(0x2024, None, None, None, None, None, None, None, None, None)
+    silent = ControllerIdentity(0x2024, None, None, None, None, None, None, None, None, None)
     assert silent.counts_per_turn(EposConfig(encoder_pulses_per_turn=512)) == 2048
     with pytest.raises(DeviceMismatchError, match="encoder_pulses_per_turn"):
         silent.counts_per_turn(EposConfig(encoder_pulses_per_turn=None))

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monstertruck_drivers.epos import objects as od
-from monstertruck_drivers.epos.objects import OBJECTS, Entry
+from monstertruck_drivers.epos.objects import OBJECTS, ObjectEntry
 from monstertruck_drivers.epos.protocol import (
     ANSWER,
     Control,
     Frame,
     FrameError,
     NmtCommand,
+    ObjectSegment,
     Opcode,
-    Segment,
     State,
     answer,
     body_size,
@@ -83,21 +83,21 @@ def test_published_checksums():
 
 
 @pytest.mark.parametrize(("what", "text"), READS.items(), ids=str)
-def test_reads(what: tuple[Entry, int], text: str):
+def test_reads(what: tuple[ObjectEntry, int], text: str):
     frame = read_request(*what)
     assert frame.head == b"\x10"
     assert frame.body == bytes.fromhex(text)
 
 
 @pytest.mark.parametrize(("what", "text"), WRITES.items(), ids=str)
-def test_writes(what: tuple[Entry, int], text: str):
+def test_writes(what: tuple[ObjectEntry, int], text: str):
     frame = write_request(*what, node=1)
     assert frame.head == b"\x11"
     assert frame.body == bytes.fromhex(text)
 
 
 @pytest.mark.parametrize(("text", "meaning"), ANSWERS.items())
-def test_answers(text: str, meaning: tuple[Entry, int]):
+def test_answers(text: str, meaning: tuple[ObjectEntry, int]):
     entry, value = meaning
     frame = decode_body(ANSWER, bytes.fromhex(text))
     assert error_of(frame) == 0
@@ -157,9 +157,10 @@ def test_garbage_is_refused_or_a_frame(data: bytes):
 
 
 @pytest.mark.parametrize(
-    "segment", [Segment(b"", False, False), Segment(b"abc", True, True), Segment(b"abcd", True, False)]
+    "segment",
+    [ObjectSegment(b"", False, False), ObjectSegment(b"abc", True, True), ObjectSegment(b"abcd", True, False)],
 )
-def test_segments(segment: Segment):
+def test_segments(segment: ObjectSegment):
     assert decode_segment(segment.words) == segment
 
 
@@ -171,7 +172,7 @@ def test_short_segments_are_refused():
 
 @settings(max_examples=60)
 @given(st.sampled_from([entry for entry in OBJECTS.values() if entry.width <= 32]), st.data())
-def test_values_survive_and_are_cut_to_their_width(entry: Entry, draw: st.DataObject):
+def test_values_survive_and_are_cut_to_their_width(entry: ObjectEntry, draw: st.DataObject):
     value = draw.draw(st.integers(*entry.limits))
     raw = entry.encode(value)
     assert 0 <= raw < 2**32

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from monstertruck_drivers.maestro.config import BatteryConfig, MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
 
 
 def test_pulse_map_of_the_truck():
@@ -37,8 +37,8 @@ def test_angle_and_pulse_are_inverse_to_a_quarter_microsecond(angle: float, dire
 
 
 def test_adc_scale():
-    assert BatteryConfig().volts(516) == pytest.approx(25.22, abs=0.005)
-    assert BatteryConfig(gain=1.01, offset=-0.1).volts(516) == pytest.approx(25.22 * 1.01 - 0.1, abs=0.005)
+    assert BatteryInputConfig().volts(516) == pytest.approx(25.22, abs=0.005)
+    assert BatteryInputConfig(gain=1.01, offset=-0.1).volts(516) == pytest.approx(25.22 * 1.01 - 0.1, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def test_adc_scale():
         (lambda: ServoConfig(channel=1, centre_us=1900.0), "centre_us 1900.0"),
         (lambda: ServoConfig(channel=6), "less than 6"),
         (lambda: ServoConfig(channel=1, direction=0), "-1 or 1"),
-        (lambda: BatteryConfig(low=22.5), "low 22.5 < clear 22.4"),
-        (lambda: BatteryConfig(gain=0.4), "reading 1023"),
-        (lambda: BatteryConfig(offset=16.0), "reading 0"),
+        (lambda: BatteryInputConfig(low=22.5), "low 22.5 < clear 22.4"),
+        (lambda: BatteryInputConfig(gain=0.4), "reading 1023"),
+        (lambda: BatteryInputConfig(offset=16.0), "reading 0"),
         (lambda: MaestroConfig(deadman_channel=5), "one use only"),
         (lambda: MaestroConfig(rear=ServoConfig(channel=1)), "one use only"),
         (lambda: MaestroConfig(baud=9600), "Extra inputs"),

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from monstertruck_drivers.maestro.protocol import (
     DATA_BYTES,
     Code,
-    Command,
     Decoder,
     Encoder,
     Error,
+    ServoCommand,
     crc7,
     error_names,
     halves,
@@ -77,7 +77,7 @@ def test_what_is_encoded_is_decoded_however_it_is_cut(
     encoder, decoder = Encoder(device, crc), Decoder(12, crc)
     stream = b"".join(encoder.command(code, *data) for code, data in items)
     seen = [item for i in range(0, len(stream), cut) for item in decoder.feed(stream[i : i + cut])]
-    assert seen == [Command(Code(code), tuple(data)) for code, data in items]
+    assert seen == [ServoCommand(Code(code), tuple(data)) for code, data in items]
 
 
 @given(st.binary(max_size=200), st.booleans())
@@ -86,17 +86,17 @@ def test_the_decoder_recovers_from_any_garbage(garbage: bytes, crc: bool):
     decoder = Decoder(12, crc)
     decoder.feed(garbage)
     decoder.feed(b"\xa1\x1b" if crc else b"\xa1")  # at worst this ends what was open
-    assert decoder.feed(Encoder(crc=crc).set_target(3, 5000))[-1] == Command(Code.SET_TARGET, (3, 8, 39))
+    assert decoder.feed(Encoder(crc=crc).set_target(3, 5000))[-1] == ServoCommand(Code.SET_TARGET, (3, 8, 39))
 
 
 @pytest.mark.parametrize(
     ("stream", "expected"),
     [
         (b"A", [Error.PROTOCOL]),  # data outside a command
-        (bytes.fromhex("84 02 A1"), [Error.PROTOCOL, Command(Code.GET_ERRORS)]),  # interrupted
+        (bytes.fromhex("84 02 A1"), [Error.PROTOCOL, ServoCommand(Code.GET_ERRORS)]),  # interrupted
         (bytes.fromhex("9F 02 00 70 2E"), [Error.PROTOCOL]),  # Mini only, its data belong to it
-        (bytes.fromhex("AA 07 21 AA 0C 21"), [Command(Code.GET_ERRORS)]),  # another device number
-        (bytes.fromhex("FF 03 FE"), [Command(Code.MINI_SSC, (3, 254))]),
+        (bytes.fromhex("AA 07 21 AA 0C 21"), [ServoCommand(Code.GET_ERRORS)]),  # another device number
+        (bytes.fromhex("FF 03 FE"), [ServoCommand(Code.MINI_SSC, (3, 254))]),
         (bytes.fromhex("FF 03 FF"), [Error.PROTOCOL]),
     ],
 )
@@ -105,8 +105,8 @@ def test_bytes_against_the_protocol(stream: bytes, expected: list[object]):
 
 
 def test_a_wrong_crc_is_an_error_and_no_command():
-    assert Decoder(crc=True).feed(bytes.fromhex("84 02 70 2E 19 A1 1B")) == [Error.CRC, Command(Code.GET_ERRORS)]
+    assert Decoder(crc=True).feed(bytes.fromhex("84 02 70 2E 19 A1 1B")) == [Error.CRC, ServoCommand(Code.GET_ERRORS)]
 
 
 def test_a_command_knows_its_14_bit_value():
-    assert Command(Code.SET_TARGET, (2, 0x70, 0x2E)).value == 6000
+    assert ServoCommand(Code.SET_TARGET, (2, 0x70, 0x2E)).value == 6000

@@ -13,7 +13,7 @@ from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.driver import WebcamDriver
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
-from monstertruck_drivers.webcam.packets import Packet, PacketKind, encode_mode
+from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, encode_mode
 from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSource
 from monstertruck_drivers.webcam.source import FrameSource, Mode
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source
@@ -376,8 +376,8 @@ def test_a_picture_that_comes_with_the_grant_is_not_lost():
 
         async def camera() -> None:
             await port.device.read()
-            grant = Packet(PacketKind.GRANTED, payload=encode_mode(granted))
-            port.device.write(grant.encode() + Packet(PacketKind.PICTURE, 7, 1, b"picture").encode())
+            grant = CameraPacket(PacketKind.GRANTED, payload=encode_mode(granted))
+            port.device.write(grant.encode() + CameraPacket(PacketKind.PICTURE, 7, 1, b"picture").encode())
 
         async with (
             background(camera()),

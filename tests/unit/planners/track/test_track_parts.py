@@ -8,7 +8,7 @@ import pytest
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.error_model import discretise, exponential, riccati
-from monstertruck_planners.track.fuzzy import Inputs, Rules
+from monstertruck_planners.track.fuzzy import FuzzyInputs, Rules
 from monstertruck_planners.track.path_tracker import AxleModel, SpeedProfile
 from monstertruck_planners.track.segments import Reference, SegmentedPath
 from monstertruck_planners.track.service import TerrainEstimator
@@ -126,7 +126,7 @@ def test_rough_ground_is_felt_and_forgotten():
 
 def inferred(published=True, **more):
     values = {"bearing": 0.0, "orientation": 0.0, "distance": 0.6, "aside": 0.0, "direction": 1.0} | more
-    return Rules(0.2, 0.05, published).infer(Inputs(**values))
+    return Rules(0.2, 0.05, published).infer(FuzzyInputs(**values))
 
 
 @pytest.mark.parametrize(

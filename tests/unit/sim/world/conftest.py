@@ -8,7 +8,7 @@ import pytest
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.config import ServoConfig, WorldConfig
+from monstertruck_sim.world.config import ServoModelConfig, WorldConfig
 from monstertruck_sim.world.world import World
 
 SECOND = 1_000_000_000
@@ -33,7 +33,7 @@ class Driver:
         """Nominal pulses for two axle angles."""
         self.world.servos.advance(self.now)
         for channel, angle in zip((1, 0), SteeringPolynomials().servo_from_axles(front, rear), strict=True):
-            servo = ServoConfig(channel=channel)
+            servo = ServoModelConfig(channel=channel)
             self.pulses[channel] = servo.centre_us + servo.us_per_degree * degrees(angle)
 
     def drive(self, speed, acceleration=20_000.0):

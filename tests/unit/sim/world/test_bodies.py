@@ -14,9 +14,9 @@ from monstertruck_schemas.body import (
     SynchroBody,
     TricycleBody,
 )
-from monstertruck_sim.world.config import ServoConfig, SimTruckConfig
+from monstertruck_sim.world.config import ServoModelConfig, SimTruckConfig
 
-EXACT = ServoConfig(channel=1, dead_band_us=0, resolution_us=0.001)
+EXACT = ServoModelConfig(channel=1, dead_band_us=0, resolution_us=0.001)
 IDEAL = {
     "front_slip_angle": 0.0,
     "rear_slip_angle": 0.0,

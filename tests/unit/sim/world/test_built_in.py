@@ -12,7 +12,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.built_in import BUILT_IN, lap
-from monstertruck_sim.world.config import LidarConfig, ServoConfig, SimTruckConfig, WorldConfig
+from monstertruck_sim.world.config import LidarConfig, ServoModelConfig, SimTruckConfig, WorldConfig
 from monstertruck_sim.world.make_worlds import make_worlds
 from monstertruck_sim.world.obstacles import Box, Disc, penetration
 from monstertruck_sim.world.terrain import Profile, load_profile
@@ -119,7 +119,7 @@ def test_bad_worlds_are_refused(config, match):
     ("model", "values", "match"),
     [
         (SimTruckConfig, {"length": 0.3}, "wheelbase"),
-        (SimTruckConfig, {"rear_servo": ServoConfig(channel=1)}, "share channel 1"),
+        (SimTruckConfig, {"rear_servo": ServoModelConfig(channel=1)}, "share channel 1"),
         (LidarConfig, {"first_step": 700, "last_step": 44}, "first_step 700"),
         (LidarConfig, {"min_range": 6.0}, "min_range"),
         (WorldConfig, {"gravity": 1.6}, "gravity"),

@@ -5,7 +5,7 @@ from math import degrees, pi, radians
 import numpy as np
 import pytest
 
-from monstertruck_sim.world.config import BatteryConfig, CompassConfig, Iron, LidarConfig, SinusoidTilt
+from monstertruck_sim.world.config import BatteryModelConfig, CompassModelConfig, Iron, LidarConfig, SinusoidTilt
 from monstertruck_sim.world.obstacles import Box, Disc
 from monstertruck_sim.world.sensors import FAILED, NO_RETURN, TOO_NEAR
 
@@ -140,7 +140,7 @@ def test_heading_is_clockwise_from_north(field, yaw, heading):
 
 
 def test_north_offset(field):
-    driver = field(compass=CompassConfig(north_yaw=pi / 2 + radians(10)))
+    driver = field(compass=CompassModelConfig(north_yaw=pi / 2 + radians(10)))
     assert driver.world.compass.compass(driver.now).heading_deg == pytest.approx(100)
 
 
@@ -148,7 +148,7 @@ def test_heading_survives_tilt_and_vectors_agree(field):
     driver = field(
         start=(0.0, 0.0, 1.0),
         tilt=SinusoidTilt(kind="sinusoid", pitch_deg=15, roll_deg=10),
-        compass=CompassConfig(horizontal_field=250, vertical_field=-390),
+        compass=CompassModelConfig(horizontal_field=250, vertical_field=-390),
     )
     down = np.array([0.0, 0.0, -1.0])
     signs = set()
@@ -172,7 +172,7 @@ def test_heading_survives_tilt_and_vectors_agree(field):
 def test_compass_error_is_smooth_fixed_and_below_half_a_degree(field):
     errors = []
     for yaw in np.linspace(-3, 3, 25):
-        driver = field(start=(0.0, 0.0, float(yaw)), noise=True, compass=CompassConfig(noise_deg=0.0))
+        driver = field(start=(0.0, 0.0, float(yaw)), noise=True, compass=CompassModelConfig(noise_deg=0.0))
         heading = driver.world.compass.compass(driver.now).heading_deg
         errors.append((heading - (90 - degrees(yaw)) + 180) % 360 - 180)
     errors = np.array(errors)
@@ -194,7 +194,7 @@ def test_compass_noise(field):
 
 
 def test_motor_current_and_iron_disturb_the_heading(field):
-    driver = field(start=(0.0, 0.0, pi / 2), walls=[(-2, 0.5, 2, 0.6)], compass=CompassConfig(motor_field=20.0))
+    driver = field(start=(0.0, 0.0, pi / 2), walls=[(-2, 0.5, 2, 0.6)], compass=CompassModelConfig(motor_field=20.0))
     driver.drive(0.2)
     driver.wait(4)  # against the wall: 0.5 A
     truth = driver.world.truth(driver.now)
@@ -202,17 +202,17 @@ def test_motor_current_and_iron_disturb_the_heading(field):
     want = degrees(np.arctan2(250 * np.sin(north) + 20 * truth.motor_current, 250 * np.cos(north)))
     assert want > 1.5
     assert driver.world.compass.compass(driver.now).heading_deg == pytest.approx(want, rel=1e-6)
-    iron = field(start=(0.0, 0.0, pi / 2), compass=CompassConfig(iron=Iron(hard_y=25.0, soft_x=0.5)))
+    iron = field(start=(0.0, 0.0, pi / 2), compass=CompassModelConfig(iron=Iron(hard_y=25.0, soft_x=0.5)))
     reading = iron.world.compass.compass(iron.now)
     assert reading.field == pytest.approx((125, 25, -390))
     assert reading.heading_deg == pytest.approx(degrees(np.arctan2(25, 125)))
-    skewed = field(start=(0.0, 0.0, pi / 2), compass=CompassConfig(iron=Iron(soft_xy=0.1)))
+    skewed = field(start=(0.0, 0.0, pi / 2), compass=CompassModelConfig(iron=Iron(soft_xy=0.1)))
     assert skewed.world.compass.compass(skewed.now).field == pytest.approx((250, 25, -390))
 
 
 def test_the_ground_wire_offsets_the_battery_input(field):
     volts = [
-        field(battery=BatteryConfig(analog_offset=offset)).world.servos.analog_volts(5, 8 * 10**9)
+        field(battery=BatteryModelConfig(analog_offset=offset)).world.servos.analog_volts(5, 8 * 10**9)
         for offset in (0.0, 0.02)
     ]
     assert volts[1] - volts[0] == pytest.approx(0.02)

@@ -5,11 +5,11 @@ from math import atan, cos, degrees, hypot, pi, radians, sin
 import numpy as np
 import pytest
 
-from monstertruck_sim.world.battery import Battery, rest_voltage
+from monstertruck_sim.world.battery import BatteryModel, rest_voltage
 from monstertruck_sim.world.config import (
-    BatteryConfig,
+    BatteryModelConfig,
     MotorConfig,
-    ServoConfig,
+    ServoModelConfig,
     SimTruckConfig,
     SinusoidTilt,
 )
@@ -37,7 +37,7 @@ def test_straight_distance_is_motor_turns_through_the_ratio(field):
 @pytest.mark.parametrize(("front", "rear"), [(0.3, 0.0), (0.3, -0.3), (-0.25, 0.25), (0.35, -0.1)])
 @pytest.mark.parametrize("speed", [0.2, -0.2])
 def test_circle_has_the_radius_of_the_formula(field, front, rear, speed):
-    exact = ServoConfig(channel=1, dead_band_us=0, resolution_us=0.001)
+    exact = ServoModelConfig(channel=1, dead_band_us=0, resolution_us=0.001)
     servos = {"front_servo": exact, "rear_servo": exact.model_copy(update={"channel": 0})}
     driver = field(truck=IDEAL.model_copy(update=servos))
     driver.steer(front, rear)
@@ -117,7 +117,7 @@ def test_servo_dead_band_and_no_pulses(field):
 
 
 def test_hidden_calibration_bends_the_straight_line(field):
-    off = IDEAL.model_copy(update={"front_servo": ServoConfig(channel=1, centre_us=1449.2)})
+    off = IDEAL.model_copy(update={"front_servo": ServoModelConfig(channel=1, centre_us=1449.2)})
     driver = field(truck=off)
     driver.steer(0.0, 0.0)
     driver.drive(0.2)
@@ -125,7 +125,7 @@ def test_hidden_calibration_bends_the_straight_line(field):
 
 
 def test_a_stop_of_the_servo_ends_its_travel_on_one_side(field):
-    off = IDEAL.model_copy(update={"front_servo": ServoConfig(channel=1, left_stop_deg=20.0)})
+    off = IDEAL.model_copy(update={"front_servo": ServoModelConfig(channel=1, left_stop_deg=20.0)})
     driver = field(truck=off)
     driver.steer(0.4, 0.0)
     assert degrees(driver.wait(1).front) == pytest.approx(13.0, abs=0.5)
@@ -266,8 +266,8 @@ def test_climbing_costs_current(field):
 
 
 def test_battery_counts_coulombs_and_sags():
-    config = BatteryConfig(charge=0.8, electronics_w=24.12)
-    battery = Battery(config)
+    config = BatteryModelConfig(charge=0.8, electronics_w=24.12)
+    battery = BatteryModel(config)
     assert rest_voltage(1.0) == pytest.approx(25.2)
     assert rest_voltage(0.0) == pytest.approx(19.62)
     idle = battery.volts

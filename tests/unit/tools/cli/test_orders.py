@@ -14,7 +14,7 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GATE, Topic
 from monstertruckd.tools.cli import orders
-from monstertruckd.tools.cli.orders import Outcome, give
+from monstertruckd.tools.cli.orders import OrderOutcome, give
 
 HEADER = {"stamp": 1, "received": 1, "seq": 0}
 
@@ -42,7 +42,7 @@ class Robot:
         return self.newest
 
 
-def given(robot: Robot, order: Order) -> Outcome:
+def given(robot: Robot, order: Order) -> OrderOutcome:
     return asyncio.run(give(robot, order))
 
 
@@ -70,9 +70,9 @@ def test_no_answer_is_no_outcome(error: TruckError):
 
 
 def shown(
-    monkeypatch: pytest.MonkeyPatch, command: Callable[..., None], outcome: Outcome, *, json_output: bool = False
+    monkeypatch: pytest.MonkeyPatch, command: Callable[..., None], outcome: OrderOutcome, *, json_output: bool = False
 ) -> int:
-    def run_wall(main: Any) -> Outcome:
+    def run_wall(main: Any) -> OrderOutcome:
         return outcome
 
     monkeypatch.setattr(orders, "run_wall", run_wall)
@@ -84,10 +84,10 @@ def shown(
 
 
 def test_what_is_printed_and_the_exit_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    done = Outcome(Order.ARM, Reason.OK, "", state(GateMode.ARMED, Reason.BATTERY_LOW))
+    done = OrderOutcome(Order.ARM, Reason.OK, "", state(GateMode.ARMED, Reason.BATTERY_LOW))
     assert shown(monkeypatch, orders.arm, done) == 0
     assert capsys.readouterr().out == "armed; battery low: speed limited\n"
-    refused = Outcome(Order.RESET, Reason.NOT_ARMED_SPEED, "it moves", state(GateMode.ESTOPPED))
+    refused = OrderOutcome(Order.RESET, Reason.NOT_ARMED_SPEED, "it moves", state(GateMode.ESTOPPED))
     assert shown(monkeypatch, orders.reset, refused) == Reason.NOT_ARMED_SPEED.exit_code
     assert capsys.readouterr() == ("", "reset refused: it moves\n")
     assert shown(monkeypatch, orders.reset, refused, json_output=True) == Reason.NOT_ARMED_SPEED.exit_code

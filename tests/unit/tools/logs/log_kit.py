@@ -6,7 +6,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.state import ClockOffset, GateMode, GateState, Odometry
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 
 MAY_2026 = 1_777_600_000 * SECOND
 """Offset of a log whose daemon time began with the boot: its first second is 2026-05-01 01:46:41 UTC."""
@@ -22,7 +22,7 @@ class Writer:
     def put(self, topic, message, skip=0):
         sequence = self.sequences.get(topic.name, 0) + skip
         self.sequences[topic.name] = sequence + 1
-        self.log.add(Entry(topic, message.received, message.stamp, sequence, wire.encode(topic, message)))
+        self.log.add(LogEntry(topic, message.received, message.stamp, sequence, wire.encode(topic, message)))
 
 
 def odometry(now, seq):

@@ -10,7 +10,7 @@ from monstertruck_schemas import topics as t
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Attitude, Vector3
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 from tests.unit.recorder.conftest import scan, steering
 
 
@@ -39,7 +39,7 @@ def write(file: Path, messages=40, compression="lz4") -> list[tuple]:
         for topic, make in MAKERS.items():
             now = SECOND + i * SECOND // 10
             message = make(now, i)
-            log.add(Entry(topic, now, now, i, wire.encode(topic, message)))
+            log.add(LogEntry(topic, now, now, i, wire.encode(topic, message)))
             written.append((topic.name, now, message))
         if i % 10 == 9:
             log.flush()

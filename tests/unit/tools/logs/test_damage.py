@@ -9,7 +9,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_schemas import topics as t
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.logs.summary import info
@@ -68,7 +68,7 @@ def test_no_damage_of_an_index_makes_messages(tmp_path):
 def test_what_turned_into_an_end_is_none(tmp_path):
     file = tmp_path / "log.mcap"
     log = LogFile(file, "none", 1 << 20, {}, {}, 0)
-    log.add(Entry(t.COMPASS, 0, 0, 0, wire.encode(t.COMPASS, compass(0, 0))))
+    log.add(LogEntry(t.COMPASS, 0, 0, 0, wire.encode(t.COMPASS, compass(0, 0))))
     log.finish()
     data = bytearray(file.read_bytes())
     (chunk,) = chunks(data)

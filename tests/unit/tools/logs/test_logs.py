@@ -14,7 +14,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover, recover_directory
 from monstertruckd.tools.logs.export import export_csv, export_npz
@@ -234,7 +234,7 @@ def test_npz_has_an_array_per_field(log, tmp_path):
 def test_invalid_message_in_a_log_is_named(tmp_path):
     file = tmp_path / "bad.mcap"
     log = LogFile(file, "none", 1000, {}, {}, 0)
-    log.add(Entry(t.COMPASS, 0, 0, 0, b'{"stamp": 1}'))
+    log.add(LogEntry(t.COMPASS, 0, 0, 0, b'{"stamp": 1}'))
     log.finish()
     with pytest.raises(InputError, match=r"bad\.mcap: message 1: sensor/compass: received: Field required"):
         export_npz(file, tmp_path / "out")

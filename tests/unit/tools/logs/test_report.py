@@ -17,7 +17,7 @@ from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, Grid
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.tools.logs.report import report
 from monstertruckd.tools.logs.report.collect import collect
 from monstertruckd.tools.logs.report.page import page
@@ -224,8 +224,8 @@ def test_log_with_next_to_nothing_still_has_a_page(tmp_path):
 def test_undecodable_messages_are_counted_and_passed_over(tmp_path):
     file = tmp_path / "odd.mcap"
     log = LogFile(file, "none", 1000, {}, {}, 0)
-    log.add(Entry(t.COMPASS, 0, 0, 0, b"not json"))
-    log.add(Entry(t.GATE, SECOND, SECOND, 0, wire.encode(t.GATE, gate(SECOND, 0))))
+    log.add(LogEntry(t.COMPASS, 0, 0, 0, b"not json"))
+    log.add(LogEntry(t.GATE, SECOND, SECOND, 0, wire.encode(t.GATE, gate(SECOND, 0))))
     log.finish()
     run = collect(file)
     assert run.traffic["sensor/compass"].undecodable == 1

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment
 
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.log_file import Entry, LogFile
+from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import MAGIC, LogMessage, open_log
 from monstertruckd.tools.replay_check import check_log
 from monstertruckd.tools.replay_check.result import ROUNDING
@@ -34,7 +34,7 @@ def write(target: Path, messages: Iterable[LogMessage], attachments: dict, **met
     named = {name.removesuffix(".json"): value for name, value in attachments.items()}
     file = LogFile(target, "zstd", 1 << 16, named, {"real_offset_ns": "0"} | metadata, 0)
     for one in messages:
-        file.add(Entry(BY_NAME[one.topic], one.log_time, one.stamp, one.sequence, one.payload))
+        file.add(LogEntry(BY_NAME[one.topic], one.log_time, one.stamp, one.sequence, one.payload))
     file.finish()
     return target
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.recorder.config import Compression, RecorderConfig
-from monstertruckd.recorder.log_file import Entry
+from monstertruckd.recorder.log_file import LogEntry
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.recorder import LogWriter
 from monstertruckd.tools.cli.main import app
@@ -25,7 +25,7 @@ def split(folder, seconds=2.0, **metadata):
     messages = list(open_log(LEVEL))
     with LogWriter(config, attached, {"real_offset_ns": "0"} | metadata, messages[0].log_time) as writer:
         for one in messages:
-            writer.write(Entry(BY_NAME[one.topic], one.log_time, one.stamp, one.sequence, one.payload))
+            writer.write(LogEntry(BY_NAME[one.topic], one.log_time, one.stamp, one.sequence, one.payload))
     return sorted(folder.iterdir())
 
 
