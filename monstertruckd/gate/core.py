@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
@@ -24,7 +25,7 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
@@ -66,10 +67,12 @@ class GateOutput(NamedTuple):
     """Axle angle, rad."""
     rear: float
     """Axle angle, rad."""
-    front_servo: float
-    """Servo angle, rad."""
-    rear_servo: float
-    """Servo angle, rad."""
+    servos: tuple[float, ...]
+    """Servo angles, rad: front and rear, or front left, front right, rear left and rear right."""
+    form: DriveForm | None
+    """Of the newest request of the holder."""
+    twist: tuple[float, float, float]
+    """Commanded, of the base: m/s, m/s, rad/s."""
     mode: GateMode
     holder: str | None
     role: Role | None
@@ -121,7 +124,7 @@ class Gate:
         self._sources = Sources(nonce, config)
         self._sensors = SensorMonitor(config, chassis)
         self._outages = Outages()
-        self._obstacles = ObstacleGuard(config, chassis.bicycle, footprint, points)
+        self._obstacles = ObstacleGuard(config, footprint, points)
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
         # Other bodies do not steer by servos with a supply of their own.
@@ -164,7 +167,7 @@ class Gate:
             now = attitude.received
             trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._sensors.steering_fresh(now)
             heading = attitude.heading if trusted and self._states.active else None
-            self._steering_check.observe(attitude.stamp, heading, self._sensors.speed(now), *self._sensors.axles)
+            self._steering_check.observe(attitude.stamp, heading, self._sensors.speed(now), *self._sensors.angles)
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
@@ -200,11 +203,11 @@ class Gate:
     def _consider(self, request: DriveRequest, now: int, accepted: Reason, *, inside: bool) -> Reason:
         if accepted is not Reason.OK:
             return self._refuse(now, accepted, request)
-        wrong = {n: v for n in ("speed", "front", "rear") if not math.isfinite(v := getattr(request, n))}
+        wrong = {name: value for name, value in request.numbers.items() if not math.isfinite(value)}
         if wrong:
             text = ", ".join(f"{name} is {value}" for name, value in wrong.items()) + ": expected finite numbers"
             return self._refuse(now, Reason.NOT_FINITE, request, text)
-        if (why := self._chassis.refusal(request.front, request.rear)) is not None:
+        if (why := self._impossible(request)) is not None:
             return self._refuse(now, Reason.IMPOSSIBLE_MOTION, request, why)
         source = self._sources.add(request, now, inside=inside)
         if self.mode is GateMode.ESTOPPED:
@@ -217,6 +220,17 @@ class Gate:
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._sensors.assess(now), now)), Reason.OK)
+
+    def _impossible(self, request: DriveRequest) -> str | None:
+        """Why the body cannot move like that; None if it can, or nearly."""
+        forms = self._chassis.forms
+        if request.form not in forms:
+            return f"a request by {request.form}: this body takes {' or '.join(sorted(forms))}"
+        try:
+            self._motion.target(request)
+        except KinematicsError as error:
+            return str(error)
+        return None
 
     def control(self, request: ControlRequest, now: int) -> Decision:
         """Carry out an order, or refuse it.
@@ -373,7 +387,7 @@ class Gate:
 
     def _released(self, holder: Source, now: int) -> bool:
         """Whether the holder's last request was standstill, and the truck has been at rest since."""
-        return holder.neutral and self._motion.speed == 0 and self._sensors.at_rest(now, holder.arrived)
+        return holder.neutral and self._motion.standing and self._sensors.at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
         self._trip(now, GateMode.STOPPING, causes, ordered=ordered)
@@ -424,15 +438,16 @@ class Gate:
         reasons = tuple(dict.fromkeys((*self._states.reasons, *blocks, *slow)))
         moving_allowed = self.mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
         motion, holder = self._motion, self._states.holder
-        front_servo, rear_servo = motion.servos
+        front, rear = motion.axle_angles
         return GateOutput(
             action=self._action(now, reasons),
             speeds=motion.shaft_speeds,
             motor_velocities=motion.motor_velocities,
-            front=motion.front,
-            rear=motion.rear,
-            front_servo=front_servo,
-            rear_servo=rear_servo,
+            front=front,
+            rear=rear,
+            servos=motion.servos,
+            form=None if holder is None else holder.request.form,
+            twist=motion.twist,
             mode=self.mode,
             holder=self._states.holder_name,
             role=None if holder is None else holder.request.role,

@@ -1,32 +1,49 @@
-"""Command limiting: from a request to the commanded motion, slowed by what the swept footprint would touch."""
+"""Command limiting: from a request of any form to the commanded motion, slowed by what the swept footprint would touch.
+
+Every form of request becomes a twist of the base and the steering angles it needs (``Motion.target``); from there on
+limits, ramps and the sweep know nothing of forms. The size of a twist is its **pace**: the greatest speed of the base
+and of the driven wheels, m/s. It is the speed of the base for a truck that drives straight on, and that of the wheels
+for a body that turns on the spot.
+"""
 
 import math
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.chassis import MAX_ANGLE, STILL, Angles, Chassis, Speeds
+from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.elementary import Array, KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.sensors import SensorMonitor
 
-POSES = 20
-"""Poses checked along the swept path."""
+POSES: Final = 20
+"""Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
 
-ANGLE_STEP = 0.005
-"""Axle angles are rounded to this before the sweep, rad: an error of 2 mm at its end, and most sweeps are cached."""
+TWIST_STEP: Final = 0.005
+"""Ways are rounded to this before the sweep, m/m and rad/m: an error of 2 mm at its end, and most sweeps are cached."""
 
-SWEEPS = 256
+SWEEPS: Final = 256
 """Sweeps cached."""
 
-Arcs = tuple[tuple[float, float], ...]
+AHEAD: Final = 0.5
+"""A motion whose forward speed is a lesser share of its pace than this has the limit of reverse: part of the footprint
+goes where the lidar sees nothing."""
+
+MAX_SPEED: Final = 1e3
+"""Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
+
+ROUNDING: Final = 1e-6
+"""Relative difference up to which two motions are the same."""
+
+Way = tuple[float, float, float]
+"""Motion of the base per metre of pace: m/m, m/m, rad/m."""
 
 
 class ObstacleGuard:
@@ -36,30 +53,21 @@ class ObstacleGuard:
 
     Args:
         config: limits.
-        steering: the truck's geometry.
-        footprint: its outline.
+        footprint: the body's outline.
         points: of scans, in base.
     """
 
-    def __init__(
-        self,
-        config: GateConfig,
-        steering: FourWheelSteering,
-        footprint: Footprint,
-        points: ScanPoints,
-    ) -> None:
+    def __init__(self, config: GateConfig, footprint: Footprint, points: ScanPoints) -> None:
         self._config = config
-        self._steering = steering
         self._footprint = footprint
         self._scan_points = points
         self._points = np.empty((0, 2))
         self._stamp = 0
-        self._checked: tuple[float, tuple[tuple[int, int], ...]] | None = None
+        self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._stopping(config.speed, delay, config.obstacle.deceleration)
         self._near = self._reach + footprint.circumscribed_radius + config.obstacle.side_clearance
-        self._distances = np.linspace(0.0, self._reach, POSES)
         self._sweep = lru_cache(SWEEPS)(self._swept)
 
     def observe(self, scan: LaserScan) -> None:
@@ -69,31 +77,33 @@ class ObstacleGuard:
         self._stamp = scan.stamp
         self._checked = None
 
-    def free_distance(self, direction: float, arcs: Arcs) -> float:
+    def free_distance(self, ways: tuple[Way, ...]) -> float:
         """Distance the footprint can travel from where the scan was taken, m; +inf if no obstacle is within reach.
 
         Args:
-            direction: +1 forward, -1 backward.
-            arcs: (front, rear) axle angles, rad; the shortest distance of all of them counts.
+            ways: the shortest distance of all of them counts.
         """
-        rounded = tuple((round(front / ANGLE_STEP), round(rear / ANGLE_STEP)) for front, rear in arcs)
-        if self._checked != (direction, rounded):
-            self._checked = (direction, rounded)
-            distances = (self._free_distance(direction, *arc) for arc in {*rounded})
+        rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in ways)
+        if self._checked != rounded:
+            self._checked = rounded
+            distances = (self._free_distance(*way) for way in rounded)
             self._free = min(distances) if len(self._points) else math.inf
         return self._free
 
-    def _swept(self, direction: float, front: int, rear: int) -> Array:
-        """Poses along the arc with axle angles in steps of ``ANGLE_STEP``."""
-        return swept_poses(self._steering, front * ANGLE_STEP, rear * ANGLE_STEP, direction * self._distances)
+    def _swept(self, x: int, y: int, turn: int) -> tuple[Array, Array]:
+        """Distances and poses along a way in steps of ``TWIST_STEP``; no corner moves further than the base would."""
+        vx, vy, wz = way = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
+        corner = math.hypot(vx, vy) + abs(wz) * self._footprint.circumscribed_radius
+        distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(corner, 1.0)))
+        return distances, swept_poses(way, distances)
 
-    def _free_distance(self, direction: float, front: int, rear: int) -> float:
-        poses = self._sweep(direction, front, rear)
+    def _free_distance(self, x: int, y: int, turn: int) -> float:
+        distances, poses = self._sweep(x, y, turn)
         contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)
-        return math.inf if contact is None else float(self._distances[contact - 1])
+        return math.inf if contact is None else float(distances[contact - 1])
 
     def allowed_speed(self, free: float, now: int) -> float:
-        """Greatest speed from which the truck stops comfortably within ``free`` metres, m/s."""
+        """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
         if math.isinf(free):
             return math.inf
         room = max(free - self._config.obstacle.ahead, 0.0)
@@ -101,7 +111,7 @@ class ObstacleGuard:
         return deceleration * (math.sqrt(delay**2 + 2 * room / deceleration) - delay)
 
     def too_near(self, free: float, speed: float, now: int) -> bool:
-        """Whether an ordinary stop from ``speed`` needs more than ``free`` metres."""
+        """Whether an ordinary stop from the pace ``speed`` needs more than ``free`` metres."""
         return free < self._stopping(abs(speed), self._delay(now), self._config.deceleration)
 
     def _delay(self, now: int) -> float:
@@ -112,12 +122,19 @@ class ObstacleGuard:
         return speed * delay + speed**2 / (2 * deceleration)
 
 
-MAX_ANGLE: Final = 1.4
-"""Axle angles are clipped to this before anything else, rad: keeps their tangents finite."""
+class Target(NamedTuple):
+    """What a request asks of the body."""
+
+    twist: Twist[float]
+    """Of the base."""
+    angles: Angles
+    """Steering angles it needs."""
+    clipped: bool
+    """It is not what was asked, but the nearest that the body can do."""
 
 
 class Motion:
-    """Commanded speed of the base (m/s, along its direction of travel) and axle angles (rad).
+    """Commanded motion: the twist of the base and the steering angles, rad.
 
     Args:
         config: limits.
@@ -127,19 +144,27 @@ class Motion:
     def __init__(self, config: GateConfig, chassis: Chassis) -> None:
         self._config = config
         self._chassis = chassis
-        self.speed = 0.0
-        self.front = 0.0
-        self.rear = 0.0
-        self._servos = (0.0, 0.0), chassis.servos(0.0, 0.0)
-        self._unit = (0.0, 0.0), chassis.shaft_speeds(1.0, 0.0, 0.0)
-        self._shafts = (0.0, 0.0, 0.0), chassis.shaft_speeds(0.0, 0.0, 0.0)
+        self.twist: Twist[float] = STILL
+        self.angles: Angles = chassis.straight
+        self._servos = self.angles, chassis.servos(*self.angles)
+        self._shafts = (STILL, self.angles), chassis.shafts_along(STILL, *self.angles)
 
     @property
-    def servos(self) -> tuple[float, float]:
-        """Servo angles front and rear that give the axle angles, rad."""
-        if self._servos[0] != (self.front, self.rear):
-            self._servos = (self.front, self.rear), self._chassis.servos(self.front, self.rear)
+    def standing(self) -> bool:
+        """Whether standstill is commanded."""
+        return self.twist == STILL
+
+    @property
+    def servos(self) -> Angles:
+        """Servo angles that give the steering angles, rad."""
+        if self._servos[0] != self.angles:
+            self._servos = self.angles, self._chassis.servos(*self.angles)
         return self._servos[1]
+
+    @property
+    def axle_angles(self) -> tuple[float, float]:
+        """Axle angles of the bicycle that moves alike, rad; 0 where none does."""
+        return self._chassis.axle_angles(self.twist, self.angles)
 
     @property
     def motor_velocities(self) -> tuple[float, ...]:
@@ -147,46 +172,91 @@ class Motion:
         return tuple(map(self._chassis.drivetrain.motor_rate, self.shaft_speeds))
 
     @property
-    def shaft_speeds(self) -> tuple[float, ...]:
+    def shaft_speeds(self) -> Speeds:
         """Wheel speed over ground of every driven shaft, m/s."""
-        command = self.speed, self.front, self.rear
+        command = self.twist, self.angles
         if self._shafts[0] != command:
-            self._shafts = command, self._chassis.shaft_speeds(*command)
+            self._shafts = command, self._chassis.shafts_along(self.twist, *self.angles)
         return self._shafts[1]
 
-    def clipped_angles(self, request: DriveRequest) -> tuple[float, float, bool]:
-        """Axle angles within the limits that keep the requested curvature, and whether clipping changed them."""
+    def target(self, request: DriveRequest) -> Target:
+        """What a request means for this body, within the limit of the axle angles.
+
+        Raises:
+            KinematicsError: the body cannot move like that; the reason is named.
+        """
+        return self._target_of_axles(request) if request.twist is None else self._target_of_twist(request.twist)
+
+    def _target_of_axles(self, request: DriveRequest) -> Target:
+        chassis = self._chassis
+        if (why := chassis.refusal(request.front, request.rear)) is not None:
+            raise KinematicsError(why)
         front = min(max(request.front, -MAX_ANGLE), MAX_ANGLE)
         rear = min(max(request.rear, -MAX_ANGLE), MAX_ANGLE)
-        if max(abs(front), abs(rear)) <= self._config.angle:
-            return front, rear, False
-        return *self._chassis.limited(front, rear, self._config.angle), True
+        clipped = max(abs(front), abs(rear)) > self._config.angle
+        if clipped:
+            front, rear = chassis.limited(front, rear, self._config.angle)
+        speed = min(max(request.speed, -MAX_SPEED), MAX_SPEED)
+        twist = chassis.bicycle.body_twist(speed, front, rear)
+        return Target(twist, chassis.steering_for_axles(front, rear, self.angles), clipped)
 
-    def max_speed(self, direction: float) -> float:
-        """Greatest speed of the base at the present axle angles, m/s, so that no wheel exceeds its limit."""
-        wheels = self._config.speed if direction >= 0 else self._config.reverse_speed
-        if self._unit[0] != (self.front, self.rear):
-            self._unit = (self.front, self.rear), self._chassis.shaft_speeds(1.0, self.front, self.rear)
-        return wheels / max(1.0, *map(abs, self._unit[1]))
+    def _target_of_twist(self, request: RequestedTwist) -> Target:
+        chassis = self._chassis
+        asked = request.vx, request.vy, request.wz
+        asked = _scaled(asked, min(1.0, MAX_SPEED / max(*map(abs, asked), MAX_SPEED)))
+        twist = chassis.possible(asked)
+        angles, clipped = chassis.limited_steering(chassis.steering_for(twist, self.angles), self._config.angle)
+        return Target(twist, angles, clipped or not _same(twist, asked))
 
-    def steer(self, front: float, rear: float, dt: float) -> None:
-        """Turn both axles towards (front, rear), rad, within the steering rate; both complete the same share of it."""
-        step = max(abs(front - self.front), abs(rear - self.rear))
-        share = min(self._config.steering_rate * dt / step, 1.0) if step > 0 else 1.0
-        self.front += share * (front - self.front)
-        self.rear += share * (rear - self.rear)
+    def along(self, twist: Twist[float], angles: Angles | None = None) -> Twist[float]:
+        """The part of a twist that the body can do at steering angles, by default the commanded ones."""
+        return self._chassis.along(twist, *(self.angles if angles is None else angles))
 
-    def accelerate(self, target: float, dt: float) -> None:
-        """Change the speed towards ``target``, m/s; a change of direction passes through zero."""
-        if self.speed * target < 0:
-            target = 0.0
-        rate = self._config.acceleration if abs(target) > abs(self.speed) else self._config.deceleration
-        change = min(abs(target - self.speed), rate * dt)
-        self.speed += math.copysign(change, target - self.speed)
+    def pace(self, twist: Twist[float]) -> float:
+        """Greatest speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s."""
+        return max(math.hypot(twist[0], twist[1]), *map(abs, self._chassis.shafts_along(twist, *self.angles)))
+
+    def max_pace(self, twist: Twist[float]) -> float:
+        """Greatest pace allowed in the direction of ``twist``, m/s."""
+        ahead = twist[0] >= AHEAD * self.pace(twist)
+        return self._config.speed if ahead else self._config.reverse_speed
+
+    def progress(self, measured: Speeds, way: Way) -> float:
+        """Measured pace along a way, m/s; the way's shaft speeds fitted to the measured ones by least squares."""
+        shafts = self._chassis.shafts_along(way, *self.angles)
+        return _dot(measured, shafts) / (_dot(shafts, shafts) or 1.0)
+
+    def steer(self, target: Angles, dt: float) -> None:
+        """Turn all steered wheels towards ``target``, rad, within the steering rate; all complete the same share."""
+        step = max(abs(to - at) for at, to in zip(self.angles, target, strict=True))
+        if step > 0:
+            share = min(self._config.steering_rate * dt / step, 1.0)
+            self.angles = tuple(at + share * (to - at) for at, to in zip(self.angles, target, strict=True))
+            self.twist = self.along(self.twist)
+
+    def aligned(self, target: Angles) -> bool:
+        """Whether the body may move while its wheels turn to ``target``."""
+        return self._chassis.aligned(self.angles, target)
+
+    def reverses(self, target: Twist[float]) -> bool:
+        """Whether wheels that turn for the present motion turn the other way for ``target``, on the whole."""
+        return _dot(self.shaft_speeds, self._chassis.shafts_along(target, *self.angles)) < 0
+
+    def accelerate(self, target: Twist[float], dt: float) -> None:
+        """Change the twist towards ``target``: no wheel, nor the base, changes its speed faster than allowed."""
+        change = (target[0] - self.twist[0], target[1] - self.twist[1], target[2] - self.twist[2])
+        step = self.pace(change)
+        if step == 0:
+            return
+        growing = self.pace(target) > self.pace(self.twist)
+        rate = self._config.acceleration if growing else self._config.deceleration
+        share = min(rate * dt / step, 1.0)
+        x, y, turn = (now + share * part for now, part in zip(self.twist, change, strict=True))
+        self.twist = target if share == 1.0 else (x, y, turn)
 
     def halt(self) -> None:
-        """Command speed 0 at once: the drive controller's own deceleration profile is the ramp."""
-        self.speed = 0.0
+        """Command standstill at once: the drive controllers' own deceleration profile is the ramp."""
+        self.twist = STILL
 
 
 class CommandLimiter:
@@ -218,43 +288,64 @@ class CommandLimiter:
         self.free = None
 
     def update(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:
-        """Advance by ``dt`` s towards ``request``; adds the speed limits that apply, m/s, to ``limits``."""
+        """Advance by ``dt`` s towards ``request``; adds the limits of the pace that apply, m/s, to ``limits``."""
         motion = self._motion
-        front, rear, clipped = motion.clipped_angles(request)
-        motion.steer(front, rear, dt)
-        direction = math.copysign(1.0, motion.speed or request.speed)
-        max_speed = motion.max_speed(direction)
-        if clipped or abs(request.speed) > max_speed * (1 + 1e-6):
-            limits[Reason.CLIPPED] = max_speed
-        if motion.speed != 0 or request.speed != 0:
-            self._check_obstacles(now, direction, max(abs(request.speed), abs(motion.speed)), limits)
-        allowed = min(*limits.values(), max_speed) if limits else max_speed
+        target = motion.target(request)
+        turning = motion.aligned(target.angles)
+        if turning or (motion.standing and self._sensors.at_rest(now)):
+            motion.steer(target.angles, dt)
+        wanted = motion.along(target.twist) if turning else STILL
+        if motion.reverses(wanted):
+            wanted = STILL  # a change of direction passes through standstill
+        pace = motion.pace(wanted)
+        max_pace = motion.max_pace(wanted if pace > 0 else motion.twist)
+        if target.clipped or pace > max_pace * (1 + ROUNDING):
+            limits[Reason.CLIPPED] = max_pace
+        if pace > 0 or not motion.standing:
+            self._check_obstacles(now, wanted, limits)
+        allowed = min(*limits.values(), max_pace) if limits else max_pace
         if allowed == 0:
             motion.halt()
         else:
-            motion.accelerate(min(max(request.speed, -allowed), allowed), dt)
+            motion.accelerate(wanted if pace <= allowed else _scaled(wanted, allowed / pace), dt)
 
     def stopping_distance(self, now: int) -> float:
         """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
         speed = max(abs(self._sensors.speed(now) or 0.0), *map(abs, self._motion.shaft_speeds))
         return speed * self._config.reaction + speed**2 / (2 * self._config.deceleration)
 
-    def _check_obstacles(self, now: int, direction: float, requested: float, limits: dict[Reason, float]) -> None:
+    def _check_obstacles(self, now: int, wanted: Twist[float], limits: dict[Reason, float]) -> None:
+        """Sweep the footprint along the commanded motion, along ``wanted``, and as the wheels are seen to stand."""
         if not self._sensors.scan_fresh(now):
             return
-        arcs = [(self._motion.front, self._motion.rear)]
+        motion = self._motion
+        twists = [twist for twist in (wanted, motion.twist) if twist != STILL]
+        ways = [_scaled(twist, 1.0 / motion.pace(twist)) for twist in twists]
         if self._sensors.steering_fresh(now):
-            arcs.append(self._sensors.axles)
-        free = self._obstacles.free_distance(direction, tuple(arcs))
+            ways.append(motion.along(ways[0], self._sensors.angles))
+        free = self._obstacles.free_distance(tuple(ways))
         self.free = free if math.isfinite(free) else None
         allowed = self._obstacles.allowed_speed(free, now)
         crawl = self._config.obstacle.crawl
         self.blocked = allowed < (2 * crawl if self.blocked else crawl)
         if self.blocked:
             limits[Reason.OBSTACLE_STOP] = 0.0
-        elif allowed < requested:
+        elif allowed < max(map(motion.pace, twists)):
             limits[Reason.OBSTACLE_SLOW] = allowed
-        speed = self._sensors.speed(now) or 0.0
-        approaching = speed * direction > self._config.standstill
+        measured = self._sensors.shaft_speeds(now)
+        speed = max(motion.progress(measured, way) for way in ways) if measured else 0.0
+        approaching = speed > self._config.standstill
         near = self.blocked and self._obstacles.too_near(free, speed, now)
         self.emergency = approaching and (self.emergency or near)
+
+
+def _scaled(twist: Twist[float], factor: float) -> Twist[float]:
+    return twist[0] * factor, twist[1] * factor, twist[2] * factor
+
+
+def _dot(one: Speeds, other: Speeds) -> float:
+    return math.fsum(a * b for a, b in zip(one, other, strict=True))
+
+
+def _same(one: Twist[float], other: Twist[float]) -> bool:
+    return all(math.isclose(a, b, rel_tol=ROUNDING, abs_tol=ROUNDING) for a, b in zip(one, other, strict=True))

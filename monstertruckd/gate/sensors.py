@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.chassis import Chassis, Speeds
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
@@ -102,12 +102,12 @@ class SensorMonitor:
         self._failed: tuple[str, ...] = ()
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
-        self._critical = _critical(config, steered=chassis.linkage is not None)
+        self._critical = _critical(config, steered=chassis.steered)
         self._tilt = _Tilt(config.tilt)
         self._speed: tuple[int, float | None] | None = None
         """Time (ns) and result of the newest ``speed``, until the next sample."""
-        self.axles = (0.0, 0.0)
-        """Axle angles by the newest steering feedback, rad."""
+        self.angles = chassis.straight
+        """Steering angles by the newest steering feedback, rad."""
 
     def observe_scan(self, scan: LaserScan) -> bool:
         """Take a scan; False if it is not valid, by its age or by the tilt of its plane."""
@@ -131,7 +131,7 @@ class SensorMonitor:
         """Take steering feedback; not valid unless the servo controller trusts it."""
         if self._valid(feedback, Reason.STEERING_STALE) and feedback.trusted:
             self.steering = feedback
-            self.axles = self._chassis.axles(feedback.front, feedback.rear)
+            self.angles = self._chassis.steering(*feedback.servos)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take an attitude; not valid without a valid tilt."""
@@ -180,10 +180,13 @@ class SensorMonitor:
     def speed(self, now: int) -> float | None:
         """Measured speed of the fastest wheel over ground, m/s; None without fresh feedback of every shaft."""
         if self._speed is None or self._speed[0] != now:
-            drives = self._fresh_drives(now)
-            rolling = tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in drives])
+            rolling = self.shaft_speeds(now)
             self._speed = now, self._chassis.fastest_wheel_speed(rolling) if rolling else None
         return self._speed[1]
+
+    def shaft_speeds(self, now: int) -> Speeds:
+        """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
+        return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
         """Feedback of all shafts; empty unless all of it is fresh."""

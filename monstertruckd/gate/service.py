@@ -13,7 +13,8 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
-from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.base import Twist2D
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand, servo_fields
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
@@ -245,8 +246,7 @@ class GateService:
                 seq=steering.next_seq(),
                 front=output.front,
                 rear=output.rear,
-                front_servo=output.front_servo,
-                rear_servo=output.rear_servo,
+                **servo_fields(output.servos),
                 deadman=Reason.DRIVE_STALE not in output.reasons,
             )
         )
@@ -298,6 +298,8 @@ class GateService:
             speed_limit=output.speed_limit,
             reasons=output.reasons,
             stopping_distance=output.stopping_distance,
+            form=output.form,
+            twist=Twist2D(**dict(zip(("vx", "vy", "wz"), output.twist, strict=True))),
         )
 
     async def _keep_latch(self) -> None:

@@ -33,9 +33,6 @@ STARTING: Final = frozenset({Order.ARM, Order.RESET})
 
 Key = tuple[bool, str]
 
-NEUTRAL: Final = 1e-3
-"""Requested speeds below this are neutral, m/s."""
-
 
 @dataclass(slots=True)
 class Source:
@@ -59,7 +56,7 @@ class Source:
     @property
     def neutral(self) -> bool:
         """Whether it requests standstill."""
-        return abs(self.request.speed) < NEUTRAL
+        return self.request.neutral
 
     @property
     def requests_motion(self) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monstertruck_kinematics.chassis import Chassis, Speeds
+from monstertruck_kinematics.chassis import Angles, Chassis, Speeds
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
@@ -33,8 +33,8 @@ class WheelIncrement:
     """Of the fastest shaft, m, not negative."""
     pace: Speeds
     """What the family makes of its shafts, see ``Chassis.input_speeds``."""
-    angles: tuple[float, float]
-    """Mean axle angles, rad."""
+    angles: Angles
+    """Mean steering angles, rad."""
     lost: bool = False
     """The drive counts from a new origin: what it did is not known, and the twist is 0."""
 
@@ -56,8 +56,8 @@ class WheelMotion:
         self._chassis = chassis
         self._max_speed = max_speed
         self._turns: Speeds | None = None
-        self._angles = (0.0, 0.0)
-        self._angles_then = (0.0, 0.0)
+        self._angles = chassis.straight
+        self._angles_then = chassis.straight
         self._pace: Speeds = (0.0,) * len(chassis.shafts)
         self.stamp = 0
         """Of the newest reading that was used, ns."""
@@ -71,14 +71,14 @@ class WheelMotion:
 
     @property
     def twist(self) -> Vector:
-        """Velocity (vx, vy, wz) at the newest pace and the newest axle angles; m/s, rad/s."""
+        """Velocity (vx, vy, wz) at the newest pace and the newest steering angles; m/s, rad/s."""
         return self._chassis.twist(self._pace, *self._angles)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent, unless the servo controller marks them untrusted."""
-        if not feedback.trusted or not math.isfinite(feedback.front + feedback.rear):
+        if not feedback.trusted or not all(map(math.isfinite, feedback.servos)):
             return
-        self._angles = self._chassis.axles(feedback.front, feedback.rear)
+        self._angles = self._chassis.steering(*feedback.servos)
         self.steered = feedback.stamp
 
     def observe_drive(self, *shafts: DriveFeedback) -> WheelIncrement | None:
@@ -98,7 +98,7 @@ class WheelMotion:
             return None
         drivetrain = self._chassis.drivetrain
         rolled = [drivetrain.distance(now - last) for now, last in zip(turns, before, strict=True)]
-        angles = ((then[0] + self._angles[0]) / 2, (then[1] + self._angles[1]) / 2)
+        angles = tuple((before + now) / 2 for before, now in zip(then, self._angles, strict=True))
         if max(map(abs, rolled)) > self._max_speed * dt:
             self._pace = (0.0,) * len(self._pace)
             return WheelIncrement(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
@@ -116,24 +116,22 @@ def way_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: 
         chassis: the body.
         roll: what the wheels did.
         shaft: standard deviation of every shaft's way per root metre it rolled, m.
-        angle: standard deviation of the mean angle of every axle over one metre, rad.
+        angle: standard deviation of the mean of every steering angle over one metre, rad.
         slip: standard deviations of what the wheels cannot tell, forward and sideways (m) and in yaw (rad), per root
             metre.
     """
-    dt, (front, rear) = roll.dt, roll.angles
+    dt = roll.dt
     result = np.diag(np.square(slip) * roll.way)
     for k, pace in enumerate(roll.pace):
         unit = tuple(float(k == i) for i in range(len(roll.pace)))
-        by_shaft = np.array(chassis.twist(unit, front, rear))
+        by_shaft = np.array(chassis.twist(unit, *roll.angles))
         result += np.outer(by_shaft, by_shaft) * (shaft**2 * abs(pace) * dt)
-    if chassis.linkage is None or roll.way <= 0:
+    if roll.way <= 0:
         return result
-    # An axle that is coupled to the other, or not steered, has no error of its own.
-    steered = {"both": ((1, 0), (0, 1)), "front": ((1, 0),), "parallel": ((1, 1),)}[chassis.freedom]
-    for one, other in steered:
-        step = (one * _ANGLE_STEP, other * _ANGLE_STEP)
-        ahead = np.array(chassis.twist(roll.pace, front + step[0], rear + step[1]))
-        behind = np.array(chassis.twist(roll.pace, front - step[0], rear - step[1]))
+    for error in chassis.steering_errors:
+        step = _ANGLE_STEP * np.array(error)
+        ahead = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) + step).tolist()))
+        behind = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) - step).tolist()))
         by_angle = (ahead - behind) * (dt / (2 * _ANGLE_STEP))
         result += np.outer(by_angle, by_angle) * (angle**2 / roll.way)
     return result

@@ -1,9 +1,16 @@
 """A robot body with its actuators: what gate, odometry and simulation need of any drive family.
 
-Requests, gate and trackers use one equivalent bicycle about the base point: its speed along the direction of travel
-and the angles of its two axles. A chassis converts these to speeds of the driven shafts and servo angles, and measured
-shaft speeds and servo angles to the base's twist. ``freedom`` is the set of axle angles that a body can take; for a
-body without axles the bicycle is virtual, its wheelbase being the body's reference length:
+A motion is asked for in one of two forms, and ``forms`` says which of them a body takes:
+
+- ``axles``: the motion of an equivalent bicycle about the base point, by its speed along the direction of travel and
+  the angles of its two axles. ``freedom`` is the set of axle angles that a body can take.
+- ``twist``: the velocity (vx, vy, wz) of the base itself.
+
+Both lead to the angles that the body's wheels are steered to and to a twist of its base. At given steering angles a
+chassis says which part of a twist is possible (``along``) and which shaft speeds make it; from measured shaft speeds
+and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any other.
+
+The bicycle of a body without axles is virtual, its wheelbase being the body's reference length. ``freedom``:
 
 - ``both``: any pair of angles (truck, independent, omni, mecanum).
 - ``front``: the rear angle is 0. A car's base lies between its axles; a differential or skid-steer drive is the
@@ -16,10 +23,10 @@ Shaft speeds are those of the wheels' treads over ground, m/s, forward positive.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
-from monstertruck_kinematics.drive import Drive, Twist
-from monstertruck_kinematics.elementary import KinematicsError, clip
+from monstertruck_kinematics.drive import Drive, Twist, refuse
+from monstertruck_kinematics.elementary import KinematicsError, clip, signed_hypot
 from monstertruck_kinematics.motion import twist_at
 from monstertruck_kinematics.polynomials import AxlePolynomials, PolynomialSet, SteeringPolynomials
 from monstertruck_kinematics.steered import WHEEL_NAMES, Ackermann, Bicycle, IndependentSteer, Synchro, Tricycle
@@ -27,10 +34,28 @@ from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, DriveTrain, FourWheelS
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 Freedom = Literal["both", "front", "parallel"]
+Form = Literal["axles", "twist"]
 Speeds = tuple[float, ...]
+Angles = tuple[float, ...]
+"""Steering angles, rad, left positive: of the front and the rear axle, or of every wheel in the order of its name."""
+
+STILL: Final = (0.0, 0.0, 0.0)
+"""Twist of a body at rest."""
+
+MAX_ANGLE: Final = 1.4
+"""Axle angles beyond this are no turn any more but turning on the spot, or sideways motion, rad."""
+
+AXLES: Final = ("front", "rear")
+"""Names of the two axles."""
+
+STANDING: Final = 0.1
+"""A forward speed below this share of the whole motion is none."""
 
 STRAIGHT: Final = 1e-6
 """Axle angles this close count as equal, rad."""
+
+ALIGNED: Final = 0.35
+"""Wheels that are steered one by one may roll while they turn to angles this close, rad."""
 
 DIRECT: Final = SteeringPolynomials(AxlePolynomials((1.0, 0.0), (1.0, 0.0)), AxlePolynomials((1.0, 0.0), (1.0, 0.0)))
 """A servo that turns its wheel itself."""
@@ -54,24 +79,98 @@ class Chassis(ABC):
     freedom: Freedom
     linkage: SteeringPolynomials | None
 
+    forms: ClassVar[frozenset[Form]] = frozenset({"axles", "twist"})
+    """Forms of request that it takes."""
+    straight: ClassVar[Angles] = (0.0, 0.0)
+    """Steering angles for driving straight ahead; those of a body that steers nothing never change."""
+
     @abstractmethod
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
         """Speed of every shaft for a motion of the bicycle."""
 
     @abstractmethod
-    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """Speeds of the drive family's own inputs, m/s, from the shaft speeds; they hold while the steering changes."""
 
     @abstractmethod
-    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
-        """Velocity (vx, vy, wz) of the base at axle angles."""
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+        """Velocity (vx, vy, wz) of the base at steering angles."""
 
     def fastest_wheel_speed(self, shaft_speeds: Speeds) -> float:
         """Speed of the fastest wheel, m/s, negative when the body goes backwards."""
         if len(shaft_speeds) == 1:
             return shaft_speeds[0]
         fastest = max(map(abs, shaft_speeds))
-        return math.copysign(fastest, self.twist(self.input_speeds(shaft_speeds, 0.0, 0.0), 0.0, 0.0)[0])
+        vx = self.twist(self.input_speeds(shaft_speeds, *self.straight), *self.straight)[0]
+        return -fastest if vx < -STANDING * fastest else fastest
+
+    @property
+    def steering_errors(self) -> tuple[Angles, ...]:
+        """Unit errors of the steering angles that are independent of each other: coupled axles err together."""
+        if not self.steered:
+            return ()
+        return {"both": ((1.0, 0.0), (0.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),)}[self.freedom]
+
+    # Motions
+
+    @property
+    def steered(self) -> bool:
+        """Whether servos steer any of its wheels."""
+        return self.linkage is not None
+
+    def possible(self, twist: Twist[float]) -> Twist[float]:
+        """The twist, with the sideways speed that follows from turning where the body cannot choose it.
+
+        A ``vy`` of 0 is understood as none asked for: a car whose base is not on its rear axle has one as it turns.
+
+        Raises:
+            KinematicsError: the body cannot move like that, nor nearly; the reason is named.
+        """
+        vx, vy, wz = twist
+        if self.freedom == "parallel":
+            refuse("wz", wz, vx, "expected 0, this body keeps its heading")
+        elif self.freedom == "front":
+            follows = self.bicycle.l_r * wz
+            if vy != 0.0:
+                refuse(
+                    "vy", vy - follows, vx, f"more than the {follows:.6g} of its turn, this body cannot move sideways"
+                )
+            vy = follows
+        if self.steered and len(self.straight) == len(AXLES):
+            _require_way(vx, vy, wz, self.bicycle)
+        return vx, vy, wz
+
+    def steering_for(self, twist: Twist[float], near: Angles) -> Angles:
+        """Steering angles for a possible twist; those nearest to ``near`` where there is a choice."""
+        if not self.steered or twist == STILL:
+            return near
+        return self.bicycle.steer_for_twist(*twist)[1:]
+
+    def steering_for_axles(self, front: float, rear: float, near: Angles) -> Angles:
+        """Steering angles for those of the bicycle; where there is a choice, those nearest to ``near``."""
+        return (front, rear) if self.steered else near
+
+    def along(self, twist: Twist[float], *angles: float) -> Twist[float]:
+        """What the body does of a twist while its wheels stand at steering angles."""
+        if not self.steered:
+            return twist
+        return self.bicycle.body_twist(signed_hypot(twist[0], twist[1]), *angles)
+
+    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+        """Speed of every shaft for a twist that the body can do at steering angles."""
+        return self.shaft_speeds(signed_hypot(twist[0], twist[1]), *angles)
+
+    def aligned(self, angles: Angles, target: Angles) -> bool:
+        """Whether the body may move while its wheels turn from ``angles`` to ``target``."""
+        return True
+
+    def axle_angles(self, twist: Twist[float], angles: Angles) -> tuple[float, float]:
+        """Axle angles of the bicycle that moves like this; 0 where none does."""
+        if self.steered and len(angles) == len(AXLES):
+            return angles[0], angles[1]
+        if abs(twist[0]) <= STANDING * max(map(abs, twist)):
+            return 0.0, 0.0
+        return self.bicycle.steer_for_twist(*twist)[1:]
 
     # Steering
 
@@ -92,22 +191,28 @@ class Chassis(ABC):
         return None
 
     def limited(self, front: float, rear: float, limit: float) -> tuple[float, float]:
-        """Angles within the limit that keep the curvature as far as possible, of angles the body can take."""
+        """Axle angles within the limit that keep the curvature as far as possible, of angles the body can take."""
         if self.freedom == "both":
             return self.bicycle.limit_keeping_curvature(front, rear, limit)
         front = clip(front, -limit, limit)
         return front, self._rear(front)
 
-    def servos(self, front: float, rear: float) -> tuple[float, float]:
-        """Servo angles for axle angles; 0 for axles that are not steered."""
-        return (0.0, 0.0) if self.linkage is None else self.linkage.servo_from_axles(front, rear)
+    def limited_steering(self, angles: Angles, limit: float) -> tuple[Angles, bool]:
+        """Steering angles with axle angles within the limit as by ``limited``, and whether that changed them."""
+        if not self.steered or max(map(abs, angles)) <= limit:
+            return angles, False
+        return self.limited(angles[0], angles[1], limit), True
 
-    def axles(self, front_servo: float, rear_servo: float) -> tuple[float, float]:
-        """Axle angles at servo angles, which are clamped to the linkage's range."""
+    def servos(self, *angles: float) -> Angles:
+        """Servo angles for steering angles; 0 for axles that are not steered."""
+        return self.straight if self.linkage is None else self.linkage.servo_from_axles(*angles)
+
+    def steering(self, *servos: float) -> Angles:
+        """Steering angles at servo angles, which are clamped to the linkage's range."""
         if self.linkage is None:
-            return 0.0, 0.0
-        front = _axle(self.linkage.front, front_servo)
-        return front, _axle(self.linkage.rear, rear_servo) if self.freedom == "both" else self._rear(front)
+            return self.straight
+        front = _axle(self.linkage.front, servos[0])
+        return front, _axle(self.linkage.rear, servos[1]) if self.freedom == "both" else self._rear(front)
 
     def _rear(self, front: float) -> float:
         return front if self.freedom == "parallel" else 0.0
@@ -115,6 +220,18 @@ class Chassis(ABC):
 
 def _axle(linkage: AxlePolynomials, servo: float) -> float:
     return linkage.axle_from_servo(min(max(servo, -linkage.servo_limit), linkage.servo_limit))
+
+
+def _require_way(vx: float, vy: float, wz: float, bicycle: FourWheelSteering) -> None:
+    """Refuse a twist that no angles of two axles below ``MAX_ANGLE`` give.
+
+    Raises:
+        KinematicsError: it is turning on the spot, or sideways motion.
+    """
+    sideways = max(abs(vy + bicycle.l_f * wz), abs(vy - bicycle.l_r * wz))
+    if sideways > abs(vx) * math.tan(MAX_ANGLE) and sideways > 0.0:
+        what = "turn on the spot" if abs(vy) < abs(wz) * bicycle.wheelbase else "move sideways"
+        raise KinematicsError(f"vx is {vx:.6g}, vy is {vy:.6g}, wz is {wz:.6g}: this body cannot {what}")
 
 
 @dataclass(frozen=True)
@@ -125,13 +242,13 @@ class TruckChassis(Chassis):
         """Speed at the motor for the base's speed."""
         return (self.bicycle.drive_speed(speed, front, rear),)
 
-    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """The base's speed along its direction of travel."""
-        return (shaft_speeds[0] / self.bicycle.drive_speed(1.0, front, rear),)
+        return (shaft_speeds[0] / self.bicycle.drive_speed(1.0, *angles),)
 
-    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
         """See ``FourWheelSteering.body_twist``."""
-        return self.bicycle.body_twist(inputs[0], front, rear)
+        return self.bicycle.body_twist(inputs[0], *angles)
 
 
 @dataclass(frozen=True)
@@ -154,18 +271,21 @@ class FamilyChassis(Chassis):
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
         """The family's inverse."""
-        twist = twist_at(*self.bicycle.body_twist(speed, front, rear), self.origin, 0.0)
-        command = self.family.inverse(twist)
+        return self.shafts_along(self.bicycle.body_twist(speed, front, rear))
+
+    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+        """The family's inverse."""
+        command = self.family.inverse(twist_at(*twist, self.origin, 0.0))
         return tuple(value / self.per_speed for value in command[: len(self.shafts)])
 
-    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
         """The family's forward."""
         driven = tuple(value * self.per_speed for value in inputs)
-        twist = self.family.forward((*driven, front) if self._steered else driven)
+        twist = self.family.forward((*driven, angles[0]) if self._steered else driven)
         return twist_at(*twist, -self.origin, 0.0)
 
 
@@ -183,20 +303,20 @@ class SynchroChassis(Chassis):
         """All wheels roll as fast as the base."""
         return (self.family.inverse((speed, 0.0, 0.0))[0] * self.family.wheel_radius,)
 
-    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """The shaft itself."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
         """The platform translates along its wheels."""
-        return self.family.platform_twist((inputs[0] / self.family.wheel_radius, 0.0), front)
+        return self.family.platform_twist((inputs[0] / self.family.wheel_radius, 0.0), angles[0])
 
 
 @dataclass(frozen=True)
 class IndependentChassis(Chassis):
     """Two steered axles with ideal linkages, every wheel with a motor of its own.
 
-    Two axle angles always leave a forward speed, so the family's turning on the spot is not available.
+    Two axle angles always leave a forward speed: turning on the spot takes ``WheelSteerChassis``.
 
     Args:
         family: the drive.
@@ -209,13 +329,106 @@ class IndependentChassis(Chassis):
         twist = self.bicycle.body_twist(speed, front, rear)
         return self.family.inverse(twist)[len(self.shafts) :]
 
-    def input_speeds(self, shaft_speeds: Speeds, front: float, rear: float) -> Speeds:
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, front: float, rear: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
         """Least-squares twist of the wheels' velocities."""
-        return self.family.forward((*self.bicycle.wheel_angles(front, rear), *inputs))
+        return self.family.forward((*self.bicycle.wheel_angles(*angles), *inputs))
+
+
+@dataclass(frozen=True)
+class WheelSteerChassis(Chassis):
+    """Every wheel steered by a servo and driven by a motor of its own: any twist.
+
+    Args:
+        family: the drive.
+        reach: angle that every wheel reaches to both sides, rad, at least a quarter turn.
+    """
+
+    family: IndependentSteer
+    reach: float
+
+    straight = (0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def steered(self) -> bool:
+        """All wheels are."""
+        return True
+
+    @property
+    def max_axle_angle(self) -> float:
+        """Wheels reach beyond those of any bicycle."""
+        return MAX_AXLE_ANGLE
+
+    @property
+    def steering_errors(self) -> tuple[Angles, ...]:
+        """Every wheel has its own."""
+        return tuple(tuple(float(i == k) for k in range(len(self.shafts))) for i in range(len(self.shafts)))
+
+    def servos(self, *angles: float) -> Angles:
+        """Each servo turns its wheel itself."""
+        return angles
+
+    def steering(self, *servos: float) -> Angles:
+        """Each servo turns its wheel itself."""
+        return tuple(clip(servo, -self.reach, self.reach) for servo in servos)
+
+    def steering_for(self, twist: Twist[float], near: Angles) -> Angles:
+        """Wheels along their own velocities; a wheel rolls backwards rather than turn further than it must."""
+        if twist == STILL:
+            return near
+        return tuple(
+            self._nearest(angle, now, still=speed == 0.0)
+            for angle, speed, now in zip(*self._wheels(twist), near, strict=True)
+        )
+
+    def _nearest(self, angle: float, near: float, *, still: bool) -> float:
+        """The angle, or the same turned by half a turn, within reach and nearest to ``near``."""
+        if still:
+            return near
+        turned = [a for a in (angle, angle - math.pi, angle + math.pi) if abs(a) <= self.reach]
+        return min(turned, key=lambda a: abs(a - near))
+
+    def steering_for_axles(self, front: float, rear: float, near: Angles) -> Angles:
+        """Wheels through the bicycle's ICR."""
+        return self.steering_for(self.bicycle.body_twist(1.0, front, rear), near)
+
+    def limited_steering(self, angles: Angles, limit: float) -> tuple[Angles, bool]:
+        """Wheels have no axle angle."""
+        return angles, False
+
+    def along(self, twist: Twist[float], *angles: float) -> Twist[float]:
+        """Least-squares twist of what each wheel can roll of its velocity."""
+        return self.twist(self.shafts_along(twist, *angles), *angles)
+
+    def aligned(self, angles: Angles, target: Angles) -> bool:
+        """Wheels far from where they must stand scrub, and would drive the body elsewhere."""
+        return max(abs(to - at) for at, to in zip(angles, target, strict=True)) <= ALIGNED
+
+    def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
+        """Wheel speeds about the bicycle's ICR."""
+        return self._wheels(self.bicycle.body_twist(speed, front, rear))[1]
+
+    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+        """The part of every wheel's velocity along the wheel."""
+        return tuple(
+            speed * math.cos(angle - at) for angle, speed, at in zip(*self._wheels(twist), angles, strict=True)
+        )
+
+    def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
+        """The shafts themselves."""
+        return shaft_speeds
+
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+        """Least-squares twist of the wheels' velocities."""
+        return self.family.forward((*angles, *inputs))
+
+    def _wheels(self, twist: Twist[float]) -> tuple[Angles, Speeds]:
+        """Angle and speed of every wheel."""
+        command = self.family.inverse(twist)
+        return command[: len(self.shafts)], command[len(self.shafts) :]
 
 
 # Builders: a body of the configuration names one of these
@@ -250,9 +463,19 @@ def truck_chassis(size: Dimensions) -> Chassis:
     return TruckChassis(size.centred, size.drivetrain, ("drive",), "both", size.linkage)
 
 
-def independent_chassis(size: Dimensions) -> Chassis:
-    """Two steered axles, a motor in every wheel."""
+def independent_chassis(
+    size: Dimensions, steering: Literal["axles", "wheels"] = "axles", reach: float = 1.75
+) -> Chassis:
+    """A motor in every wheel.
+
+    Args:
+        size: the robot's.
+        steering: two steered axles with ideal linkages, or a servo for every wheel.
+        reach: of a wheel with a servo of its own, rad.
+    """
     wheels = IndependentSteer(size.centred.wheel_positions, size.drivetrain.wheel_radius)
+    if steering == "wheels":
+        return WheelSteerChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", None, wheels, reach)
     return IndependentChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", size.linkage, wheels)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.motion import integrate
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.state import Grid
@@ -222,22 +222,19 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     return int(np.argmax(hits)) if hits.any() else None
 
 
-def swept_poses(steering: FourWheelSteering, front: float, rear: float, distances: Array) -> Array:
-    """Poses of the base, starting at the origin, after each signed distance at constant axle angles.
+def swept_poses(twist: tuple[float, float, float], distances: Array) -> Array:
+    """Poses of the base, starting at the origin, on the arc of a constant twist.
 
     Args:
-        steering: the truck's geometry.
-        front: axle angle, rad.
-        rear: axle angle, rad.
-        distances: shape (m,), m along the direction of travel; negative backwards.
+        twist: vx, vy, wz of the base per metre of way: m/m, m/m, rad/m.
+        distances: shape (m,), ways, m; negative backwards.
 
     Returns:
         Shape (m, 3).
     """
-    vx, vy, wz = steering.body_twist(1.0, front, rear)
     still = np.zeros_like(distances)
-    poses = steering.integrate((still, still, still), vx * distances, vy * distances, wz * distances, 1.0)
-    return np.column_stack(poses)
+    vx, vy, wz = (component * distances for component in twist)
+    return np.column_stack(integrate((still, still, still), vx, vy, wz, 1.0))
 
 
 def placed(poses: Array, at: tuple[float, float, float]) -> Array:

@@ -41,6 +41,7 @@ from monstertruck_schemas.req import (
     GoalOrder,
     Order,
     PathRequest,
+    RequestedTwist,
     Role,
 )
 from monstertruck_schemas.state import GateState
@@ -299,6 +300,15 @@ class TruckClient(Operator):
         """
         header = await self._answered(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
+
+    async def drive_twist(self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.3) -> None:
+        """Request a velocity of the base, forward, to the left (m/s) and turning (rad/s), for ``lease`` seconds.
+
+        What the body cannot do is refused by the robot with an event ``impossible_motion``. Raises as ``drive`` does.
+        """
+        header = await self._answered(lease)
+        twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
+        self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist))
 
     def order(self, order: Order) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.

@@ -1,6 +1,8 @@
 """Messages of the ``cmd`` group: what the gate, and only the gate, sent to the actuators."""
 
+from collections.abc import Sequence
 from enum import StrEnum
+from typing import Any
 
 from monstertruck_schemas.base import Message
 
@@ -30,10 +32,27 @@ class SteeringCommand(Message):
     """Steering of both axles: bicycle angles and the servo angles they need."""
 
     front: float
-    """Axle angle, rad, left positive."""
+    """Angle of the equivalent bicycle's axle, rad, left positive; 0 for a motion that no bicycle makes."""
     rear: float
     front_servo: float
     """Servo angle, rad, left positive, 0 = straight ahead."""
     rear_servo: float
+    front_right_servo: float | None = None
+    """Where every wheel has its own servo: the front right wheel's; ``front_servo`` is the front left one's."""
+    rear_right_servo: float | None = None
+    """The rear right wheel's; ``rear_servo`` is the rear left one's."""
     deadman: bool = True
     """Level of the deadman line, where it is wired: False stops the motor without a word to its controller."""
+
+    @property
+    def servos(self) -> tuple[float, ...]:
+        """All servo angles: front and rear, or front left, front right, rear left and rear right."""
+        if self.front_right_servo is None or self.rear_right_servo is None:
+            return self.front_servo, self.rear_servo
+        return self.front_servo, self.front_right_servo, self.rear_servo, self.rear_right_servo
+
+
+def servo_fields(servos: Sequence[float]) -> dict[str, Any]:
+    """Fields of ``SteeringCommand`` for its ``servos``, two or four angles, rad."""
+    names = ("front_servo", "front_right_servo", "rear_servo", "rear_right_servo")
+    return dict(zip(names if len(servos) == len(names) else names[::2], servos, strict=True))

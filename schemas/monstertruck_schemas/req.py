@@ -5,10 +5,11 @@ every start, so that no recorded request can move another run), a sequence numbe
 source, and a lease: the time for which the request stands without a newer one. Trust in clocks is not needed.
 """
 
+import math
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Message, Nanoseconds, Pose2D, Schema
 from monstertruck_schemas.plan import Path
@@ -39,15 +40,78 @@ class Request(Message):
     carry a recent one, so that a request that was long on its way moves nothing."""
 
 
-class DriveRequest(Request):
-    """Speed and both axle angles asked for. Non-finite numbers reach the gate, which refuses them by name."""
+NEUTRAL = 1e-3
+"""A request below this in all its speeds, m/s and rad/s, is for standstill."""
 
-    speed: Annotated[float, Field(allow_inf_nan=True)]
+AnyNumber = Annotated[float, Field(allow_inf_nan=True)]
+
+
+class DriveForm(StrEnum):
+    """How a drive request describes the motion; a body says which forms it takes."""
+
+    AXLES = "axles"
+    """Speed and both axle angles."""
+    TWIST = "twist"
+    """Velocity of the base: forward, sideways and turning."""
+
+
+class RequestedTwist(Schema):
+    """Velocity asked for, of the base in its own frame."""
+
+    vx: AnyNumber = 0.0
+    """Forward, m/s."""
+    vy: AnyNumber = 0.0
+    """To the left, m/s."""
+    wz: AnyNumber = 0.0
+    """Yaw rate, rad/s, counter-clockwise positive."""
+
+
+class DriveRequest(Request):
+    """A motion asked for, in one form: speed and axle angles, or ``twist``.
+
+    Non-finite numbers reach the gate, which refuses them by name. A reader that does not know ``twist`` sees a request
+    for standstill.
+    """
+
+    speed: AnyNumber
     """Speed of the base point along its direction of travel, m/s; negative = reverse."""
-    front: Annotated[float, Field(allow_inf_nan=True)]
+    front: AnyNumber
     """Front axle angle of the equivalent bicycle, rad, left positive."""
-    rear: Annotated[float, Field(allow_inf_nan=True)] = 0.0
+    rear: AnyNumber = 0.0
     """Rear axle angle of the equivalent bicycle, rad, left positive (counter-steer: opposite to front)."""
+    twist: RequestedTwist | None = None
+    """Velocity of the base; speed and angles are 0 then."""
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if self.twist is not None and (self.speed, self.front, self.rear) != (0.0, 0.0, 0.0):
+            raise ValueError("a request has one form: expected speed, front and rear of 0 beside twist")
+        return self
+
+    @property
+    def form(self) -> DriveForm:
+        """How it describes the motion."""
+        return DriveForm.AXLES if self.twist is None else DriveForm.TWIST
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The numbers of its form, by name."""
+        if self.twist is None:
+            return {"speed": self.speed, "front": self.front, "rear": self.rear}
+        return self.twist.model_dump()
+
+    @property
+    def pace(self) -> float:
+        """Speed of the base, m/s, negative = reverse; 0 for turning on the spot."""
+        if self.twist is None:
+            return self.speed
+        return math.copysign(math.hypot(self.twist.vx, self.twist.vy), self.twist.vx)
+
+    @property
+    def neutral(self) -> bool:
+        """Whether it asks for standstill."""
+        speeds = (self.speed,) if self.twist is None else (self.twist.vx, self.twist.vy, self.twist.wz)
+        return all(abs(speed) < NEUTRAL for speed in speeds)
 
 
 class Order(StrEnum):

@@ -104,10 +104,21 @@ class SteeringFeedback(Message):
     """Front servo angle, rad, left positive, 0 = straight ahead."""
     rear: float
     """Rear servo angle, rad, left positive, 0 = straight ahead."""
+    front_right: float | None = None
+    """Where every wheel has its own servo: the front right wheel's; ``front`` is the front left one's."""
+    rear_right: float | None = None
+    """The rear right wheel's; ``rear`` is the rear left one's."""
     error_word: int = 0
     """Non-zero: the controller reported errors since the last read (its own bits)."""
     trusted: bool = True
     """False while the targets have to be sent again after an error or a restart."""
+
+    @property
+    def servos(self) -> tuple[float, ...]:
+        """All servo angles: front and rear, or front left, front right, rear left and rear right."""
+        if self.front_right is None or self.rear_right is None:
+            return self.front, self.rear
+        return self.front, self.front_right, self.rear, self.rear_right
 
 
 class BatteryLevel(StrEnum):

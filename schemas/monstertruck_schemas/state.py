@@ -16,7 +16,7 @@ from monstertruck_schemas.base import (
     Twist2D,
 )
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Role
+from monstertruck_schemas.req import DriveForm, Role
 
 
 class Odometry(Message):
@@ -125,3 +125,7 @@ class GateState(Message):
     """Everything that limits or stops the truck now, worst first."""
     stopping_distance: float = 0.0
     """Metres the truck would still travel if stopped now."""
+    form: DriveForm | None = None
+    """Form of the holder's newest request."""
+    twist: Twist2D | None = None
+    """Commanded velocity of the base, whatever the form of the request."""

@@ -204,7 +204,14 @@ EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and reco
 STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the truck was stopped, with the chain of causes", retained=True)
 LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", foxglove="foxglove.Log")
 
-REQ_DRIVE: Final = Topic("req/drive", DriveRequest, W.OUTSIDE, "Drive by speed and axle angles", 20, stale_after=0.3)
+REQ_DRIVE: Final = Topic(
+    "req/drive",
+    DriveRequest,
+    W.OUTSIDE,
+    "Drive by speed and axle angles, or by twist",
+    20,
+    stale_after=0.3,
+)
 REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disarm, e-stop, reset, stop")
 REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
 REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")

@@ -287,7 +287,7 @@ class _Steering:
         if (front_servo, rear_servo) == self._servos:
             return
         self._servos = (front_servo, rear_servo)
-        self.front, self.rear = self._chassis.axles(front_servo, rear_servo)
+        self.front, self.rear = self._chassis.steering(front_servo, rear_servo)
         self.body_per_wheel = 1.0
         if isinstance(self._chassis, TruckChassis):
             self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, self.front, self.rear))

@@ -96,7 +96,7 @@ def _way(
     behind = front if crab else (-front if rear else 0.0)
     steering: Steering = "crab" if crab else ("counter" if rear else "front")
     distances = direction * np.arange(0.0, config.distance + STEP / 2, STEP)
-    poses = swept_poses(geometry, front, behind, distances)
+    poses = swept_poses(geometry.body_twist(1.0, front, behind), distances)
     contact = first_contact(footprint, poses, points, config.margin)
     if contact is not None:
         poses = poses[:contact]

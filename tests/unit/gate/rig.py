@@ -11,7 +11,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
-from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, RequestedTwist, Role
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
@@ -120,6 +120,15 @@ class Rig:
     def drive(self, speed=0.2, front=0.0, rear=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, inside=False, **more):
         fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
         request = DriveRequest(source=source, role=role, lease=lease, speed=speed, front=front, rear=rear, **fields)
+        return self._ask(request, inside=inside)
+
+    def twist(self, vx=0.0, vy=0.0, wz=0.0, source="ann", role=Role.GAMEPAD, lease=1.0, inside=False, **more):
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
+        twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
+        request = DriveRequest(source=source, role=role, lease=lease, speed=0.0, front=0.0, twist=twist, **fields)
+        return self._ask(request, inside=inside)
+
+    def _ask(self, request, inside):
         return (self.gate.planner_request if inside else self.gate.request)(request, self.now)
 
     def order(self, order, source="ann", role=Role.GAMEPAD, **more):
@@ -148,7 +157,7 @@ class Rig:
             if sense:
                 self.sense()
             if self.driver is not None:
-                self.drive(**self.driver)
+                (self.twist if self.driver.keys() & {"vx", "vy", "wz"} else self.drive)(**self.driver)
             self.out = self.gate.tick(self.now)
             self.events += self.out.events
             self.trips += self.out.trips

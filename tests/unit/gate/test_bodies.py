@@ -42,7 +42,7 @@ def test_a_turn_is_two_wheel_speeds_and_no_servo():
     rig = TwoWheels().driving(speed=0.1, front=0.3)
     assert rig.out.speeds == pytest.approx(DIFFERENTIAL.shaft_speeds(0.1, 0.3, 0.0))
     assert rig.out.motor_velocities == pytest.approx([DRIVETRAIN.motor_rate(speed) for speed in rig.out.speeds])
-    assert (rig.out.front_servo, rig.out.rear_servo) == (0.0, 0.0)
+    assert rig.out.servos == (0.0, 0.0)
     assert rig.out.reasons == ()
 
 

@@ -90,7 +90,7 @@ class Straight(Rig):
     def sense(self):
         super().sense()
         if self.out is not None:
-            self.gate.observe_steering(servos(self.now, self.out.front_servo, self.out.rear_servo))
+            self.gate.observe_steering(servos(self.now, *self.out.servos))
 
 
 def test_the_gate_stops_for_dead_steering_and_has_to_be_armed_again():

@@ -82,9 +82,9 @@ def test_angles_are_limited_to_what_the_body_can_take(chassis):
 @every_body
 def test_servos_and_axles_are_each_others_inverse(chassis):
     front, rear = angles_of(chassis, np.random.default_rng(5))
-    back = chassis.axles(*chassis.servos(front, rear))
+    back = chassis.steering(*chassis.servos(front, rear))
     assert back == pytest.approx((front, rear) if chassis.linkage is not None else (0.0, 0.0), abs=1e-9)
-    assert chassis.axles(2.0, 2.0) == chassis.axles(math.pi / 4, math.pi / 4)
+    assert chassis.steering(2.0, 2.0) == chassis.steering(math.pi / 4, math.pi / 4)
 
 
 def test_the_truck_is_its_own_formulas():

@@ -89,7 +89,7 @@ def test_covering_discs_cover_the_rectangle():
 
 
 def straight(length=0.5, count=51):
-    return swept_poses(FourWheelSteering(), 0.0, 0.0, np.linspace(0, length, count))
+    return swept_poses((1.0, 0.0, 0.0), np.linspace(0, length, count))
 
 
 def test_first_contact_of_a_straight_run():
@@ -102,7 +102,7 @@ def test_first_contact_of_a_straight_run():
 def test_first_contact_is_what_all_distances_say(seed, count, front, rear, margin):
     rng = np.random.default_rng(seed)
     cloud = rng.uniform(-1, 1, (count, 2))
-    poses = swept_poses(FourWheelSteering(), front, rear, np.linspace(0, rng.uniform(-0.5, 0.5), 20))
+    poses = swept_poses(FourWheelSteering().body_twist(1.0, front, rear), np.linspace(0, rng.uniform(-0.5, 0.5), 20))
     distance = rectangle_distance(BARE, poses, cloud)
     hits = np.flatnonzero(((distance < margin) & (distance < distance[0] - 1e-9)).any(axis=1))
     assert first_contact(BARE, poses, cloud, margin) == (hits[0] if len(hits) else None)
@@ -125,7 +125,7 @@ def test_a_truck_at_a_wall_may_leave_it_but_not_push_on():
 
 def test_a_turn_sweeps_its_outer_rear_corner():
     steering = FourWheelSteering()
-    poses = swept_poses(steering, 0.4, -0.4, np.linspace(0, 0.3, 31))
+    poses = swept_poses(steering.body_twist(1.0, 0.4, -0.4), np.linspace(0, 0.3, 31))
     beside_the_tail = points((-0.1, -0.18))
     assert first_contact(BARE, poses, beside_the_tail) is not None
     assert first_contact(BARE, straight(0.3, 31), beside_the_tail) is None
@@ -133,10 +133,10 @@ def test_a_turn_sweeps_its_outer_rear_corner():
 
 def test_swept_poses_follow_the_arc():
     steering = FourWheelSteering()
-    poses = swept_poses(steering, 0.3, -0.3, np.array([0.0, 0.5, -0.5]))
+    poses = swept_poses(steering.body_twist(1.0, 0.3, -0.3), np.array([0.0, 0.5, -0.5]))
     curvature = steering.curvature(0.3, -0.3)
     assert poses[:, 2] == pytest.approx([0, 0.5 * curvature, -0.5 * curvature])
-    crab = swept_poses(steering, 0.3, 0.3, np.array([0.5]))
+    crab = swept_poses(steering.body_twist(1.0, 0.3, 0.3), np.array([0.5]))
     assert crab[0] == pytest.approx([0.5 * math.cos(0.3), 0.5 * math.sin(0.3), 0])
 
 

@@ -1,0 +1,244 @@
+"""Requests by twist through the gate: what each body does of them, under the limits that hold for every form."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.chassis import (
+    Dimensions,
+    ackermann_chassis,
+    differential_chassis,
+    independent_chassis,
+    mecanum_chassis,
+    omni_chassis,
+    skid_steer_chassis,
+    synchro_chassis,
+    truck_chassis,
+)
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveForm
+from monstertruck_schemas.state import GateMode
+from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, make_gate, scan, servos
+
+SIZE = Dimensions(DRIVETRAIN)
+BODIES = {
+    "truck": truck_chassis(SIZE),
+    "ackermann": ackermann_chassis(SIZE),
+    "differential": differential_chassis(SIZE),
+    "skid_steer": skid_steer_chassis(SIZE, icr_left=0.2, icr_right=-0.21, icr_x=-0.03),
+    "synchro": synchro_chassis(SIZE),
+    "omni": omni_chassis(SIZE, circle=0.15),
+    "mecanum": mecanum_chassis(SIZE),
+    "wheels": independent_chassis(SIZE, steering="wheels"),
+}
+
+
+class Robot(Rig):
+    """Any body; its shafts and servos follow their commands."""
+
+    def __init__(self, kind, **config):
+        super().__init__(**config)
+        self.chassis = BODIES[kind]
+        self.gate = make_gate(chassis=self.chassis, **config)
+        self.shafts = [0.0] * len(self.chassis.shafts)
+        self.servos = self.chassis.servos(*self.chassis.straight)
+
+    def sense(self):
+        self.gate.observe_scan(scan(self.now, *self.obstacles))
+        self.gate.observe_attitude(attitude(self.now))
+        for shaft, speed in enumerate(self.shafts):
+            self.gate.observe_drive(feedback(self.now, speed), shaft)
+        if self.chassis.steered:
+            front, *right, rear = self.servos[:1] + self.servos[1:2] * (len(self.servos) == 4) + self.servos[-2:][:1]
+            more = {"front_right": right[0], "rear_right": self.servos[3]} if right else {}
+            rear = rear if right else self.servos[1]
+            self.gate.observe_steering(servos(self.now, front, rear).model_copy(update=more))
+
+    def _obey(self):
+        self.shafts, self.servos = list(self.out.speeds), self.out.servos
+
+    @property
+    def made(self):
+        """Twist that shafts and servos make."""
+        angles = self.chassis.steering(*self.servos)
+        return self.chassis.twist(self.chassis.input_speeds(tuple(self.shafts), *angles), *angles)
+
+
+SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
+
+
+@pytest.mark.parametrize("kind", ["differential", "skid_steer", "omni", "mecanum", "wheels"])
+@pytest.mark.parametrize("turn", [0.5, -0.5])
+def test_bodies_that_can_turn_on_the_spot(kind, turn):
+    robot = Robot(kind).driving(wz=turn, ticks=150)
+    vx, vy, wz = robot.made
+    assert (vx, wz) == pytest.approx((0.0, turn), abs=1e-9)
+    assert vy == pytest.approx(0.03 * turn if kind == "skid_steer" else 0.0, abs=1e-9)  # round the sides' ICRs
+    assert (Reason.CLIPPED in robot.out.reasons) == (kind == "skid_steer")
+    assert (robot.out.form, robot.out.front, robot.out.rear) == (DriveForm.TWIST, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("kind", ["omni", "mecanum", "wheels"])
+@pytest.mark.parametrize("side", [0.1, -0.1])
+def test_bodies_that_can_move_sideways(kind, side):
+    robot = Robot(kind).driving(vy=side, ticks=200)
+    assert robot.made == pytest.approx((0.0, side, 0.0), abs=1e-9)
+    assert robot.out.reasons == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "asked", "why"),
+    [
+        ("truck", SPOT, "this body cannot turn on the spot"),
+        ("truck", SIDE, "this body cannot move sideways"),
+        ("truck", {"vx": 0.01, "wz": 0.5}, "this body cannot turn on the spot"),
+        ("ackermann", SPOT, "this body cannot turn on the spot"),
+        ("ackermann", SIDE, "this body cannot move sideways"),
+        ("ackermann", {"vx": 0.2, "vy": 0.1}, "vy is 0.1: more than the 0 of its turn"),
+        ("differential", SIDE, "this body cannot move sideways"),
+        ("synchro", SPOT, "wz is 0.5: expected 0, this body keeps its heading"),
+        ("synchro", SIDE, "this body cannot move sideways"),
+    ],
+)
+def test_what_a_body_cannot_do_is_refused_with_the_reason_and_moves_nothing(kind, asked, why):
+    robot = Robot(kind).armed()
+    assert robot.twist(**asked) is Reason.IMPOSSIBLE_MOTION
+    robot.tick(5)
+    assert robot.out.mode is GateMode.ARMED
+    [event] = robot.told(Reason.IMPOSSIBLE_MOTION)
+    assert why in event.text
+
+
+def test_a_form_that_a_body_does_not_take_is_refused(monkeypatch):
+    robot = Robot("differential").armed()
+    monkeypatch.setattr(type(robot.chassis), "forms", frozenset({"axles"}))
+    assert robot.twist(vx=0.1) is Reason.IMPOSSIBLE_MOTION
+    robot.tick()
+    assert "a request by twist: this body takes axles" in robot.told(Reason.IMPOSSIBLE_MOTION)[0].text
+    assert robot.drive(speed=0.1) is Reason.OK
+
+
+@pytest.mark.parametrize("kind", ["truck", "ackermann"])
+def test_a_twist_steers_axles(kind):
+    robot = Robot(kind).driving(vx=0.15, wz=0.1, ticks=100)
+    vx, vy, wz = robot.made
+    assert (vx, wz) == pytest.approx((0.15, 0.1), rel=0.02)
+    assert vy == pytest.approx(0.0 if kind == "truck" else 0.016, abs=1e-3)  # the car's base is not on its rear axle
+    assert (Reason.CLIPPED in robot.out.reasons) == (kind == "ackermann")
+
+
+def test_a_turn_tighter_than_the_truck_can_is_clipped_to_its_tightest():
+    robot = Robot("truck", turning=None).driving(vx=0.1, wz=0.6, ticks=150)
+    assert Reason.CLIPPED in robot.out.reasons
+    assert (robot.out.front, robot.out.rear) == pytest.approx((0.436, -0.436))
+    vx, _, wz = robot.out.twist
+    assert vx == pytest.approx(0.1)
+    assert wz < 0.6
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_refused_by_name(number):
+    robot = Robot("mecanum").armed()
+    assert robot.twist(vx=0.1, wz=number) is Reason.NOT_FINITE
+    robot.tick()
+    assert f"wz is {number}: expected finite numbers" in robot.told(Reason.NOT_FINITE)[0].text
+
+
+@pytest.mark.parametrize(("kind", "fastest"), [("mecanum", 0.15), ("wheels", 0.21)])
+def test_huge_twists_are_clipped_in_their_direction(kind, fastest):
+    robot = Robot(kind).driving(vx=1e308, vy=1e308, wz=-1e308, ticks=400)
+    assert Reason.CLIPPED in robot.out.reasons
+    # Mecanum wheels push against each other: the forward part is less than half of their speed.
+    assert max(map(abs, robot.out.speeds)) == pytest.approx(fastest, rel=1e-3)
+    assert np.array(robot.made) / robot.made[0] == pytest.approx([1.0, 1.0, -1.0], abs=1e-6)
+
+
+def test_no_wheel_is_faster_than_allowed_on_the_spot_and_sideways():
+    for asked in ({"wz": 5.0}, {"vy": 0.5}, {"vx": -0.5}):
+        robot = Robot("mecanum").driving(**asked, ticks=100)
+        assert max(map(abs, robot.shafts)) == pytest.approx(0.15)  # not ahead: the limit of reverse
+        assert Reason.CLIPPED in robot.out.reasons
+    assert max(Robot("mecanum").driving(vx=0.5, ticks=100).shafts) == pytest.approx(0.21)
+
+
+@pytest.mark.parametrize("kind", ["differential", "omni", "mecanum", "wheels"])
+def test_no_wheel_accelerates_faster_than_allowed_from_any_motion_to_any_other(kind):
+    robot, rng = Robot(kind).armed(), np.random.default_rng(5)
+    before = np.array(robot.out.speeds)
+    for _ in range(12):
+        vx, vy, wz = rng.uniform((-0.1, -0.1, -0.5), (0.2, 0.1, 0.5)).tolist()
+        robot.driver = {"vx": vx, "vy": 0.0 if kind == "differential" else vy, "wz": wz}
+        for _ in range(rng.integers(5, 60)):
+            angles = np.array(robot.servos)
+            robot.tick()
+            now = np.array(robot.out.speeds)
+            turned = np.abs(np.array(robot.servos) - angles).max()
+            assert turned <= 1.0 * 0.02 + 1e-9
+            # A wheel that turns changes the part of its velocity that it rolls.
+            assert np.abs(now - before).max() <= 1.0 * 0.02 + 0.21 * turned + 1e-9
+            before = now
+
+
+def test_a_reversal_of_turning_passes_through_standstill():
+    robot = Robot("differential").driving(wz=0.8, ticks=80)
+    robot.driver = {"wz": -0.8}
+    turns = [robot.tick().twist[2] for _ in range(80)]
+    assert 0.0 in turns
+    assert turns[-1] == pytest.approx(-0.8)
+
+
+def test_wheels_turn_at_standstill_before_they_drive_elsewhere():
+    robot = Robot("wheels").driving(vx=0.15, ticks=60)
+    robot.driver = SIDE
+    moved = []
+    for _ in range(150):
+        robot.tick()
+        angle = abs(robot.servos[0])
+        moved.append((angle, max(map(abs, robot.shafts))))
+    assert moved[-1] == pytest.approx((math.pi / 2, 0.1))
+    assert all(speed == 0.0 for angle, speed in moved if 0.01 < angle < math.pi / 2 - 0.36)
+
+
+def test_wheels_turn_no_further_than_they_must():
+    robot = Robot("wheels").driving(vx=0.001, vy=0.1, ticks=200)
+    assert all(angle == pytest.approx(1.5608, abs=1e-3) for angle in robot.servos)
+    robot.driver = {"vx": -0.001, "vy": 0.1}
+    robot.tick(20)
+    assert all(angle == pytest.approx(1.5808, abs=1e-3) for angle in robot.servos)  # not half a turn back
+    assert robot.made == pytest.approx((-0.001, 0.1, 0.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["differential", "mecanum", "wheels"])
+def test_an_obstacle_that_a_corner_would_touch_stops_turning_on_the_spot(kind):
+    free = Robot(kind).driving(wz=0.5, ticks=100)
+    assert free.out.reasons == ()
+    # Left of the front: a turn to the left brings the corner there, one to the right takes it away.
+    near = Robot(kind).armed()
+    near.obstacles = ((0.16, 0.24),)
+    near.driver = {"wz": 0.5}
+    near.tick(100)
+    assert Reason.OBSTACLE_STOP in near.out.reasons
+    assert near.out.twist == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_an_obstacle_to_one_side_stops_sideways_motion_to_that_side_only(side):
+    robot = Robot("mecanum").armed()
+    robot.obstacles = ((0.2, 0.25 * side),)
+    robot.driver = {"vy": 0.1 * side}
+    robot.tick(100)
+    assert Reason.OBSTACLE_STOP in robot.out.reasons
+    robot.driver = {"vy": -0.1 * side}
+    robot.tick(100)
+    assert robot.out.twist == pytest.approx((0.0, -0.1 * side, 0.0))
+
+
+def test_neutral_twists_release_the_truck():
+    robot = Robot("differential").driving(wz=0.5, ticks=60)
+    robot.driver = {"wz": 0.0}
+    robot.tick(60)
+    robot.driver = None
+    robot.tick(80)
+    assert robot.out.mode is GateMode.ARMED
+    assert robot.trips == []
