@@ -90,7 +90,7 @@ def drive(where: Place, answer: PlanAnswer, pose: Pose) -> tuple[Pose, bool, flo
     assert answer.poses is not None
     path = DrivePath(
         stamp=0, received=0, seq=0, frame="map", poses=answer.poses.ravel(), directions=answer.directions,
-        steering=answer.steering,
+        steering=answer.steering, clearance=np.zeros(0) if answer.clearance is None else answer.clearance,
     )  # fmt: skip
     try:
         line = SegmentedPath(path, pose, CONFIG.beyond)

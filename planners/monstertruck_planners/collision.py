@@ -437,6 +437,25 @@ class DistanceField:
         rows, columns = self._distance.shape
         return np.asarray((row >= 0.5) & (row <= rows - 1.5) & (column >= 0.5) & (column <= columns - 1.5))
 
+    def clearance(self, footprint: Footprint | DiscFootprint, poses: Array, most: float, step: float = 0.01) -> Array:
+        """Distance from the footprint to the nearest occupied cell, rounded down to whole steps.
+
+        Args:
+            footprint: the truck.
+            poses: shape (m, 3), in the grid's parent frame.
+            most: what is looked for, m.
+            step: m.
+
+        Returns:
+            Shape (m,), m: 0 to ``most``.
+        """
+        clearance = np.zeros(len(poses))
+        rest = np.arange(len(poses))
+        for margin in np.arange(1, round(most / step) + 1) * step:
+            rest = rest[self.free(footprint, poses[rest], margin)]
+            clearance[rest] = margin
+        return clearance
+
     def free(self, footprint: Footprint | DiscFootprint, poses: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether the footprint, grown by ``margin`` on all sides, overlaps no occupied cell, exactly.
 

@@ -1,8 +1,9 @@
 """Messages of the ``plan`` group: paths, tracker progress, and the planners' drive requests."""
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
+import numpy as np
 from pydantic import Field
 
 from monstertruck_schemas.base import Float64Array, Message, Pose2D
@@ -10,6 +11,12 @@ from monstertruck_schemas.reasons import Reason
 
 Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
 """Which axles steer: one alone, both by opposite or by equal angles, or both freely."""
+
+
+MAX_POSES: Final = 5000
+"""Poses of a path that is driven."""
+MAX_RUNS: Final = 64
+"""Runs of a path that is driven: parts between two stops, where the direction changes, or crab begins or ends."""
 
 
 class Path(Message):
@@ -22,6 +29,9 @@ class Path(Message):
     steering: tuple[Steering, ...] = ()
     """n of them: how the axles steer where the truck arrives; empty = as the tracker is configured. Only where it is
     crab or hybrid is the poses' yaw meant; else it follows from the path."""
+    clearance: Float64Array = Field(default_factory=lambda: np.zeros(0))
+    """Shape (n,): distance from the footprint to the nearest obstacle at each pose, m, as far as it was looked for;
+    empty = not known."""
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
     name: str = ""

@@ -90,6 +90,7 @@ class Reason(StrEnum):
     CLOCK_STEPPED = "clock_stepped", 82, "real time was stepped"
     MESSAGES_DROPPED = "messages_dropped", 83, "a bounded queue overflowed"
     PATH_LOST = "path_lost", 84, "truck is too far from its path"
+    CUSP_MISSED = "cusp_missed", 85, "the truck came to rest too far from where its path changes direction"
 
     # Localisation and mapping
     POSE_LOST = "pose_lost", 90, "the scans do not fit the map: the pose is odometry alone"

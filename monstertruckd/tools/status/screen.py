@@ -161,7 +161,7 @@ def _truck(state: ScreenState) -> Panel:
 
 def _done(tracker: TrackerState) -> float:
     """Share of the path that is driven; at the end of a lap the tracker measures along the next one."""
-    if tracker.outcome is Reason.GOAL_REACHED:
+    if tracker.outcome in (Reason.GOAL_REACHED, Reason.GOAL_MISSED):
         return 1.0
     return tracker.along / tracker.length if tracker.length else 0.0
 

@@ -155,7 +155,14 @@ class RouteDeformation:
         assert route.directions is not None
         at = min(answer.place, len(route.poses) - 2)
         return PlanAnswer(
-            Reason.OK, "", route.poses[at:], route.directions[at:], route.steering[at:], self.left, self.left
+            Reason.OK,
+            "",
+            route.poses[at:],
+            route.directions[at:],
+            route.steering[at:],
+            self.left,
+            self.left,
+            None if route.clearance is None else route.clearance[at:],
         )
 
     def _task(self, scan: LaserScan) -> DeformTask | None:

@@ -68,6 +68,8 @@ class PlanAnswer:
     """Metres."""
     cost: float = 0.0
     """Metres, with all prices."""
+    clearance: Array | None = None
+    """Shape (n,): see ``Path``; None = not known."""
     kept: bool = False
     """It is the rest of the route before."""
     drivable: bool = True

@@ -28,6 +28,12 @@ REFUSED: Final = frozenset(
 )
 """Why a goal is refused if its first route fails; later on these may be passing trouble."""
 
+ENDED: Final = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
+"""What the tracker says at the end of a path."""
+
+LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED})
+"""What it says where it leaves a path, to be planned anew from there."""
+
 MISSES: Final = 5
 """Routes that may end beside the goal."""
 
@@ -217,10 +223,10 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         left = len(run.via) - 1
         report = Report(Reason.WAYPOINT_PASSED, Severity.INFO, f"goal {run.number}: waypoint passed, {left} left")
         return replace(run, via=run.via[1:]), (report,)
-    if observed.outcome is Reason.GOAL_REACHED and observed.at_rest:
+    if observed.outcome in ENDED and observed.at_rest:
         return _plan(run, config) if backing else _arrived(run, observed, config)
-    if observed.outcome is Reason.PATH_LOST:
-        report = Report(Reason.PATH_LOST, Severity.WARNING, f"goal {run.number}: plans anew")
+    if observed.outcome is not None and observed.outcome in LEFT:
+        report = Report(observed.outcome, Severity.WARNING, f"goal {run.number}: plans anew")
         return _with(_plan(run, config), report)
     if observed.along > run.best + config.progress:
         run = replace(run, best=observed.along, moved=observed.now)

@@ -113,7 +113,7 @@ class PathPublisher:
         assert answer.poses is not None
         assert answer.directions is not None
         steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
-        self._publish(answer.poses, answer.directions, steering, name, before)
+        self._publish(answer.poses, answer.directions, steering, name, before, answer.clearance)
 
     def brake(self, name: str) -> None:
         """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands."""
@@ -126,7 +126,10 @@ class PathPublisher:
             rest = speed * speed / (2 * self._deceleration) + STUB
             count = kept_poses(followed.travelled, report.along, rest)
             steering = followed.message.steering[:count]
-            self._publish(followed.poses[:count], followed.message.directions[:count], steering, name, driven)
+            clearance = followed.message.clearance[:count]
+            self._publish(
+                followed.poses[:count], followed.message.directions[:count], steering, name, driven, clearance
+            )
         else:
             ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
             self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven)
@@ -157,7 +160,15 @@ class PathPublisher:
             )
         )
 
-    def _publish(self, poses: Array, directions: Array, steering: tuple[Any, ...], name: str, before: float) -> None:
+    def _publish(
+        self,
+        poses: Array,
+        directions: Array,
+        steering: tuple[Any, ...],
+        name: str,
+        before: float,
+        clearance: Array | None = None,
+    ) -> None:
         now, odometry = self._clock.now(), self._in.pose.latest
         assert odometry is not None
         self._paths += 1
@@ -169,6 +180,7 @@ class PathPublisher:
             poses=np.ascontiguousarray(poses).ravel(),
             directions=np.array(directions),
             steering=steering,
+            clearance=np.zeros(0) if clearance is None else np.array(clearance),
             name=f"{name}.{self._paths}",
         )
         steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)

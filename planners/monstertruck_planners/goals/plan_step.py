@@ -7,6 +7,7 @@ An obstacle is kept until a scan sees through its place: a robot that looks ahea
 behind it, so nothing is forgotten by age.
 """
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,9 @@ SQUARE: Final = 0.05
 NEARBY: Final = 1.5
 """Obstacles this near count when backing out, and are not forgotten, m."""
 
+
+CLEARANCE: Final = 0.2
+"""Clearance of the poses of an answer is looked for up to this, m."""
 
 BEAM_WIDTH: Final = 0.012
 """Beams this near in bearing show a place, rad: two steps of a URG-04LX."""
@@ -237,7 +241,10 @@ class PlanningStep:
             return PlanAnswer(result.reason, result.text)
         self._route = result.path
         if result.path is not None:
-            return answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"]))
+            answer = answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"]))
+            assert answer.poses is not None
+            clearance = route_map.field.clearance(self._setup.footprint, answer.poses, CLEARANCE)
+            return replace(answer, clearance=clearance)
         if result.poses is None or self._setup.config.local_planner is None:
             return PlanAnswer(
                 Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.local_planner"

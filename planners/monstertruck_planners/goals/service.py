@@ -226,7 +226,7 @@ class GoalService:
     def _outcome(self, outcome: Reason) -> Reason:
         """The end of a deformed path is not that of the route."""
         on_the_way = self._deformation is not None and not self._deformation.complete
-        return Reason.DRIVING if on_the_way and outcome is Reason.GOAL_REACHED else outcome
+        return Reason.DRIVING if on_the_way and outcome in goal_run.ENDED else outcome
 
     def _blocked(self, followed: FollowedPath, along: float, odometry: Odometry, now: int) -> bool:
         if self._deformation is not None and self._deformation.active:

@@ -49,7 +49,9 @@ class TrackerConfig(Schema):
     lateral_acceleration: Positive = 0.5
     """Greatest speed squared times curvature, m/s^2."""
     goal_tolerance: Positive = 0.02
-    """A run has ended when this much of it is left, m."""
+    """A path is driven to its end if the truck comes to rest this near to it, m..."""
+    goal_yaw_tolerance: Annotated[float, Field(gt=0, le=math.pi)] = 0.2
+    """...and is turned away from it by no more than this, rad."""
     lost_distance: Positive = 0.5
     """Further away than this from the path the tracker gives up, m."""
     slow_clearance: Positive = 0.12

@@ -1,7 +1,8 @@
 """What all trackers have in common: progress, cusps, speed, prediction over the dead time, limits.
 
 A segment ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
-the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters.
+the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters. Each
+end is judged by the pose at rest: at a cusp by the clearance there, at the end of the path by the tolerances.
 """
 
 import math
@@ -17,7 +18,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.segments import (
-    MAX_SEGMENTS,
     Progress,
     Projection,
     Reference,
@@ -25,7 +25,7 @@ from monstertruck_planners.track.segments import (
     Segment,
     SegmentedPath,
 )
-from monstertruck_schemas.plan import Steering
+from monstertruck_schemas.plan import MAX_RUNS, Steering
 from monstertruck_schemas.reasons import Reason
 
 Angles = tuple[float, float]
@@ -154,7 +154,7 @@ class Command:
     heading_error: float
     """Yaw less the path's, rad."""
     outcome: Reason
-    """DRIVING, GOAL_REACHED, PATH_LOST or NOT_FINITE."""
+    """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST or NOT_FINITE."""
 
 
 LEAST: Final = 1e-6
@@ -194,7 +194,7 @@ def target_speed(config: TrackerConfig, truck: TruckState, segment: Segment, pro
     speed = config.speed if segment.direction > 0 else config.reverse_speed
     speed *= min(max(truck.clearance, 0.0) / config.slow_clearance, 1.0)
     speed *= speed_share(truck.tilt, config.slow_tilt) * speed_share(truck.roughness, config.slow_roughness)
-    left = segment.length - s - config.goal_tolerance - abs(truck.speed) * config.dead_time
+    left = segment.length - s - abs(truck.speed) * config.dead_time
     speed = min(speed, math.sqrt(2 * config.deceleration * max(left, 0.0)), profile.at(s))
     return segment.direction * max(speed, config.min_speed)
 
@@ -208,6 +208,10 @@ C = TypeVar("C", bound=TrackerConfig)
 
 REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
+CUSP_SHARE: Final = 0.5
+"""Of the clearance at a cusp that the truck may be off there: the rest is for the way on."""
+LEAST_CUSP_TOLERANCE: Final = 0.01
+"""However narrow it is, m."""
 STEEPEST: Final = 1.4
 """Angles are cut to this before their curvature is kept, rad."""
 TURNED: Final = 0.03
@@ -267,6 +271,8 @@ class PathTracker(ABC, Generic[C]):
         self.period = 1.0 / config.rate
         self.prediction = config.dead_time
         """Seconds ahead for which ``steer`` is asked."""
+        self._stop = min(config.min_speed**2 / (2 * config.deceleration), config.goal_tolerance)
+        """Metres before the end at which the truck, then at its slowest, stops."""
         self._prepared: dict[int, tuple[Segment, Reference, SpeedProfile]] = {}
 
     def reset(self) -> None:
@@ -302,19 +308,20 @@ class PathTracker(ABC, Generic[C]):
         config = self.config
         segment = path.segments[progress.segment]
         nearest = self._project(truck, segment, progress.s)
-        ended = segment.length - nearest.s <= config.goal_tolerance
+        ended = self._ended(segment, nearest)
         last = progress.segment + 1 == len(path.segments)
-        if ended and not last and abs(truck.speed) <= REST:
-            progress = Progress(progress.segment + 1)
+        judged = progress.outcome
+        if ended and judged is Reason.DRIVING:
+            judged = self._judge(truck, segment, last=last)
+        if judged is Reason.OK:
+            progress, judged = Progress(progress.segment + 1), Reason.DRIVING
             segment = path.segments[progress.segment]
             nearest, ended = self._project(truck, segment, 0.0), False
             last = progress.segment + 1 == len(path.segments)
         state = self._predict(truck, segment, nearest.s)
-        outcome = Reason.DRIVING
+        outcome = judged
         if math.hypot(truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]) > config.lost_distance:
             outcome = Reason.PATH_LOST
-        elif ended and last:
-            outcome = Reason.GOAL_REACHED
         angles = self.limited(state.steering, *self.steer(state))
         if ended and not last:
             angles = self.axles.requested  # coming to rest at a cusp
@@ -327,11 +334,35 @@ class PathTracker(ABC, Generic[C]):
             speed=speed,
             front=angles[0],
             rear=angles[1],
-            progress=Progress(progress.segment, nearest.s),
+            progress=Progress(progress.segment, nearest.s, judged),
             cross_track=math.cos(nearest.tangent) * dy - math.sin(nearest.tangent) * dx,
             heading_error=wrap_angle(truck.pose[2] - state.reference.state(nearest.s).yaw),
             outcome=outcome,
         )
+
+    def _ended(self, segment: Segment, nearest: Projection) -> bool:
+        """Whether the truck has come so near to the segment's end that it stops."""
+        return segment.length - nearest.s <= self._stop
+
+    def _judge(self, truck: TruckState, segment: Segment, *, last: bool) -> Reason:
+        """How a segment's end was met by a truck that stops: OK at a cusp within tolerance, DRIVING while it rolls."""
+        config, end = self.config, segment.at(segment.length)
+        dx, dy = truck.pose[0] - end.point[0], truck.pose[1] - end.point[1]
+        past = math.cos(end.tangent) * dx + math.sin(end.tangent) * dy
+        if abs(truck.speed) > REST and past <= config.goal_tolerance:
+            return Reason.DRIVING
+        away = math.hypot(dx, dy)
+        reference = self._prepare(segment)[0]
+        turned = abs(wrap_angle(truck.pose[2] - reference.state(segment.length).yaw))
+        if not reference.has_yaw(segment.length):
+            turned = 0.0
+        if last:
+            reached = away <= config.goal_tolerance and turned <= config.goal_yaw_tolerance
+            return Reason.GOAL_REACHED if reached else Reason.GOAL_MISSED
+        tolerance = max(CUSP_SHARE * segment.clearance, LEAST_CUSP_TOLERANCE)
+        # A corner moves by about the wheelbase for each radian.
+        off = away + self.geometry.wheelbase * turned
+        return Reason.OK if off <= tolerance else Reason.CUSP_MISSED
 
     def speed(self, state: TrackingState) -> float:
         """Speed to request, m/s."""
@@ -354,7 +385,7 @@ class PathTracker(ABC, Generic[C]):
         """Reference and greatest speeds of a segment, computed once."""
         known = self._prepared.get(id(segment))
         if known is None or known[0] is not segment:
-            if len(self._prepared) >= MAX_SEGMENTS:
+            if len(self._prepared) >= MAX_RUNS:
                 self._prepared.clear()
             reference = Reference(segment, self.geometry, self.config.steering)
             known = self._prepared[id(segment)] = (segment, reference, SpeedProfile(self.config, reference))
@@ -382,7 +413,7 @@ class PathTracker(ABC, Generic[C]):
             segment=segment,
             reference=reference,
             s=nearest.s,
-            steering=_steering_at(reference, nearest.s),
+            steering=reference.steering(nearest.s),
             lateral_error=math.cos(target.heading) * dy - math.sin(target.heading) * dx,
             target=target,
             heading_error=wrap_angle(pose[2] - target.yaw),
@@ -394,9 +425,3 @@ class PathTracker(ABC, Generic[C]):
             return False
         now = self.axles.angles
         return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > TURNED
-
-
-def _steering_at(reference: Reference, s: float) -> Steering:
-    """How the axles steer: where a path crabs its headings are meant, so they may differ to keep them."""
-    steering = reference.steering(s)
-    return "hybrid" if steering == "crab" and reference.given else steering

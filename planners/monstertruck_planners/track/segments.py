@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import Path, Steering
+from monstertruck_schemas.plan import MAX_POSES, MAX_RUNS, Path, Steering
+from monstertruck_schemas.reasons import Reason
 
 NEAREST: Final = 0.1
 """Vertices this much further than the nearest one count as equally near when a start is chosen, m."""
@@ -25,13 +26,10 @@ SAME_HEADING: Final = 0.3
 LEAST_STEP: Final = 1e-6
 """Shorter steps between two poses are left out, m."""
 
-MAX_POSES: Final = 5000
 MAX_COORDINATE: Final = 10_000.0
 """Metres from the frame's origin."""
 MAX_STEP: Final = 100.0
 """Metres between two poses."""
-MAX_SEGMENTS: Final = 64
-"""Segments; each costs some 20 us to prepare."""
 MAX_NAME: Final = 128
 MANY: Final = 40
 """Steps from which on arrays find the nearest one sooner than floats do."""
@@ -45,6 +43,8 @@ class Progress:
     """Index of the segment."""
     s: float = 0.0
     """Metres from the segment's beginning."""
+    outcome: Reason = Reason.DRIVING
+    """How the path ended, once it is judged."""
 
 
 class Projection(NamedTuple):
@@ -67,6 +67,8 @@ class PathSteps(NamedTuple):
     """Shape (n - 1,): of each step."""
     steering: tuple[Steering, ...]
     """Of each step, or empty."""
+    clearance: Array
+    """Shape (n,), m; +inf where it is not known."""
 
 
 class Segment:
@@ -80,6 +82,7 @@ class Segment:
         yaws: of the own points, shape (last + 1,), rad.
         steering: of each own step, or empty.
         lap: the way beyond is the path's own beginning.
+        clearance: between footprint and obstacles at its end, m.
     """
 
     def __init__(
@@ -92,6 +95,7 @@ class Segment:
         steering: tuple[Steering, ...] = (),
         *,
         lap: bool = False,
+        clearance: float = math.inf,
     ) -> None:
         steps = np.diff(points, axis=0)
         lengths, tangents = np.hypot(steps[:, 0], steps[:, 1]), np.arctan2(steps[:, 1], steps[:, 0])
@@ -105,6 +109,7 @@ class Segment:
         """Up to here the way is part of the path, m."""
         self.yaws = np.zeros(last + 1) if yaws is None else yaws
         self.steering = steering
+        self.clearance = clearance
 
     @property
     def vertices(self) -> Array:
@@ -210,8 +215,10 @@ def check_path(path: Path) -> None:
         _refuse(path, f"directions: expected +1 or -1 for each of the {count} poses, or none at all")
     if len(path.steering) not in (0, count):
         _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
-    if np.count_nonzero(_stops(path.directions, path.steering)) >= MAX_SEGMENTS:
-        _refuse(path, f"direction or crab changes too often: expected at most {MAX_SEGMENTS} segments")
+    if len(path.clearance) not in (0, count) or np.isnan(path.clearance).any():
+        _refuse(path, f"{len(path.clearance)} clearances: expected a number for each of the {count} poses, or none")
+    if np.count_nonzero(stops(path.directions[1:], path.steering[1:])) >= MAX_RUNS:
+        _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
     if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
         _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m from the origin")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
@@ -232,15 +239,17 @@ def _steps(path: Path) -> PathSteps:
     points, yaws = path.poses.reshape(-1, 3)[:, :2], path.poses[2::3]
     directions = path.directions if len(path.directions) else np.ones(len(points))
     arriving, steering = directions[1:], path.steering[1:]
+    clearance = path.clearance if len(path.clearance) else np.full(len(points), math.inf)
     if path.closed:
         points, yaws = np.concatenate((points, points[:1])), np.concatenate((yaws, yaws[:1]))
         arriving, steering = np.concatenate((arriving, directions[:1])), steering + path.steering[:1]
+        clearance = np.concatenate((clearance, clearance[:1]))
     step = np.diff(points, axis=0)
     real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
     kept = np.concatenate(([True], real))
     if steering:
         steering = tuple(mode for mode, is_real in zip(steering, real.tolist(), strict=True) if is_real)
-    return PathSteps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering)
+    return PathSteps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering, clearance[kept])
 
 
 def _rolled(steps: PathSteps, first: int) -> PathSteps:
@@ -248,7 +257,8 @@ def _rolled(steps: PathSteps, first: int) -> PathSteps:
     points = np.concatenate((steps.points[first:-1], steps.points[: first + 1]))
     yaws = np.unwrap(np.concatenate((steps.yaws[first:-1], steps.yaws[: first + 1])))
     steering = steps.steering[first:] + steps.steering[:first]
-    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering)
+    clearance = np.concatenate((steps.clearance[first:-1], steps.clearance[: first + 1]))
+    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering, clearance)
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
@@ -267,7 +277,7 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
 
 
 def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment, ...]:
-    cuts = [0, *(np.flatnonzero(_stops(steps.directions, steps.steering)) + 1).tolist(), len(steps.directions)]
+    cuts = [0, *(np.flatnonzero(stops(steps.directions, steps.steering)) + 1).tolist(), len(steps.directions)]
     lap = closed and len(cuts) == 2
     segments: list[Segment] = []
     before = 0.0
@@ -286,20 +296,29 @@ def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment
             steps.yaws[begin : end + 1],
             steps.steering[begin:end],
             lap=lap,
+            clearance=float(steps.clearance[end]),
         )
         segments.append(segment)
         before += segment.length
     return tuple(segments)
 
 
-def _stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
-    """Whether the truck has to come to rest between each two steps."""
-    stops: NDArray[np.bool_] = np.diff(directions) != 0.0
-    if len(stops):
+def stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
+    """Whether the truck has to come to rest between each two steps.
+
+    Args:
+        directions: shape (n,), +1 or -1 of each step.
+        steering: of each step, or empty.
+
+    Returns:
+        Shape (n - 1,).
+    """
+    at_rest: NDArray[np.bool_] = np.diff(directions) != 0.0
+    if len(at_rest):
         for i, (before, after) in enumerate(pairwise(steering)):
             if before != after and _must_stand(before, after):
-                stops[i] = True
-    return stops
+                at_rest[i] = True
+    return at_rest
 
 
 def _must_stand(before: Steering, after: Steering) -> bool:
@@ -392,8 +411,12 @@ class Reference:
         return self._s
 
     def steering(self, s: float) -> Steering:
-        """How the axles steer at ``s`` metres."""
+        """How the axles steer at ``s`` metres; where a path crabs its yaws are meant: they may differ to keep them."""
         return self._modes(np.array([s]))[0] if self.given else self._default
+
+    def has_yaw(self, s: float) -> bool:
+        """Whether the path says which yaw the body has at ``s`` metres: not where it crabs by the tracker's choice."""
+        return self.steering(s) != "crab"
 
     def steerings(self, s: Array) -> list[Steering]:
         """The same at several places."""
@@ -424,7 +447,8 @@ class Reference:
         return float(self._changes[i]) if i < len(self._changes) else self._segment.end
 
     def _modes(self, s: Array) -> list[Steering]:
-        return [self._segment.steering[i] for i in self._step_at(s).tolist()]
+        modes = [self._segment.steering[i] for i in self._step_at(s).tolist()]
+        return ["hybrid" if mode == "crab" else mode for mode in modes]
 
     def _step_at(self, s: Array) -> NDArray[np.intp]:
         """Index of the segment's step at each of the places."""

@@ -201,7 +201,7 @@ class TrackingStep:
         self._outcome = command.outcome
         if command.outcome is not self._reported and (self._active or command.outcome is not Reason.DRIVING):
             self._reported = command.outcome
-            severity = Severity.WARNING if command.outcome is Reason.PATH_LOST else Severity.INFO
+            severity = Severity.INFO if command.outcome in (Reason.DRIVING, Reason.GOAL_REACHED) else Severity.WARNING
             self._report(command.outcome, severity, path=path.name, cross_track=command.cross_track)
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
         along = path.along(command.progress)

@@ -218,6 +218,7 @@ def _write_path(path: Path, proto: Any) -> None:
     proto.poses2d = path.poses.tobytes()
     proto.directions = path.directions.tobytes()
     proto.steering.extend(path.steering)
+    proto.clearance = path.clearance.tobytes()
     proto.closed = path.closed
     proto.name = path.name
 
@@ -229,6 +230,7 @@ def _read_path(proto: Any) -> Path:
         poses=_array(poses),
         directions=_array(proto.directions),
         steering=tuple(proto.steering),
+        clearance=_array(proto.clearance),
         closed=proto.closed,
         name=proto.name,
     )

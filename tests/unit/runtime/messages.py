@@ -86,6 +86,7 @@ paths = st.builds(
     poses=hnp.arrays(np.float64, st.integers(0, 5).map(lambda n: 3 * n), elements=number),
     directions=doubles(st.integers(0, 5)),
     steering=st.lists(st.sampled_from(get_args(Steering)), max_size=5).map(tuple),
+    clearance=doubles(st.integers(0, 5)),
     closed=st.booleans(),
     name=st.text(),
 )
