@@ -1,6 +1,7 @@
 """Workers that count, sleep, hang, raise and die, for tests of the actor."""
 
 import os
+import signal
 import sys
 import time
 
@@ -39,6 +40,14 @@ class Hanging:
 
     def step(self, inputs):
         time.sleep(600)
+
+
+class Stopping:
+    """Stops in the middle of its first answer."""
+
+    def step(self, inputs):
+        os.write(int(sys.argv[1]), (1000).to_bytes(4, "big") + b"part")
+        os.kill(os.getpid(), signal.SIGSTOP)
 
 
 def broken():

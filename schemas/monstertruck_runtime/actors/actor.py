@@ -157,7 +157,9 @@ class WorkerActor:
         latency: declared seconds of a step on the reference computer.
         deadline: seconds after which a step is given up.
         cpu_factor: how much slower than the reference the studied computer is; virtual clock only.
-        start_timeout: real seconds a start may take and, on the virtual clock, a result after its virtual instant.
+        start_timeout: real seconds a start may take.
+        answer_timeout: real seconds without an answer, or without more of it, after which the worker is given up; on
+            the virtual clock from the result's instant on. As long as a start if not said.
     """
 
     def __init__(
@@ -170,6 +172,7 @@ class WorkerActor:
         deadline: float,
         cpu_factor: float = 1.0,
         start_timeout: float = 30.0,
+        answer_timeout: float | None = None,
     ) -> None:
         self._name = name
         self._target = target
@@ -177,6 +180,7 @@ class WorkerActor:
         self._latency = latency * cpu_factor
         self._deadline = deadline
         self._start_timeout = start_timeout
+        self._answer_timeout = start_timeout if answer_timeout is None else answer_timeout
         self._virtual = isinstance(clock, VirtualClock)
         self._process: WorkerProcess | None = None
         self._built = False
@@ -261,7 +265,7 @@ class WorkerActor:
             if self._latency <= self._deadline:
                 assert isinstance(self._clock, VirtualClock)
                 await delivery_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
-                return process.receive(self._start_timeout)
+                return process.receive(self._answer_timeout)
         except TimeoutError:
             pass
         await self._clock.sleep_until(submitted + round(self._deadline * SECOND))
@@ -271,7 +275,7 @@ class WorkerActor:
         return WorkerTimeoutError(f"worker {self._name} missed its deadline of {self._deadline} s and was killed")
 
     def _spawn(self) -> WorkerProcess:
-        self._process, self._built = WorkerProcess(self._name, self._target, self._start_timeout), False
+        self._process, self._built = WorkerProcess(self._name, self._target, self._answer_timeout), False
         return self._process
 
     async def _discard(self) -> None:

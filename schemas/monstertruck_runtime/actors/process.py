@@ -34,13 +34,15 @@ class WorkerProcess:
     Args:
         name: for error texts.
         target: ``module:factory``; what the factory returns has ``step(inputs) -> outputs``.
-        send_timeout: seconds after which a process that takes no inputs is given up.
+        stall_timeout: seconds after which a process that stops in the middle of a message, either way, is given up.
     """
 
-    def __init__(self, name: str, target: str, send_timeout: float = 30.0) -> None:
+    def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
         self._name = name
         ours, theirs = socket.socketpair()
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*divmod(round(send_timeout * 1e6), 10**6)))
+        limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
+        for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, direction, limit)
         self._connection = Connection(ours.detach())
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
@@ -72,7 +74,7 @@ class WorkerProcess:
 
         Raises:
             WorkerError: the process is gone or its code raised; the text holds its traceback.
-            TimeoutError: nothing came for ``timeout`` seconds.
+            TimeoutError: nothing came for ``timeout`` seconds, or the process stopped in the middle of its answer.
         """
         try:
             if not self._connection.poll(timeout):
@@ -80,6 +82,8 @@ class WorkerProcess:
             success, value = self._connection.recv()
         except TimeoutError:
             raise
+        except BlockingIOError:  # SO_RCVTIMEO has passed
+            raise TimeoutError from None
         except (EOFError, OSError) as error:
             raise WorkerError(self._gone()) from error
         if not success:

@@ -250,7 +250,7 @@ def test_too_slow_a_computer_misses_the_deadline_on_the_virtual_clock():
 
 def test_a_hang_on_the_virtual_clock_ends_at_the_deadline_too():
     async def main(clock: VirtualClock) -> tuple[float, int]:
-        async with counter(clock, latency=0.2, deadline=0.5, start_timeout=1.0) as worker:
+        async with counter(clock, latency=0.2, deadline=0.5, answer_timeout=2.0) as worker:
             start = clock.now()
             with pytest.raises(WorkerTimeoutError):
                 await worker.step({"sleep": 60})
@@ -260,6 +260,18 @@ def test_a_hang_on_the_virtual_clock_ends_at_the_deadline_too():
             return took, await worker.step(None)
 
     assert run_virtual(main) == (pytest.approx(0.5, abs=1e-6), 1)
+
+
+def test_a_worker_that_stops_in_the_middle_of_its_answer_ends_at_the_deadline_too():
+    async def main(clock: VirtualClock) -> float:
+        async with counter(clock, "Stopping", latency=0.2, deadline=0.5, answer_timeout=0.5) as worker:
+            start = clock.now()
+            with pytest.raises(WorkerTimeoutError, match="missed its deadline"):
+                await worker.step(None)
+            assert worker.pid is None
+            return (clock.now() - start) / SECOND
+
+    assert run_virtual(main) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
