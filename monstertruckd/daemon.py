@@ -33,7 +33,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.description import description
-from monstertruckd.assembly.devices import Cabling, build_drivers, of_duty
+from monstertruckd.assembly.devices import Cabling, build_drivers, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
@@ -273,6 +273,7 @@ class Daemon:
             chassis=self._body.chassis,
             footprint=self._body.footprint,
             points=self._body.points,
+            services=sensor_services(config),
             nonce=nonce,
             latched=latch.engaged(),
         )

@@ -19,10 +19,12 @@ from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.gate.sensors import STALE_TOPICS
 
 
 class Cabling:
@@ -125,6 +127,16 @@ def build_drivers(
         driver = kind.implementation_class()
         drivers[role.name] = driver(settings[role.name], where, clock, **ends, events=bus.event_sink(), name=role.name)
     return drivers
+
+
+def sensor_services(config: TruckConfig) -> dict[str, Reason]:
+    """Services that write what the gate needs, with the reason their loss gives."""
+    return {
+        role: STALE_TOPICS[topic]
+        for role in config.devices.present()
+        for topic in DEVICES.roles[role].writes.values()
+        if topic in STALE_TOPICS
+    }
 
 
 def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:

@@ -96,6 +96,7 @@ class Gate:
         chassis: kinematics of the body, its motors and servos.
         footprint: the truck's outline.
         points: converts scans to points in base.
+        services: the services of the sensors, with the reason their loss gives.
         nonce: of this run; requests must carry it.
         latched: whether the emergency stop was latched when the daemon last ran.
 
@@ -110,6 +111,7 @@ class Gate:
         chassis: Chassis,
         footprint: Footprint,
         points: ScanPoints,
+        services: Mapping[str, Reason],
         nonce: str,
         latched: bool = False,
     ) -> None:
@@ -122,8 +124,8 @@ class Gate:
         self._config = config
         self._chassis = chassis
         self._sources = Sources(nonce, config)
-        self._sensors = SensorMonitor(config, chassis)
-        self._outages = Outages()
+        self._sensors = SensorMonitor(config, chassis, services)
+        self._outages = Outages(services)
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)

@@ -9,17 +9,18 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import SHAFTS, DeviceRole
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
@@ -29,15 +30,16 @@ from monstertruck_schemas.sensor import (
     LaserScan,
     SteeringFeedback,
 )
+from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.config import GateConfig, SensorLimit, SteeringCheckConfig, TiltLimits
 
-SENSOR_SERVICES: Final[Mapping[str, Reason]] = {
-    DeviceRole.LIDAR: Reason.SCAN_STALE,
-    DeviceRole.COMPASS: Reason.ATTITUDE_STALE,
-    **dict.fromkeys(SHAFTS, Reason.DRIVE_STALE),
-    DeviceRole.STEERING: Reason.STEERING_STALE,
+STALE_TOPICS: Final[Mapping[Topic[Any], Reason]] = {
+    topics.SCAN: Reason.SCAN_STALE,
+    topics.COMPASS: Reason.ATTITUDE_STALE,
+    **dict.fromkeys(topics.DRIVES, Reason.DRIVE_STALE),
+    topics.STEERING: Reason.STEERING_STALE,
 }
-"""Services whose reported loss invalidates their samples at once."""
+"""Topics whose samples are stale as soon as the service that writes them reports its loss."""
 
 STALE_SENSORS: Final = {
     Reason.SCAN_STALE: DeviceRole.LIDAR,
@@ -89,10 +91,12 @@ class SensorMonitor:
     Args:
         config: limits.
         chassis: kinematics of the body.
+        services: what is stale at once when a service reports its loss.
     """
 
-    def __init__(self, config: GateConfig, chassis: Chassis) -> None:
+    def __init__(self, config: GateConfig, chassis: Chassis, services: Mapping[str, Reason]) -> None:
         self._config = config
+        self._services = services
         self._chassis = chassis
         self.scan: LaserScan | None = None
         self.drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
@@ -147,7 +151,7 @@ class SensorMonitor:
     def observe_health(self, table: HealthTable) -> None:
         """Take the services' health: samples from before the loss of a service become stale."""
         for service in table.services:
-            if service.state is not ServiceState.READY and (stale := SENSOR_SERVICES.get(service.name)) is not None:
+            if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
                 self._lost[stale] = max(service.since, self._lost.get(stale, -1))
                 self._speed = None
         self._failed = tuple(

@@ -16,7 +16,7 @@ from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter
-from monstertruckd.gate.sensors import SENSOR_SERVICES, STALE_SENSORS, SensorMonitor, SteeringCheck
+from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, SteeringCheck
 from monstertruckd.gate.sources import Source
 
 GATE: Final = "gate"
@@ -168,9 +168,14 @@ class _Outage:
 
 
 class Outages:
-    """Newest outage of each service, and the events that explain outages: lost devices, hubs and links."""
+    """Newest outage of each service, and the events that explain outages: lost devices, hubs and links.
 
-    def __init__(self) -> None:
+    Args:
+        services: of the sensors, with the reason their loss gives.
+    """
+
+    def __init__(self, services: Mapping[str, Reason]) -> None:
+        self._services = services
         self._outages: dict[str, _Outage] = {}
         self._hubs: dict[str, Event] = {}
         self._link: Event | None = None
@@ -213,7 +218,7 @@ class Outages:
 
     def _behind(self, cause: Cause) -> Iterator[Cause]:
         """Causes behind ``cause``, each behind the one before it."""
-        services = [name for name, stale in SENSOR_SERVICES.items() if stale is cause.reason] or [cause.source]
+        services = [name for name, stale in self._services.items() if stale is cause.reason] or [cause.source]
         outages = (outage for name in services if (outage := self._outages.get(name)) is not None)
         outage = next((outage for outage in outages if outage.end is None or cause.since <= outage.end), None)
         if outage is not None:

@@ -11,6 +11,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, RequestedTwist, Role
 from monstertruck_schemas.sensor import (
     Attitude,
@@ -31,15 +32,23 @@ SENSORS = ("scan", "attitude", "drive", "steering", "battery")
 DRIVETRAIN = DriveTrain()
 LINKAGE = SteeringPolynomials()
 STEERING = FourWheelSteering()
+SERVICES = {
+    "lidar": Reason.SCAN_STALE,
+    "compass": Reason.ATTITUDE_STALE,
+    "drive": Reason.DRIVE_STALE,
+    "drive_2": Reason.DRIVE_STALE,
+    "steering": Reason.STEERING_STALE,
+}
 CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
 
 
-def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, **config):
+def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, **config):
     return Gate(
         GateConfig(**config),
         chassis=chassis,
         footprint=Footprint(),
         points=ScanPoints((0.14, 0.0, 0.0)),
+        services=services,
         nonce=nonce,
         latched=latched,
     )

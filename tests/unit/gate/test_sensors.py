@@ -9,7 +9,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import BatteryLevel
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import Rig, attitude, battery, health, scan, servos
+from tests.unit.gate.rig import Rig, attitude, battery, health, make_gate, scan, servos
 
 STALE = {
     "scan": Reason.SCAN_STALE,
@@ -72,6 +72,20 @@ def test_a_sensor_reported_lost_stops_at_once_until_it_delivers_again(service, s
     rig.silent = set()
     rig.tick(30)
     assert rig.out.mode is GateMode.DRIVING
+
+
+def test_the_loss_of_a_sensor_counts_under_the_name_of_the_role_that_writes_its_topic():
+    rig = Rig()
+    rig.gate = make_gate(services={"imu": Reason.ATTITUDE_STALE})
+    rig.driving()
+    rig.silent = {"attitude"}
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "compass"))
+    rig.tick()
+    assert rig.out.mode is GateMode.DRIVING, "not this robot's compass"
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "imu", reason=Reason.DEVICE_LOST))
+    rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    assert rig.out.reasons == (Reason.ATTITUDE_STALE,)
 
 
 def test_uncritical_sensors_may_be_silent():

@@ -384,6 +384,7 @@ def test_the_linkage_must_reach_the_limit():
             chassis=replace(CHASSIS, linkage=SteeringPolynomials(short, short)),
             footprint=Footprint(),
             points=ScanPoints((0.14, 0.0, 0.0)),
+            services={},
             nonce="n",
         )
 

@@ -1,0 +1,31 @@
+"""Which service's loss makes which sensor stale, for the roles that are configured."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from monstertruck_drivers.catalog import COMPASS, DEVICES
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.assembly.devices import sensor_services
+from monstertruckd.config.load import load_truck
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+
+
+def test_the_services_of_the_truck():
+    config, _ = load_truck(CONFIGS / "truck.yaml")
+    assert sensor_services(config) == {
+        "lidar": Reason.SCAN_STALE,
+        "drive": Reason.DRIVE_STALE,
+        "steering": Reason.STEERING_STALE,
+        "compass": Reason.ATTITUDE_STALE,
+    }
+
+
+def test_a_role_of_another_name_that_writes_a_sensor_topic(monkeypatch: pytest.MonkeyPatch):
+    imu = dataclasses.replace(COMPASS, name="imu")
+    monkeypatch.setattr("monstertruckd.assembly.devices.DEVICES", SimpleNamespace(roles={**DEVICES.roles, "imu": imu}))
+    config = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"imu": None, "camera": None}))
+    assert sensor_services(config) == {"imu": Reason.ATTITUDE_STALE}  # type: ignore[arg-type]
