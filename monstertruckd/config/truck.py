@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.odometry import OdometryConfig
@@ -148,7 +149,7 @@ class TruckConfig(Schema):
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""
         chassis = self.chassis()
-        needed = (*SHAFTS[: len(chassis.shafts)], *(("steering",) if chassis.linkage is not None else ()))
+        needed = (*SHAFTS[: len(chassis.shafts)], *(("steering",) if chassis.steered else ()))
         if set(needed) <= self.devices.present().keys():
             return None
         return f"the devices {', '.join(needed[:-1])} and {needed[-1]}"
@@ -174,6 +175,9 @@ class TruckConfig(Schema):
         if shafts and set(shafts) != set(SHAFTS[: len(chassis.shafts)]):
             wanted = ", ".join(f"{role} ({shaft})" for role, shaft in zip(SHAFTS, chassis.shafts, strict=False))
             raise ValueError(f"body {self.body.kind} is driven by {wanted}; got {', '.join(shafts)}")
+        steering = self.devices.steering
+        if steering is not None and chassis.steered:
+            self._check_servos(steering.driver, chassis)
         if self.tracker is not None:
             if lack := self.missing_actuators():
                 raise ValueError(f"a tracker needs {lack}")
@@ -184,6 +188,14 @@ class TruckConfig(Schema):
         for role, device in shafts.items():
             if isinstance(device.driver, EposConfig):
                 self._check_braking(role, device.driver)
+
+    def _check_servos(self, driver: MaestroConfig, chassis: Chassis) -> None:
+        wanted = len(chassis.straight)
+        if len(driver.servos) != wanted:
+            raise ValueError(
+                f"body {self.body.kind} has {wanted} servos: expected front_right and rear_right of devices.steering"
+                f" {'given' if wanted > len(driver.servos) else 'null'}"
+            )
 
     def _check_planner(self) -> None:
         planner = self.planner

@@ -13,8 +13,8 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
-from monstertruck_schemas.base import Twist2D
-from monstertruck_schemas.cmd import DriveCommand, SteeringCommand, servo_fields
+from monstertruck_schemas.base import Twist2D, servo_fields
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
@@ -246,7 +246,7 @@ class GateService:
                 seq=steering.next_seq(),
                 front=output.front,
                 rear=output.rear,
-                **servo_fields(output.servos),
+                **servo_fields(output.servos, "_servo"),
                 deadman=Reason.DRIVE_STALE not in output.reasons,
             )
         )

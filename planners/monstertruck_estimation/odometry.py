@@ -375,7 +375,7 @@ class OdometryContext:
 
     def inputs(self) -> dict[str, Any]:
         """Topics of an ``OdometryService``, by the names of its arguments."""
-        bus, shafts, steered = self.bus, len(self.chassis.shafts), self.chassis.linkage is not None
+        bus, shafts, steered = self.bus, len(self.chassis.shafts), self.chassis.steered
         return {
             "drives": [bus.subscribe(topic, latest()) for topic in topics.DRIVES[:shafts]],
             "steering": bus.subscribe(topics.STEERING, latest()) if steered else None,

@@ -54,6 +54,10 @@ STANDING: Final = 0.1
 STRAIGHT: Final = 1e-6
 """Axle angles this close count as equal, rad."""
 
+WHEEL_REACH: Final = math.radians(100.0)
+"""Angle that wheels with servos of their own reach to both sides: more than a quarter turn, so that a wheel need not
+turn about when its motion passes through sideways, rad."""
+
 ALIGNED: Final = 0.35
 """Wheels that are steered one by one may roll while they turn to angles this close, rad."""
 
@@ -344,11 +348,9 @@ class WheelSteerChassis(Chassis):
 
     Args:
         family: the drive.
-        reach: angle that every wheel reaches to both sides, rad, at least a quarter turn.
     """
 
     family: IndependentSteer
-    reach: float
 
     straight = (0.0, 0.0, 0.0, 0.0)
 
@@ -373,7 +375,7 @@ class WheelSteerChassis(Chassis):
 
     def steering(self, *servos: float) -> Angles:
         """Each servo turns its wheel itself."""
-        return tuple(clip(servo, -self.reach, self.reach) for servo in servos)
+        return tuple(clip(servo, -WHEEL_REACH, WHEEL_REACH) for servo in servos)
 
     def steering_for(self, twist: Twist[float], near: Angles) -> Angles:
         """Wheels along their own velocities; a wheel rolls backwards rather than turn further than it must."""
@@ -388,7 +390,7 @@ class WheelSteerChassis(Chassis):
         """The angle, or the same turned by half a turn, within reach and nearest to ``near``."""
         if still:
             return near
-        turned = [a for a in (angle, angle - math.pi, angle + math.pi) if abs(a) <= self.reach]
+        turned = [a for a in (angle, angle - math.pi, angle + math.pi) if abs(a) <= WHEEL_REACH]
         return min(turned, key=lambda a: abs(a - near))
 
     def steering_for_axles(self, front: float, rear: float, near: Angles) -> Angles:
@@ -463,19 +465,16 @@ def truck_chassis(size: Dimensions) -> Chassis:
     return TruckChassis(size.centred, size.drivetrain, ("drive",), "both", size.linkage)
 
 
-def independent_chassis(
-    size: Dimensions, steering: Literal["axles", "wheels"] = "axles", reach: float = 1.75
-) -> Chassis:
+def independent_chassis(size: Dimensions, steering: Literal["axles", "wheels"] = "axles") -> Chassis:
     """A motor in every wheel.
 
     Args:
         size: the robot's.
         steering: two steered axles with ideal linkages, or a servo for every wheel.
-        reach: of a wheel with a servo of its own, rad.
     """
     wheels = IndependentSteer(size.centred.wheel_positions, size.drivetrain.wheel_radius)
     if steering == "wheels":
-        return WheelSteerChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", None, wheels, reach)
+        return WheelSteerChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", None, wheels)
     return IndependentChassis(size.centred, size.drivetrain, WHEEL_NAMES, "both", size.linkage, wheels)
 
 

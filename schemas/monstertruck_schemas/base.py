@@ -4,6 +4,7 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 (map > odom > base > sensors). A value that is absent is ``None``, never NaN.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -122,3 +123,14 @@ class Twist2D(Schema):
     vx: float
     vy: float
     wz: float
+
+
+def servos_of(front: float, front_right: float | None, rear: float, rear_right: float | None) -> tuple[float, ...]:
+    """Servo angles: front and rear, or front left, front right, rear left and rear right."""
+    return (front, rear) if front_right is None or rear_right is None else (front, front_right, rear, rear_right)
+
+
+def servo_fields(servos: Sequence[float], suffix: str = "") -> dict[str, Any]:
+    """Fields of a message for its servo angles, two or four as by ``servos_of``; ``suffix`` ends their names."""
+    names = ("front", "front_right", "rear", "rear_right")
+    return {f"{n}{suffix}": angle for n, angle in zip(names[:: len(names) // len(servos)], servos, strict=True)}

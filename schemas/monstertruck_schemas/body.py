@@ -1,8 +1,8 @@
 """Which robot it is, for the daemon's configuration and for the simulated world's: drive families by ``kind``.
 
-Lengths that every robot has (wheelbase, track, wheel radius, gear ratio) stand beside it. Requests always name the
-speed of the base and two axle angles; a body without axles is driven as the bicycle of its ``wheelbase`` that moves
-alike. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in the order given here.
+Lengths that every robot has (wheelbase, track, wheel radius, gear ratio) are in ``geometry``. Requests are the twist of
+the base, or its speed and two axle angles; a body without axles is then driven as the bicycle of its ``wheelbase`` that
+moves alike. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in this order.
 """
 
 import math
@@ -73,9 +73,11 @@ class TricycleBody(BodyConfig):
 
 
 class IndependentBody(BodyConfig):
-    """Two steered axles with ideal linkages, a motor in every wheel: front left, front right, rear left, rear right."""
+    """A motor in every wheel: front left, front right, rear left, rear right."""
 
     kind: Literal["independent"]
+    steering: Literal["axles", "wheels"] = "axles"
+    """Two steered axles with ideal linkages, or a servo for every wheel"""
 
 
 class DifferentialBody(BodyConfig):

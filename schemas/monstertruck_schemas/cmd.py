@@ -1,10 +1,8 @@
 """Messages of the ``cmd`` group: what the gate, and only the gate, sent to the actuators."""
 
-from collections.abc import Sequence
 from enum import StrEnum
-from typing import Any
 
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, servos_of
 
 
 class DriveAction(StrEnum):
@@ -47,12 +45,4 @@ class SteeringCommand(Message):
     @property
     def servos(self) -> tuple[float, ...]:
         """All servo angles: front and rear, or front left, front right, rear left and rear right."""
-        if self.front_right_servo is None or self.rear_right_servo is None:
-            return self.front_servo, self.rear_servo
-        return self.front_servo, self.front_right_servo, self.rear_servo, self.rear_right_servo
-
-
-def servo_fields(servos: Sequence[float]) -> dict[str, Any]:
-    """Fields of ``SteeringCommand`` for its ``servos``, two or four angles, rad."""
-    names = ("front_servo", "front_right_servo", "rear_servo", "rear_right_servo")
-    return dict(zip(names if len(servos) == len(names) else names[::2], servos, strict=True))
+        return servos_of(self.front_servo, self.front_right_servo, self.rear_servo, self.rear_right_servo)

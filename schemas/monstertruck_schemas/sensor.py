@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from monstertruck_schemas.base import Float64Array, Message, Schema, UInt8Array
+from monstertruck_schemas.base import Float64Array, Message, Schema, UInt8Array, servos_of
 
 
 class LaserScan(Message):
@@ -116,9 +116,7 @@ class SteeringFeedback(Message):
     @property
     def servos(self) -> tuple[float, ...]:
         """All servo angles: front and rear, or front left, front right, rear left and rear right."""
-        if self.front_right is None or self.rear_right is None:
-            return self.front, self.rear
-        return self.front, self.front_right, self.rear, self.rear_right
+        return servos_of(self.front, self.front_right, self.rear, self.rear_right)
 
 
 class BatteryLevel(StrEnum):

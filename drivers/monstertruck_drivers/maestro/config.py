@@ -24,7 +24,7 @@ class ServoConfig(Schema):
     """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
     min_us: Microseconds = 1088.0
     max_us: Microseconds = 1840.0
-    max_angle_deg: Annotated[float, Field(gt=0, le=90)] = 45.0
+    max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     speed: Annotated[int, Field(ge=0, le=0x3FFF)] = 100
     """Limit of the pulse's change, 0.25 us per 10 ms; 0 = none."""
     acceleration: Annotated[int, Field(ge=0, le=255)] = 0
@@ -77,6 +77,10 @@ class MaestroConfig(Schema):
     kind: Literal["maestro"] = "maestro"
     front: ServoConfig = ServoConfig(channel=1)
     rear: ServoConfig = ServoConfig(channel=0)
+    front_right: ServoConfig | None = None
+    """Where every wheel has its own servo: the front right wheel's; ``front`` is the front left one's"""
+    rear_right: ServoConfig | None = None
+    """The rear right wheel's; ``rear`` is the rear left one's"""
     battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second both pulses and the error word are read."""
@@ -95,9 +99,20 @@ class MaestroConfig(Schema):
     use_crc: bool = False
     """Must equal the unit's own setting."""
 
+    @property
+    def servos(self) -> tuple[ServoConfig, ...]:
+        """Front and rear, or front left, front right, rear left and rear right."""
+        if self.front_right is None or self.rear_right is None:
+            return self.front, self.rear
+        return self.front, self.front_right, self.rear, self.rear_right
+
     @model_validator(mode="after")
     def _channels_differ(self) -> Self:
         used = {"front": self.front.channel, "rear": self.rear.channel}
+        if (self.front_right is None) != (self.rear_right is None):
+            raise ValueError("front_right and rear_right: expected both or neither")
+        if self.front_right is not None and self.rear_right is not None:
+            used |= {"front_right": self.front_right.channel, "rear_right": self.rear_right.channel}
         if self.battery is not None:
             used["battery"] = self.battery.channel
         if self.deadman_channel is not None:

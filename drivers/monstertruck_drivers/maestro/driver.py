@@ -5,12 +5,13 @@ from typing import Final
 
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
-from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.base import servo_fields
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -71,7 +72,7 @@ class MaestroDriver:
         self._battery = None
         if battery is not None and config.battery is not None:
             self._battery = BatteryInput(config.battery, BatteryMonitor(config.battery, battery, events, name, drive))
-        self._angles = [0.0, 0.0]
+        self._angles = [0.0] * len(config.servos)
         self._start_session()
 
     def _start_session(self) -> None:
@@ -96,7 +97,7 @@ class MaestroDriver:
             encoder = Encoder(config.device_number, config.use_crc)
             session = MaestroSession(link, self._clock, encoder, config.answer_timeout)
             # Errors pending since power-up say nothing about this session.
-            await session.identify(config.front.channel, config.rear.channel)
+            await session.identify(*(servo.channel for servo in config.servos))
             self._restore(session)
             ready()
             try:
@@ -142,7 +143,7 @@ class MaestroDriver:
             self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
 
     def _targets(self, session: MaestroSession, command: SteeringCommand) -> list[bytes]:
-        pairs = ((self._config.front, command.front_servo), (self._config.rear, command.rear_servo))
+        pairs = zip(self._config.servos, command.servos, strict=True)
         return [session.encode.set_target(servo.channel, servo.quarters(angle)) for servo, angle in pairs]
 
     def _line(self, session: MaestroSession, *, high: bool) -> list[bytes]:
@@ -152,7 +153,7 @@ class MaestroDriver:
     def _restore(self, session: MaestroSession) -> None:
         """Send everything a Maestro forgets at power-up or loses by an error."""
         packets: list[bytes] = []
-        for servo in (self._config.front, self._config.rear):
+        for servo in self._config.servos:
             packets.append(session.encode.set_speed(servo.channel, servo.speed))
             packets.append(session.encode.set_acceleration(servo.channel, servo.acceleration))
         if self._command is not None:
@@ -162,7 +163,7 @@ class MaestroDriver:
 
     async def _poll(self, session: MaestroSession, battery: "BatteryInput | None") -> None:
         config = self._config
-        channels = [config.front.channel, config.rear.channel] + ([battery.channel] if battery else [])
+        channels = [servo.channel for servo in config.servos] + ([battery.channel] if battery else [])
         asked = self._clock.now()
         try:
             *positions, errors = await session.ask(
@@ -181,14 +182,14 @@ class MaestroDriver:
         stamp = (asked + received) // 2
         self._report(session, stamp, received, positions, errors)
         if battery is not None:
-            battery.take(stamp, received, positions[2])
+            battery.take(stamp, received, positions[-1])
 
     def _report(self, session: MaestroSession, stamp: int, received: int, positions: list[int], errors: int) -> None:
-        servos: tuple[ServoConfig, ServoConfig] = (self._config.front, self._config.rear)
-        for axle, (servo, position) in enumerate(zip(servos, positions[:2], strict=True)):
+        positions = positions[: len(self._angles)]
+        for i, (servo, position) in enumerate(zip(self._config.servos, positions, strict=True)):
             if position > 0:  # 0: no pulses, the servo stays where it is
-                self._angles[axle] = servo.angle(position)
-        pulsing = all(positions[:2])
+                self._angles[i] = servo.angle(position)
+        pulsing = all(positions)
         lost = errors != 0 or (self._command is not None and not pulsing)
         if lost:
             if not self._failing:
@@ -202,8 +203,7 @@ class MaestroDriver:
                 stamp=stamp,
                 received=received,
                 seq=self._out.next_seq(),
-                front=self._angles[0],
-                rear=self._angles[1],
+                **servo_fields(self._angles),
                 error_word=errors,
                 trusted=errors == 0 and pulsing,
             )

@@ -2,7 +2,6 @@
 
 from math import copysign, exp, floor, pi, radians
 
-from monstertruck_kinematics.polynomials import SERVO_LIMIT
 from monstertruck_sim.world.config import MotorConfig, ServoModelConfig
 
 RPM = 2 * pi / 60
@@ -59,8 +58,8 @@ class Servo:
 
     def __init__(self, config: ServoModelConfig) -> None:
         self._config = config
-        self._left_stop = min(SERVO_LIMIT, radians(config.left_stop_deg))
-        self._right_stop = -min(SERVO_LIMIT, radians(config.right_stop_deg))
+        self._left_stop = radians(config.left_stop_deg)
+        self._right_stop = -radians(config.right_stop_deg)
         self._held_us: float | None = None
         self._target = 0.0
         """Angle of the held pulse, rad."""

@@ -34,9 +34,9 @@ class ServoModelConfig(Schema):
     """The servo does not move for a smaller change of its pulse, us."""
     resolution_us: Positive = 1.0
     """Steps in which the servo measures its pulse, us."""
-    left_stop_deg: Annotated[float, Field(gt=0, le=45)] = 45.0
+    left_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     """Angle at which something stops the arm on its way to the left."""
-    right_stop_deg: Annotated[float, Field(gt=0, le=45)] = 45.0
+    right_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
 
 
 class MotorConfig(Schema):
@@ -115,6 +115,10 @@ class SimTruckConfig(Schema):
     """Set of linkage polynomials."""
     front_servo: ServoModelConfig = ServoModelConfig(channel=1)
     rear_servo: ServoModelConfig = ServoModelConfig(channel=0)
+    front_right_servo: ServoModelConfig | None = None
+    """Where every wheel has its own servo: the front right wheel's; ``front_servo`` is the front left one's."""
+    rear_right_servo: ServoModelConfig | None = None
+    """The rear right wheel's; ``rear_servo`` is the rear left one's."""
     motor: MotorConfig = MotorConfig()
     """Each of the motors"""
 
@@ -128,6 +132,13 @@ class SimTruckConfig(Schema):
         chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, self.wheelbase, self.track, self.steering))
         return chassis
 
+    @property
+    def servos(self) -> tuple[ServoModelConfig, ...]:
+        """Front and rear, or front left, front right, rear left and rear right."""
+        if self.front_right_servo is None or self.rear_right_servo is None:
+            return self.front_servo, self.rear_servo
+        return self.front_servo, self.front_right_servo, self.rear_servo, self.rear_right_servo
+
     @model_validator(mode="after")
     def _check_geometry(self) -> Self:
         if self.length < self.wheelbase or self.width < self.track:
@@ -138,6 +149,8 @@ class SimTruckConfig(Schema):
         if self.front_servo.channel == self.rear_servo.channel:
             raise ValueError(f"front_servo and rear_servo share channel {self.front_servo.channel}")
         chassis = self.chassis()
+        if len({servo.channel for servo in self.servos}) < len(chassis.straight):
+            raise ValueError(f"body {self.body.kind} has {len(chassis.straight)} servos: expected one channel for each")
         if self.dynamics == "single_track" and (chassis.linkage is None or chassis.freedom == "parallel"):
             raise ValueError(f"dynamics single_track: body {self.body.kind} has no axles that steer it into a curve")
         return self

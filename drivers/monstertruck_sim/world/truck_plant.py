@@ -49,7 +49,7 @@ class TruthState(NamedTuple):
     """Along the direction of travel, negative backwards."""
     wz: float
     front: float
-    """Bicycle angle of the front wheels, left positive."""
+    """Angle of the equivalent bicycle's front axle, left positive; 0 for a motion that no bicycle makes."""
     rear: float
     pitch: float
     """Nose down positive (REP 103)."""
@@ -103,7 +103,7 @@ class TruckPlant:
         self.pulses: PulseSource | None = None
         self.servo_supply = True
         """The steering servos have their 5 V."""
-        self._front, self._rear = Servo(config.front_servo), Servo(config.rear_servo)
+        self._servos = tuple(map(Servo, config.servos))
         self._steering = _Steering(self._chassis)
         self._tyres = _tyres(config, self._chassis)
         self._contact, self._tilt = contact, tilt
@@ -155,6 +155,7 @@ class TruckPlant:
         """State at the newest instant."""
         x, y, yaw = self._pose
         vx, vy, wz = self._twist
+        front, rear = self._chassis.axle_angles(self._twist, self._steering.angles)
         return TruthState(
             time_ns=(self._start_ns or 0) + self._elapsed,
             x=x,
@@ -162,8 +163,8 @@ class TruckPlant:
             yaw=pi - (pi - yaw) % (2 * pi),
             v=copysign(hypot(vx, vy), vx) if vx or vy else 0.0,
             wz=wz,
-            front=self._steering.front,
-            rear=self._steering.rear,
+            front=front,
+            rear=rear,
             pitch=self._attitude[0],
             roll=self._attitude[1],
             stuck=self._stuck_at is not None,
@@ -210,11 +211,11 @@ class TruckPlant:
     def _steer(self, dt: float) -> None:
         if self.pulses is not None and self._elapsed % SERVO_FRAME_NS == 0:
             now = (self._start_ns or 0) + self._elapsed
-            for servo, config in ((self._front, self.config.front_servo), (self._rear, self.config.rear_servo)):
+            for servo, config in zip(self._servos, self.config.servos, strict=True):
                 servo.latch(self.pulses.pulse_us(config.channel, now) if self.servo_supply else None)
-        self._front.step(dt)
-        self._rear.step(dt)
-        self._steering.follow(self._front.angle, self._rear.angle)
+        for servo in self._servos:
+            servo.step(dt)
+        self._steering.follow(*(servo.angle for servo in self._servos))
 
     def _drive(self, i: int, shaft: Shaft, dt: float) -> float:
         """Wheels follow their motor as fast as the clutch can pull mass, slope and rolling resistance; its current."""
@@ -249,15 +250,19 @@ class TruckPlant:
         if self._tyres is None:
             vx, _, wz = self._twist
             lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * copysign(1.0, wheels[0])
-        front = steering.front - config.front_slip_angle * lateral + config.slip_angle_noise * front_noise
-        rear = steering.rear - config.rear_slip_angle * lateral + config.slip_angle_noise * rear_noise
+        front_slip = config.front_slip_angle * lateral - config.slip_angle_noise * front_noise
+        rear_slip = config.rear_slip_angle * lateral - config.slip_angle_noise * rear_noise
+        half = len(steering.angles) // 2
+        angles = [angle - front_slip for angle in steering.angles[:half]]
+        angles += [angle - rear_slip for angle in steering.angles[half:]]
         pace = []
         for wheel, pull, slip_noise in zip(wheels, self._pulls, slip_noises, strict=True):
             slip = config.slip_per_newton * pull * copysign(1.0, wheel) + config.slip_noise * slip_noise
             pace.append(wheel * steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0]))
-        twist = self._chassis.twist(tuple(pace), front, rear)
+        twist = self._chassis.twist(tuple(pace), *angles)
         if self._tyres is not None:
             speed = copysign(hypot(twist[0], twist[1]), twist[0])
+            front, rear = angles
             twist = self._tyres.step(self._twist, speed, front, rear if self._chassis.freedom == "both" else 0.0, dt)
         pose = integrate(self._pose, *twist, dt)
         depth = self._contact(*pose) if pose != self._pose else 0.0
@@ -273,24 +278,24 @@ class TruckPlant:
 
 
 class _Steering:
-    """Axle angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
+    """Steering angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
 
     The truck's one motor drives four wheels through open differentials: it turns with the mean of their speeds.
     """
 
     def __init__(self, chassis: Chassis) -> None:
         self._chassis = chassis
-        self._servos: tuple[float, float] | None = None
-        self.follow(0.0, 0.0)
+        self._servos: tuple[float, ...] | None = None
+        self.follow(*chassis.straight)
 
-    def follow(self, front_servo: float, rear_servo: float) -> None:
-        if (front_servo, rear_servo) == self._servos:
+    def follow(self, *servos: float) -> None:
+        if servos == self._servos:
             return
-        self._servos = (front_servo, rear_servo)
-        self.front, self.rear = self._chassis.steering(front_servo, rear_servo)
+        self._servos = servos
+        self.angles = self._chassis.steering(*servos)
         self.body_per_wheel = 1.0
         if isinstance(self._chassis, TruckChassis):
-            self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, self.front, self.rear))
+            self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, *self.angles))
 
 
 def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
