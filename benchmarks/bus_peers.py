@@ -31,7 +31,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.tools.demo.wall import connect
+from monstertruckd.tools.demo.runs import connect
 
 BEAMS = 682
 RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)

@@ -36,7 +36,7 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.state import GateMode
-from monstertruckd.tools.demo.wall import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.demo.runs import connect, free_endpoint, program, write_overlay
 from monstertruckd.tools.simulation.operator import drive_lap
 
 HERE = Path(__file__).resolve().parent

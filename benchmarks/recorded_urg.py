@@ -20,7 +20,7 @@ import numpy as np
 from monstertruck_drivers.hokuyo_urg.recording import FIRST_STEP, RecordedRanges
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_schemas.sensor import VALID_BEAM
-from monstertruckd.tools.demo.wall import connect, free_endpoint, write_overlay
+from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "configs" / "recorded-urg.yaml"

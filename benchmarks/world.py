@@ -32,7 +32,7 @@ from same_python import go_on_in_the_systems_python
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.raycast import cast_rays, clearance
-from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.demo.runs import run_fast_demo
 
 ROOT = Path(__file__).resolve().parents[1]
 CELLS, RESOLUTION = 1000, 0.05

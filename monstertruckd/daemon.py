@@ -5,6 +5,7 @@ order, so the gate commands neutral while actuators and recorder still listen.
 """
 
 import asyncio
+import dataclasses
 import secrets
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
@@ -15,7 +16,10 @@ import numpy as np
 
 from monstertruck_drivers.catalog import Duty
 from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
@@ -32,7 +36,6 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd.assembly.description import description
 from monstertruckd.assembly.devices import Cabling, build_drivers, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
@@ -110,7 +113,7 @@ class Daemon:
         self._remote_steps = RemoteWorkQueue(CODEC)
         self._actors = ActorFactory(clock, self._remote_steps)
         self.rpc = self._build_rpc()
-        self._attachments = description(config, self._body, tree)
+        self._attachments = _attachments(config, self._body, tree)
         self.recorder = self._build_recorder()
         self.black_box = self._build_black_box()
         self._notify = notify_from(environment, clock, self.gate.ticks, config.gate.rate, self._status)
@@ -336,3 +339,36 @@ class Daemon:
             metadata={"robot": self.config.robot},
             offload=in_daemon_thread if self._seed is None else inline,
         )
+
+
+def _attachments(config: TruckConfig, body: Body, tree: Tree | None) -> dict[str, Any]:
+    """Attachments of a log: configuration, calibration, origins of the values, versions."""
+    origins = tree.origins if tree is not None else {}
+    return {
+        "config": resolved(config),
+        "calibration": _calibration(config, body.chassis, tree),
+        "origins": {".".join(map(str, key)): str(origin) for key, origin in origins.items()},
+        "versions": dict(running_versions()),
+    }
+
+
+def _calibration(config: TruckConfig, chassis: Chassis, tree: Tree | None) -> dict[str, Any]:
+    """Everything that was measured on this very truck, and the file it comes from, for the log."""
+    devices = config.devices
+    values: dict[str, Any] = {
+        "file": None if tree is None or tree.calibration is None else str(tree.calibration),
+        "wheel_radius_m": config.geometry.wheel_radius,
+        "drive_ratio": config.geometry.drive_ratio,
+        "linkage": None if chassis.linkage is None else dataclasses.asdict(chassis.linkage),
+        "mounts": {role: device.mount.model_dump() for role, device in devices.present().items()},
+    }
+    values |= {
+        f"{role}_inverted": device.driver.inverted
+        for role, device in devices.shafts().items()
+        if isinstance(device.driver, EposConfig)
+    }
+    if devices.steering is not None and isinstance(steering := devices.steering.driver, MaestroConfig):
+        values |= {"front_servo": steering.front.model_dump(), "rear_servo": steering.rear.model_dump()}
+        if steering.battery is not None:
+            values["battery"] = steering.battery.model_dump()
+    return values

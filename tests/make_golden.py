@@ -14,7 +14,7 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruckd import __version__
 from monstertruckd.config.load import load_tree
 from monstertruckd.config.migrate import VERSION
-from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.demo.runs import run_fast_demo
 from monstertruckd.tools.logs.report.collect import collect
 from monstertruckd.tools.logs.summary import info
 

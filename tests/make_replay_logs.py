@@ -20,8 +20,7 @@ from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Role
 from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.config.migrate import VERSION
-from monstertruckd.tools.demo.fast import run_fast_demo
-from monstertruckd.tools.demo.wall import write_overlay
+from monstertruckd.tools.demo.runs import run_fast_demo, write_overlay
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator

@@ -187,22 +187,31 @@ class DeviceKind(Plugin):
 
 RESERVED: Final = frozenset(
     {
-        "present",
-        "shafts",
-        "gate",
-        "recorder",
+        "blackbox",
         "bus",
-        "usb",
         "clock",
-        "health",
-        "path",
-        "tracker",
+        "gate",
         "goals",
-        "slam",
+        "health",
+        "levelling",
+        "map",
+        "meter",
+        "notify",
         "odometry",
+        "path",
+        "present",
+        "recorder",
+        "shafts",
+        "slam",
+        "stalls",
+        "tracker",
+        "transforms",
+        "usb",
+        "zenoh",
     }
 )
-"""Names of services, and of what a section of the configuration has besides its roles."""
+"""Names of the daemon's other services (a test compares them), and of what a section of the configuration has besides
+its roles."""
 
 
 class DeviceCatalog(Catalog[DeviceKind]):

@@ -12,7 +12,7 @@ import pytest
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
-from monstertruckd.tools.demo.wall import free_endpoint
+from monstertruckd.tools.demo.runs import free_endpoint
 from tests.daemon.wall_kit import DEMO, ROOT, Robot, command, end
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]

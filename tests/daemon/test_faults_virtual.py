@@ -10,7 +10,7 @@ from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.faults import Fault, nothing
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.demo.fast import run_fast_demo
+from monstertruckd.tools.demo.runs import run_fast_demo
 from monstertruckd.tools.demo.summary import GOAL_CLOSING
 from monstertruckd.tools.drill.observer import Violation
 from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario, measure, shortcomings

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd.tools.demo.wall import free_endpoint, write_overlay
+from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 from tests.daemon.wall_kit import DEMO, ROOT, end
 
 pytestmark = pytest.mark.wall

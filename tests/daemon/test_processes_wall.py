@@ -17,7 +17,7 @@ from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
-from monstertruckd.tools.demo.wall import free_endpoint
+from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.logs.summary import info
 from tests.daemon.wall_kit import ROOT, end, robot
 

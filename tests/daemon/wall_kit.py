@@ -20,7 +20,7 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.state import GateMode
-from monstertruckd.tools.demo.wall import free_endpoint, write_overlay
+from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "configs" / "demo.yaml"

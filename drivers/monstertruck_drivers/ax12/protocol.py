@@ -202,21 +202,6 @@ def write(unit: int, start: Register, data: bytes) -> bytes:
     return Packet(unit, Instruction.WRITE, bytes((start.address,)) + data).encode()
 
 
-def reg_write(unit: int, start: Register, data: bytes) -> bytes:
-    """As ``write``, but carried out at the next ``action``."""
-    return Packet(unit, Instruction.REG_WRITE, bytes((start.address,)) + data).encode()
-
-
-def action(unit: int = BROADCAST) -> bytes:
-    """Carry out what was registered."""
-    return Packet(unit, Instruction.ACTION).encode()
-
-
-def reset(unit: int) -> bytes:
-    """Factory settings: its number becomes 1."""
-    return Packet(unit, Instruction.RESET).encode()
-
-
 def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
     """Write to several units in one packet, which nobody answers.
 

@@ -147,16 +147,6 @@ def scan_command(scan_format: ScanFormat, start: int, end: int, cluster: int = 1
     return f"{scan_format}{start:04d}{end:04d}{cluster:02d}{skip:d}{count:02d}"
 
 
-def single_command(command: Literal["GD", "GS"], start: int, end: int, cluster: int = 1) -> str:
-    """``GD``/``GS``: the latest revolution, once; the laser must be on (``BM``).
-
-    Raises:
-        ValueError: a parameter outside its digits.
-    """
-    _digits(start=(start, 9999), end=(end, 9999), cluster=(cluster, 99))
-    return f"{command}{start:04d}{end:04d}{cluster:02d}"
-
-
 def scip1_scan_command(start: int, end: int, cluster: int = 1) -> str:
     """``G`` of SCIP 1.1: the latest revolution, once.
 
@@ -165,17 +155,6 @@ def scip1_scan_command(start: int, end: int, cluster: int = 1) -> str:
     """
     _digits(start=(start, 999), end=(end, 999), cluster=(cluster, 99))
     return f"G{start:03d}{end:03d}{cluster:02d}"
-
-
-def baud_command(baud: int) -> str:
-    """``SS``: change the rate of the RS232 port.
-
-    Raises:
-        ValueError: not a rate of the standard.
-    """
-    if baud not in (19200, 57600, 115200):
-        raise ValueError(f"SCIP knows 19200, 57600 and 115200 baud, not {baud}")
-    return f"SS{baud:06d}"
 
 
 def _digits(**limits: tuple[int, int]) -> None:

@@ -118,8 +118,6 @@ class MaestroEmulator:
         self.on_output = on_output
         self.received = Trail()
         """Bytes the host sent to the Command Port, for tests."""
-        self.wire = Trail()
-        """Bytes bridged from the TTL Port to the TX pin."""
         self.analog_v = dict.fromkeys(range(CHANNELS), 2.4)
         """Volts at the inputs while there is no plant."""
         self.rail_v = 5.0
@@ -189,11 +187,6 @@ class MaestroEmulator:
             group.create_task(self._watch())
             while True:
                 self._take(end, await end.read())
-
-    async def run_ttl(self, end: DeviceEnd) -> None:
-        """Serve the TTL Port: a plain bridge to the TX pin, on which nothing listens."""
-        while True:
-            self.wire.extend(await end.read())
 
     def inject(self, fault: str, *values: str) -> None:
         """Start a fault, see the class.

@@ -1,16 +1,21 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, and an open yard."""
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, and an open yard.
 
+``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the lap of ``loop``.
+"""
+
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi, radians, tan
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
-from monstertruck_sim.world.terrain import Profile
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, save_map
+from monstertruck_sim.world.terrain import Profile, profile_path, save_profile
 
 RESOLUTION = 0.025
 """m per cell."""
@@ -180,3 +185,26 @@ def _along(x: float, y: float, yaw: float, s: Array, curvature: float) -> tuple[
     half = s * curvature / 2
     chord = s * np.sinc(half / pi)
     return x + chord * np.cos(yaw + half), y + chord * np.sin(yaw + half), yaw + 2 * half
+
+
+def make_worlds(out: Path) -> list[Path]:
+    """Write ``out``/worlds/NAME.yaml, .png, .profile.yaml and ``out``/paths/loop.csv; returns what was written."""
+    worlds, paths = out / "worlds", out / "paths"
+    worlds.mkdir(parents=True, exist_ok=True)
+    paths.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, draw in BUILT_IN.items():
+        built, path = draw(), worlds / f"{name}.yaml"
+        save_map(built.map, path)
+        written += [path, path.with_suffix(".png")]
+        if built.profile is not None:
+            save_profile(built.profile, profile_path(path))
+            written.append(profile_path(path))
+    rows = [f"{x:.4f},{y:.4f},{yaw:.5f},1" for x, y, yaw in lap()]
+    (paths / "loop.csv").write_text("\n".join(["x,y,yaw,direction", *rows, ""]), encoding="utf-8")
+    return [*written, paths / "loop.csv"]
+
+
+if __name__ == "__main__":
+    for path in make_worlds(Path(sys.argv[1] if len(sys.argv) > 1 else "configs")):
+        sys.stdout.write(f"{path}\n")

@@ -34,8 +34,7 @@ def demo(
     """The emulated truck drives a lap: real drivers, real bytes, real log."""
     from monstertruck_runtime.clock import run_wall
     from monstertruck_schemas.reasons import Reason
-    from monstertruckd.tools.demo.fast import run_fast_demo
-    from monstertruckd.tools.demo.wall import run_wall_demo
+    from monstertruckd.tools.demo.runs import run_fast_demo, run_wall_demo
     from monstertruckd.tools.simulation.config import load_simulated
 
     load_simulated(config)

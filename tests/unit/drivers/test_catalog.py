@@ -1,13 +1,16 @@
 """Roles and kinds: everything that lists devices agrees with them, and what does not fit is refused by name."""
 
+import ast
 import dataclasses
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_type_hints
 
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_drivers.catalog import DEVICES, LIDAR, DeviceKind, Duty, RoleSpec, start_order
+from monstertruck_drivers.catalog import DEVICES, LIDAR, RESERVED, DeviceKind, Duty, RoleSpec, start_order
 from monstertruck_drivers.config import Device, Devices, Monitors
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
@@ -119,6 +122,30 @@ def kind_with(**changes: object) -> DeviceKind:
     role = dataclasses.replace(LIDAR, name="sonar", writes={"out": topics.CAMERA})
     roles = changes["roles"] if "roles" in changes else (dataclasses.replace(role, **changes),)
     return dataclasses.replace(DEVICES["hokuyo_urg"], roles=roles)
+
+
+def test_the_names_of_all_services_are_reserved():
+    root = Path(__file__).resolve().parents[3]
+    names = set()
+    for folder in ("schemas", "planners", "drivers", "monstertruckd"):
+        for file in (root / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.ClassDef) and {"run", "__aenter__"} & {
+                    getattr(line, "name", "") for line in node.body
+                }:
+                    names |= set(service_name(node, file))
+    assert {"gate", "usb", "tracker", "slam", "recorder"} <= names
+    assert names <= RESERVED
+
+
+def service_name(node: ast.ClassDef, file: Path) -> Iterator[str]:
+    """The name a class gives its service, written there or in a constant of the module."""
+    for line in node.body:
+        if isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == "name":
+            if isinstance(line.value, ast.Constant):
+                yield line.value.value
+            else:
+                yield re.findall(rf'^{ast.unparse(line.value)}\b.*= "(\w+)"', file.read_text(), re.MULTILINE)[0]
 
 
 @pytest.mark.parametrize(

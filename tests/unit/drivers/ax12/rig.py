@@ -126,3 +126,13 @@ async def value(host: Host, unit: int, register: p.Register) -> int:
 
 async def present(host: Host, unit: int = 1) -> Present:
     return Present.decode((await host.status(p.read(unit, p.PRESENT_POSITION, p.PRESENT_SIZE))).params)
+
+
+def instruction(unit: int, code: p.Instruction, data: bytes = b"") -> bytes:
+    """A packet of the host that the driver has no use for."""
+    return Packet(unit, code, data).encode()
+
+
+def reg_write(unit: int, start: p.Register, data: bytes) -> bytes:
+    """As ``write``, but carried out at the next ``ACTION``."""
+    return instruction(unit, p.Instruction.REG_WRITE, bytes((start.address,)) + data)

@@ -7,7 +7,7 @@ from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.ax12.protocol import Alarm, Packet
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
-from tests.unit.drivers.ax12.rig import Host, on_wire, value, write
+from tests.unit.drivers.ax12.rig import Host, instruction, on_wire, reg_write, value, write
 
 
 def test_documented_exchange():
@@ -64,7 +64,9 @@ def test_an_echo_comes_before_the_answer():
     async def test(bus: Ax12Bus, host: Host, _clock) -> None:
         request = p.ping(1)
         assert await host.raw(request) == request + Packet(1, 0).encode()
-        assert await host.raw(p.action()) == p.action()
+        assert await host.raw(instruction(p.BROADCAST, p.Instruction.ACTION)) == instruction(
+            p.BROADCAST, p.Instruction.ACTION
+        )
         bus.inject("echo", "off")
         assert await host.raw(request) == Packet(1, 0).encode()
 
@@ -78,7 +80,7 @@ def test_status_level_decides_what_is_answered(level: int):
         assert len(await host.ask(p.ping(1))) == 1
         assert len(await host.ask(p.read(1, p.ID, 1))) == (level >= 1)
         assert len(await host.ask(write(1, p.LED, 1))) == (level >= 2)
-        assert len(await host.ask(p.reset(1))) == (level >= 2)
+        assert len(await host.ask(instruction(1, p.Instruction.RESET))) == (level >= 2)
 
     on_wire(test, ids=(1,))
 
@@ -125,10 +127,10 @@ def test_half_a_packet_is_given_up_after_a_pause():
         (p.write(1, p.PUNCH, b"\x00\x00\x00"), Alarm.RANGE),
         (p.read(1, p.PUNCH, 3), Alarm.RANGE),
         (write(1, p.GOAL_POSITION, 300), Alarm.ANGLE),
-        (p.reg_write(1, p.GOAL_POSITION, p.GOAL_POSITION.encode(300)), Alarm.ANGLE),
+        (reg_write(1, p.GOAL_POSITION, p.GOAL_POSITION.encode(300)), Alarm.ANGLE),
         (Packet(1, p.Instruction.BULK_READ, b"\x00\x02\x01\x24").encode(), Alarm.INSTRUCTION),
         (Packet(1, 0x55).encode(), Alarm.INSTRUCTION),
-        (p.action(1), Alarm.INSTRUCTION),
+        (instruction(1, p.Instruction.ACTION), Alarm.INSTRUCTION),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_its_bit(request_: bytes, bits: Alarm):
@@ -145,10 +147,10 @@ def test_what_cannot_be_done_is_refused_by_its_bit(request_: bytes, bits: Alarm)
 def test_registered_writes_wait_for_the_action():
     async def test(bus: Ax12Bus, host: Host, _clock) -> None:
         for unit in (1, 2):
-            await host.status(p.reg_write(unit, p.GOAL_POSITION, p.GOAL_POSITION.encode(600)))
+            await host.status(reg_write(unit, p.GOAL_POSITION, p.GOAL_POSITION.encode(600)))
             assert await value(host, unit, p.REGISTERED) == 1
             assert await value(host, unit, p.GOAL_POSITION) == 0
-        assert await host.ask(p.action()) == []
+        assert await host.ask(instruction(p.BROADCAST, p.Instruction.ACTION)) == []
         assert [unit.get(p.GOAL_POSITION) for unit in bus.units] == [600, 600]
         assert await value(host, 1, p.REGISTERED) == 0
 
@@ -196,7 +198,7 @@ def test_the_12_v_rail_silences_all_units_and_nothing_else():
 
 def test_factory_reset_makes_it_number_1_and_two_of_a_number_garble():
     async def test(bus: Ax12Bus, host: Host, _clock) -> None:
-        assert (await host.status(p.reset(2))).unit == 2
+        assert (await host.status(instruction(2, p.Instruction.RESET))).unit == 2
         assert await host.ask(p.ping(2)) == []
         heard = await host.raw(p.ping(1))
         assert len(heard) == 6

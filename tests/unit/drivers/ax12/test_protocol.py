@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import LONGEST, Alarm, Packet, Parser, Present
+from tests.unit.drivers.ax12.rig import instruction, reg_write
 
 
 def bytes_of(text: str) -> bytes:
@@ -32,12 +33,12 @@ def test_published_checksums(body: str, expected: int):
             p.sync_write(p.GOAL_POSITION, {0: bytes_of("10 00 50 01"), 1: bytes_of("20 02 60 03")}),
             "FF FF FE 0E 83 1E 04 00 10 00 50 01 01 20 02 60 03 67",
         ),
-        (p.reg_write(1, p.GOAL_POSITION, bytes_of("F4 01")), "FF FF 01 05 04 1E F4 01 E2"),
-        (p.action(), "FF FF FE 02 05 FA"),
+        (reg_write(1, p.GOAL_POSITION, bytes_of("F4 01")), "FF FF 01 05 04 1E F4 01 E2"),
+        (instruction(p.BROADCAST, p.Instruction.ACTION), "FF FF FE 02 05 FA"),
         (p.write(p.BROADCAST, p.ID, b"\x01"), "FF FF FE 04 03 03 01 F6"),
         (p.write(1, p.TORQUE_LIMIT, p.TORQUE_LIMIT.encode(1023)), "FF FF 01 05 03 22 FF 03 D2"),
         (p.write(1, p.TORQUE_ENABLE, b"\x01"), "FF FF 01 04 03 18 01 DE"),
-        (p.reset(1), "FF FF 01 02 06 F6"),
+        (instruction(1, p.Instruction.RESET), "FF FF 01 02 06 F6"),
         (Packet(1, 0).encode(), "FF FF 01 02 00 FC"),
         (Packet(1, 0, b"\x20").encode(), "FF FF 01 03 00 20 DB"),
         (Packet(1, Alarm.OVERLOAD | Alarm.OVERHEAT).encode(), "FF FF 01 02 24 D8"),

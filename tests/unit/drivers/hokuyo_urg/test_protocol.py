@@ -10,7 +10,6 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     Reply,
     ScipParser,
     StatusMeaning,
-    baud_command,
     build_reply,
     classify,
     decode,
@@ -23,7 +22,6 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     request,
     scan_command,
     scip1_scan_command,
-    single_command,
     split_ranges,
     sum_matches,
     unwrap_lines,
@@ -106,9 +104,7 @@ def test_requests():
     assert request("VV") == b"VV\n"
     assert request(scan_command("MD", 384, 388, 1, 0, 2)) == b"MD0384038801002\n"
     assert request(scan_command("MS", 44, 725, 3, 1), "truck") == b"MS0044072503100;truck\n"
-    assert single_command("GD", 44, 725, 1) == "GD0044072501"
     assert scip1_scan_command(0, 768) == "G00076801"
-    assert baud_command(19200) == "SS019200"
 
 
 @pytest.mark.parametrize("make", [lambda: request("VV", "x" * 17), lambda: request("V\nV"), lambda: request("")])
@@ -122,8 +118,6 @@ def test_parameters_out_of_their_digits():
         scan_command("MD", 0, 768, skip=10)
     with pytest.raises(ValueError, match="end 1000"):
         scip1_scan_command(0, 1000)
-    with pytest.raises(ValueError, match="9600"):
-        baud_command(9600)
 
 
 # Replies

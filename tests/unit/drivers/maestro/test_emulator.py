@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_drivers.cable import DeviceEnd, MemoryPort
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.emulator import MaestroEmulator, Ramp
 from monstertruck_drivers.maestro.protocol import Encoder, Error, words
@@ -286,18 +286,6 @@ def test_modem_commands_are_protocol_errors():
         assert await bench.ask(E.get_errors()) == b""
 
     on_bench(test)
-
-
-def test_the_ttl_port_is_a_plain_bridge():
-    async def main(clock: VirtualClock) -> None:
-        emulator, end = MaestroEmulator(clock), DeviceEnd("ttl")
-        async with background(emulator.run_ttl(end)):
-            end.take(E.get_errors())
-            await clock.sleep(0.01)
-        assert bytes(emulator.wire) == E.get_errors()
-        assert not emulator.received
-
-    run_virtual(main)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,8 @@ from scipy.ndimage import distance_transform_edt, label
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.built_in import BUILT_IN, lap
+from monstertruck_sim.world.built_in import BUILT_IN, lap, make_worlds
 from monstertruck_sim.world.config import LidarConfig, ServoModelConfig, SimTruckConfig, WorldConfig
-from monstertruck_sim.world.make_worlds import make_worlds
 from monstertruck_sim.world.obstacles import Box, Disc, penetration
 from monstertruck_sim.world.terrain import Profile, load_profile
 from monstertruck_sim.world.world import World

@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 from monstertruckd.config.load import load_truck
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
-from monstertruckd.tools.demo.wall import free_endpoint
+from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
 from monstertruckd.tools.logs.replay import replay_log
 from monstertruckd.tools.logs.report import report

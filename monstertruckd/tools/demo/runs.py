@@ -1,7 +1,11 @@
-"""The demo on the wall clock: emulators behind ptys in one process, the daemon in another, the operator in this one."""
+"""A lap of the demo: in one process on the virtual clock, reproducible, or over ptys on the wall clock.
+
+On the wall clock the emulators are in one process, the daemon is in another, and the operator in this one.
+"""
 
 import asyncio
 import contextlib
+import gc
 import os
 import signal
 import socket
@@ -16,18 +20,57 @@ from rich.console import Console
 from rich.live import Live
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.yaml_files import yaml_text
-from monstertruckd.config.load import load_tree
+from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.demo.summary import Summary, log_figures
-from monstertruckd.tools.simulation.operator import drive_lap
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import PERIOD, Follower
 
 PATIENCE = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
+
+
+def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
+    """Drive a lap on the virtual clock.
+
+    Raises:
+        NoAnswerError: the lap was not finished.
+    """
+    overlay = write_overlay(config_file, folder, "tcp/127.0.0.1:0", seed)
+    config, tree = load_config(overlay, SimulatedTruckConfig)
+    wall = WallClock()
+
+    async def main(clock: VirtualClock) -> tuple[VirtualRig, Lap, float]:
+        rig = VirtualRig(config, clock, tree)
+        begin_wall, begin = wall.now(), clock.now()
+        gc.freeze()  # as the daemon does at its start
+        async with rig.running():
+            lap = await drive_lap(LocalOperator(rig.daemon, clock), clock)
+            await clock.sleep(1.0)
+            speed = (clock.now() - begin) / (wall.now() - begin_wall)
+        return rig, lap, speed
+
+    try:
+        rig, lap, speed = run_virtual(main, start=SECOND)
+    finally:
+        gc.unfreeze()
+    late = rig.daemon.gate.lateness()
+    return Summary(
+        lap,
+        rig.truth.array(),
+        late.p99,
+        late.max,
+        *log_figures(folder),
+        digest=rig.daemon.digest.hexdigest(),
+        speedup=speed,
+        closed=config.path is not None and config.path.closed,
+    )
 
 
 async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:
