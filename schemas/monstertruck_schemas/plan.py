@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from monstertruck_schemas.base import Float64Array, Message, Pose2D
+from monstertruck_schemas.base import Float64Array, Message, Pose2D, Schema
 from monstertruck_schemas.reasons import Reason
 
 Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
@@ -37,6 +37,21 @@ class Path(Message):
     name: str = ""
 
 
+class AxleResponse(Schema):
+    """How the axles follow requests: what a tracker assumes, and what the truck's turns say."""
+
+    dead_time: Annotated[float, Field(ge=0)]
+    """Assumed, from a request to the first movement of the wheels, s."""
+    lag: Annotated[float, Field(ge=0)]
+    """Assumed, time constant with which the axles then turn, s."""
+    delay: Annotated[float, Field(ge=0)]
+    """Estimated, dead time and lag together, s."""
+    deviation: Annotated[float, Field(ge=0)]
+    """Standard deviation of that, s."""
+    samples: Annotated[int, Field(ge=0)]
+    """Measured turns that the estimate rests on."""
+
+
 class TrackerState(Message):
     """How well the tracker follows its path."""
 
@@ -51,6 +66,7 @@ class TrackerState(Message):
     """Metres of the whole path."""
     outcome: Reason
     """DRIVING, GOAL_REACHED, PATH_LOST ..."""
+    axles: AxleResponse | None = None
 
 
 class GoalPhase(StrEnum):

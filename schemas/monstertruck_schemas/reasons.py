@@ -91,6 +91,8 @@ class Reason(StrEnum):
     MESSAGES_DROPPED = "messages_dropped", 83, "a bounded queue overflowed"
     PATH_LOST = "path_lost", 84, "truck is too far from its path"
     CUSP_MISSED = "cusp_missed", 85, "the truck came to rest too far from where its path changes direction"
+    RESPONSE_DIFFERS = "response_differs", 86, "the axles answer later or sooner than configured"
+    RESPONSE_AGREES = "response_agrees", 0, "the axles answer as configured again"
 
     # Localisation and mapping
     POSE_LOST = "pose_lost", 90, "the scans do not fit the map: the pose is odometry alone"

@@ -148,10 +148,13 @@ class Fuzzy(PathTracker[FuzzyConfig]):
     def __init__(self, config: FuzzyConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
         self._published = config.rules == "published"
-        if not self._published:
-            self.prediction = config.dead_time + config.lag
         self._rules = Rules(config.near, config.lateral_tolerance, self._published)
         self._front = self._sideways = 0.0
+
+    @property
+    def prediction(self) -> float:
+        """See the base class."""
+        return super().prediction if self._published else self.response.total
 
     def reset(self) -> None:
         """See ``Tracker``."""

@@ -54,7 +54,7 @@ class Lqr(PathTracker[LqrConfig]):
     def steer(self, state: TrackingState) -> Angles:
         """Axle angles for the coming period."""
         basis = BASES[state.steering]
-        gains = self._gains.at(state.steering, float(state.speeds(self._soon).mean()))
+        gains = self._gains.at(state.steering, float(state.speeds(self._soon).mean()), self.response.lag)
         onto = np.linalg.pinv(basis)
         axles = onto @ np.tan(state.angles)
         asked = onto @ np.tan(self.axles.requested)
@@ -79,10 +79,10 @@ class Lqr(PathTracker[LqrConfig]):
 
 
 class GainTable:
-    """Gains by way of steering and speed, each computed once.
+    """Gains by way of steering, speed and the axles' lag, each computed once.
 
     Args:
-        config: scales and lag.
+        config: scales.
         geometry: the truck's.
         periods: of preview.
     """
@@ -91,19 +91,19 @@ class GainTable:
         self._config = config
         self._geometry = geometry
         self._periods = periods
-        self._known: dict[tuple[Steering, bool, int], Gains] = {}
+        self._known: dict[tuple[Steering, bool, int, float], Gains] = {}
 
-    def at(self, steering: Steering, speed: float) -> Gains:
-        """Gains for a speed, m/s, not 0."""
-        key = (steering, speed > 0, round(math.log(abs(speed)) / SPEED_STEP))
+    def at(self, steering: Steering, speed: float, lag: float) -> Gains:
+        """Gains for a speed, m/s, not 0, and a lag, s."""
+        key = (steering, speed > 0, round(math.log(abs(speed)) / SPEED_STEP), lag)
         if key not in self._known:
             size = math.exp(key[2] * SPEED_STEP)
-            self._known[key] = self._design(steering, math.copysign(size, speed))
+            self._known[key] = self._design(steering, math.copysign(size, speed), lag)
         return self._known[key]
 
-    def _design(self, steering: Steering, speed: float) -> Gains:
+    def _design(self, steering: Steering, speed: float, lag: float) -> Gains:
         config, period = self._config, 1.0 / self._config.rate
-        model = discretise(self._geometry, steering, speed, config.lag, period)
+        model = discretise(self._geometry, steering, speed, lag, period)
         n, m = model.b.shape
         a = np.block([[model.a, model.b], [np.zeros((m, n)), np.eye(m)]])
         b = np.vstack((model.b, np.eye(m)))

@@ -22,6 +22,7 @@ from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.error_model import BASES, LEAST_LAG
 from monstertruck_planners.track.lqr import GainTable
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
+from monstertruck_planners.track.response import Response
 from monstertruck_planners.track.segments import ReferenceStates
 from monstertruck_schemas.plan import Steering
 
@@ -79,6 +80,11 @@ class Mpc(PathTracker[MpcConfig]):
         self._plan = None
         self._solvers.clear()
 
+    def respond(self, response: Response) -> None:
+        """See the base class."""
+        super().respond(response)
+        self._lag, self._fading = self._responses()
+
     def steer(self, state: TrackingState) -> Angles:
         """Axle angles for the coming period."""
         modes = tuple(state.reference.steerings(state.distances(self._times)))
@@ -115,7 +121,7 @@ class Mpc(PathTracker[MpcConfig]):
         """Axle angle in the middle of each fine step, by the requests (f, k) and by the present angle (f,)."""
         middle = self._middles
         begin = np.arange(self._periods, dtype=np.float64) * self.period
-        lag = max(self.config.lag, LEAST_LAG)
+        lag = max(self.response.lag, LEAST_LAG)
         risen = [1.0 - np.exp(-np.maximum(middle[:, None] - b, 0.0) / lag) for b in (begin, begin + self.period)]
         return risen[0] - risen[1], np.asarray(np.exp(-middle / lag))
 
@@ -166,7 +172,7 @@ class Mpc(PathTracker[MpcConfig]):
         """What remains to be paid after the last period with the axles where they are best; None for crab."""
         if mode == "crab":
             return None
-        cost = self._gains.at(mode, float(state.speeds(self._times[-1:])[0])).cost
+        cost = self._gains.at(mode, float(state.speeds(self._times[-1:])[0]), self.response.lag).cost
         least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
         rows = [self._fine - 1, 2 * self._fine - 1]
         return Terminal(rollout.errors[rows], rollout.by_plan[rows], least)

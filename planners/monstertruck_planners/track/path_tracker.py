@@ -1,5 +1,8 @@
 """What all trackers have in common: progress, cusps, speed, prediction over the dead time, limits.
 
+Dead time and lag are the configured ones until the truck's turns contradict them, and estimated where none are
+configured (``response``).
+
 A segment ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
 the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters. Each
 end is judged by the pose at rest: at a cusp by the clearance there, at the end of the path by the tolerances.
@@ -17,6 +20,7 @@ from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.response import Response, ResponseEstimator, choose, rounded
 from monstertruck_planners.track.segments import (
     Progress,
     Projection,
@@ -34,7 +38,7 @@ Pose = tuple[float, float, float]
 LONGEST: Final = 0.05
 """Of the steps the future is computed in, s."""
 FORGET: Final = 1.0
-"""After a pause of this length nothing is known of the axles, s."""
+"""After a pause of this length nothing is known of the axles, s; requests older than this no longer act."""
 
 
 class AxleModel:
@@ -58,6 +62,8 @@ class AxleModel:
         self.requested: Angles = (0.0, 0.0)
         """By the newest request."""
         self._due: deque[tuple[float, Angles]] = deque()
+        self._requests: deque[tuple[float, Angles]] = deque()
+        """Of the last second."""
         self._target: Angles = (0.0, 0.0)
         self._t: float | None = None
 
@@ -65,6 +71,24 @@ class AxleModel:
         """Note a request made at ``t``."""
         self.requested = angles
         self._due.append((t + self.dead_time, angles))
+        self._requests.append((t, angles))
+        while self._requests[0][0] < t - FORGET:
+            self._requests.popleft()
+
+    def respond(self, response: Response) -> None:
+        """Take another dead time and lag, for the requests of the last second as well."""
+        self.dead_time, self.lag = response
+        if self._t is None or not self._requests:
+            return
+        now, requests = self._t, list(self._requests)
+        self.reset()
+        first = requests[0]
+        self.angles = self._target = self.requested = first[1]
+        self._t = first[0]
+        for t, angles in requests:
+            self.advance(t)
+            self.request(t, angles)
+        self.advance(now)
 
     def advance(self, t: float) -> None:
         """Bring the angles to the time ``t``."""
@@ -138,6 +162,11 @@ class TruckState(NamedTuple):
     """Angle between the truck's z axis and the vertical, rad."""
     roughness: float = 0.0
     """Standard deviation of the tilt over the last seconds, rad."""
+    obeyed: bool = True
+    """Whether the axles do what the tracker requests."""
+    heading: tuple[float, float] | None = None
+    """Instant (s) and yaw (rad, in any frame) of a measurement that does not depend on the requests; None: there is no
+    compass, and the pose's yaw tells how the truck turns."""
 
 
 @dataclass(slots=True)
@@ -187,14 +216,16 @@ class SpeedProfile:
         return math.sqrt(here + share * (there - here))
 
 
-def target_speed(config: TrackerConfig, truck: TruckState, segment: Segment, profile: SpeedProfile, s: float) -> float:
-    """Speed along the segment, m/s, at ``s`` metres; its sign is the segment's direction."""
+def target_speed(
+    config: TrackerConfig, truck: TruckState, segment: Segment, profile: SpeedProfile, s: float, dead_time: float
+) -> float:
+    """Speed along the segment, m/s, at ``s`` metres and acting after ``dead_time`` s; its sign is the direction."""
     if truck.speed * segment.direction < -config.min_speed:
         return 0.0  # still rolling the other way
     speed = config.speed if segment.direction > 0 else config.reverse_speed
     speed *= min(max(truck.clearance, 0.0) / config.slow_clearance, 1.0)
     speed *= speed_share(truck.tilt, config.slow_tilt) * speed_share(truck.roughness, config.slow_roughness)
-    left = segment.length - s - abs(truck.speed) * config.dead_time
+    left = segment.length - s - abs(truck.speed) * dead_time
     speed = min(speed, math.sqrt(2 * config.deceleration * max(left, 0.0)), profile.at(s))
     return segment.direction * max(speed, config.min_speed)
 
@@ -267,10 +298,15 @@ class PathTracker(ABC, Generic[C]):
     def __init__(self, config: C, geometry: FourWheelSteering) -> None:
         self.config = config
         self.geometry = geometry
-        self.axles = AxleModel(config.dead_time, config.lag, config.steering_rate)
+        self.configured: Response | None = None
+        """Dead time and lag that the configuration states."""
+        if config.dead_time is not None or config.lag is not None:
+            self.configured = Response(config.dead_time or 0.0, config.lag or 0.0)
+        self.estimator = ResponseEstimator(geometry, config.steering_rate)
+        self.response = self.configured or rounded(self.estimator.estimate)
+        """Dead time and lag in use."""
+        self.axles = AxleModel(*self.response, config.steering_rate)
         self.period = 1.0 / config.rate
-        self.prediction = config.dead_time
-        """Seconds ahead for which ``steer`` is asked."""
         self._stop = min(config.min_speed**2 / (2 * config.deceleration), config.goal_tolerance)
         """Metres before the end at which the truck, then at its slowest, stops."""
         self._prepared: dict[int, tuple[Segment, Reference, SpeedProfile]] = {}
@@ -278,7 +314,23 @@ class PathTracker(ABC, Generic[C]):
     def reset(self) -> None:
         """Forget the requests: they were not obeyed."""
         self.axles.reset()
+        self.estimator.forget_requests()
         self._prepared.clear()
+
+    @property
+    def prediction(self) -> float:
+        """Seconds ahead for which ``steer`` is asked."""
+        return self.response.dead_time
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the truck answers otherwise than configured, so that the estimate is used."""
+        return self.configured is not None and self.response != self.configured
+
+    def respond(self, response: Response) -> None:
+        """Use another dead time and lag from here on."""
+        self.response = response
+        self.axles.respond(response)
 
     @abstractmethod
     def steer(self, state: TrackingState) -> Angles:
@@ -306,6 +358,7 @@ class PathTracker(ABC, Generic[C]):
         if not all(map(math.isfinite, (*truck.pose, truck.speed))):
             return Command(0.0, *self.axles.requested, progress, 0.0, 0.0, Reason.NOT_FINITE)
         config = self.config
+        self._observe(truck, t)
         segment = path.segments[progress.segment]
         nearest = self._project(truck, segment, progress.s)
         ended = self._ended(segment, nearest)
@@ -329,6 +382,7 @@ class PathTracker(ABC, Generic[C]):
         if outcome is Reason.DRIVING and not ended and not self._turning_at_rest(truck, angles):
             speed = self.speed(state)
         self.axles.request(t, angles)
+        self.estimator.request(t, angles)
         dx, dy = truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]
         return Command(
             speed=speed,
@@ -381,6 +435,18 @@ class PathTracker(ABC, Generic[C]):
         front, rear = self.geometry.limit_keeping_curvature(front, rear, ahead, behind)
         return float(front), float(rear)
 
+    def _observe(self, truck: TruckState, t: float) -> None:
+        """Learn from the truck's turn how the axles answer."""
+        if not truck.obeyed:
+            self.estimator.forget_requests()
+            return
+        measured = truck.heading is not None
+        at, yaw = truck.heading or (t, truck.pose[2])
+        if self.estimator.observe(at, yaw, truck.speed, measured=measured):
+            response = choose(self.response, self.configured, self.estimator.estimate)
+            if response is not self.response:
+                self.respond(response)
+
     def _prepare(self, segment: Segment) -> tuple[Reference, SpeedProfile]:
         """Reference and greatest speeds of a segment, computed once."""
         known = self._prepared.get(id(segment))
@@ -408,7 +474,7 @@ class PathTracker(ABC, Generic[C]):
             pose=pose,
             angles=angles,
             speed=speed or segment.direction * self.config.min_speed,
-            target_speed=target_speed(self.config, truck, segment, profile, s),
+            target_speed=target_speed(self.config, truck, segment, profile, s, self.response.dead_time),
             acceleration=self.config.acceleration,
             segment=segment,
             reference=reference,

@@ -2,7 +2,6 @@
 
 import math
 
-from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_planners.track.segments import Projection
@@ -16,9 +15,10 @@ LEAST_SQUARE = 1e-6
 class PurePursuit(PathTracker[PurePursuitConfig]):
     """See the module; the arc begins where the truck will be when the wheels have turned."""
 
-    def __init__(self, config: PurePursuitConfig, geometry: FourWheelSteering) -> None:
-        super().__init__(config, geometry)
-        self.prediction = config.dead_time + config.lag
+    @property
+    def prediction(self) -> float:
+        """See the base class."""
+        return self.response.total
 
     def steer(self, state: TrackingState) -> Angles:
         """Axle angles of the arc through the point ahead."""

@@ -18,11 +18,11 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import Path, TrackerState
+from monstertruck_schemas.plan import AxleResponse, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.sensor import Attitude, LaserScan
-from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
 WINDOW = 2.0
@@ -58,6 +58,9 @@ class TerrainEstimator:
             return
         self._t = t
 
+
+SOURCE: Final = "tracker"
+"""Of the drive requests."""
 
 LOOKS: Final = 8
 """Poses ahead whose clearance counts."""
@@ -122,6 +125,7 @@ class TrackOutput:
     """Metres of the path driven."""
     length: float = 0.0
     """Of the whole path, m."""
+    axles: AxleResponse | None = None
     events: tuple[StepEvent, ...] = ()
 
 
@@ -158,6 +162,8 @@ class TrackingStep:
         self._reported = Reason.DRIVING
         """Outcome of the newest event since the path came or the truck was armed."""
         self._active = False
+        self._contradicted = False
+        """The truck answered otherwise than configured at the step before."""
         self._events: list[StepEvent] = []
 
     def step(self, now: int, newest: Newest) -> TrackOutput:
@@ -188,7 +194,10 @@ class TrackingStep:
     def _control(self, path: SegmentedPath, pose: Odometry, gate: GateState, newest: Newest, now: int) -> TrackOutput:
         at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
         clearance = self._clearance(newest.scan, path, pose, now)
-        state = TruckState(at, pose.twist.vx, clearance, *self._terrain_at(newest.attitude, now))
+        tilt, roughness = self._terrain_at(newest.attitude, now)
+        obeyed = gate.mode is GateMode.DRIVING and gate.holder == SOURCE
+        heading = _heading(newest.attitude, now)
+        state = TruckState(at, pose.twist.vx, clearance, tilt, roughness, obeyed, heading)
         try:
             command = self._path_tracker.control(state, path, self._progress, now / SECOND)
         except KinematicsError as error:
@@ -203,9 +212,31 @@ class TrackingStep:
             self._reported = command.outcome
             severity = Severity.INFO if command.outcome in (Reason.DRIVING, Reason.GOAL_REACHED) else Severity.WARNING
             self._report(command.outcome, severity, path=path.name, cross_track=command.cross_track)
+        axles = self._axles()
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
         along = path.along(command.progress)
-        return TrackOutput(command, drive, path.frame, path.name, along, path.length, self._drain())
+        return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
+
+    def _axles(self) -> AxleResponse:
+        """How the axles answer; reports where that differs from the configuration."""
+        tracker = self._path_tracker
+        estimate, configured = tracker.estimator.estimate, tracker.configured
+        axles = AxleResponse(
+            dead_time=tracker.response.dead_time,
+            lag=tracker.response.lag,
+            delay=estimate.response.total,
+            deviation=estimate.deviation,
+            samples=estimate.samples,
+        )
+        if configured is not None and tracker.contradicted is not self._contradicted:
+            self._contradicted = tracker.contradicted
+            reason, severity = Reason.RESPONSE_AGREES, Severity.INFO
+            if self._contradicted:
+                reason, severity = Reason.RESPONSE_DIFFERS, Severity.WARNING
+            values = axles.model_dump()
+            text = f"dead time and lag are {axles.delay:.3f} s together, configured are {configured.total:.3f} s"
+            self._report(reason, severity, text, configured=configured.total, **values)
+        return axles
 
     def _choose_path(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
         """Take a new path, or start the present one over: until armed it may still begin anywhere; whether it did."""
@@ -276,6 +307,13 @@ class TrackingStep:
         return events
 
 
+def _heading(attitude: Attitude | None, now: int) -> tuple[float, float] | None:
+    """When (s) and how (rad, counter-clockwise) the compass saw the truck headed."""
+    if attitude is None or attitude.heading_disturbed or now - attitude.received > COMPASS.fresh_for() * SECOND:
+        return None
+    return attitude.stamp / SECOND, -attitude.heading
+
+
 @dataclass(frozen=True, slots=True)
 class TrackInput:
     """One control step at ``now``, ns, with the messages that are newer than at the step before, by input."""
@@ -324,7 +362,7 @@ class TrackerService:
         InputError: the tracker cannot be built.
     """
 
-    name = "tracker"
+    name = SOURCE
 
     def __init__(
         self,
@@ -416,5 +454,6 @@ class TrackerService:
                     along=output.along,
                     length=output.length,
                     outcome=command.outcome,
+                    axles=output.axles,
                 )
             )

@@ -7,7 +7,6 @@ its own place. A leading axle that cannot steer is returned by the truck's headi
 
 import math
 
-from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import StanleyConfig
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 
@@ -15,9 +14,10 @@ from monstertruck_planners.track.path_tracker import Angles, PathTracker, Tracki
 class Stanley(PathTracker[StanleyConfig]):
     """See the module; errors are those of where the truck will be when the wheels have turned."""
 
-    def __init__(self, config: StanleyConfig, geometry: FourWheelSteering) -> None:
-        super().__init__(config, geometry)
-        self.prediction = config.dead_time + config.lag
+    @property
+    def prediction(self) -> float:
+        """See the base class."""
+        return self.response.total
 
     def steer(self, state: TrackingState) -> Angles:
         """Axle angles."""

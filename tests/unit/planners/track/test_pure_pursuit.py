@@ -159,7 +159,7 @@ def test_contradictory_configs_are_refused(bad):
 def test_crabbing_keeps_the_heading(direction):
     x = np.arange(0.0, 2.0, 0.05)
     route = np.column_stack((direction * x, 0.3 * np.sin(1.2 * x)))
-    truck = Follower(path(route, [direction] * len(route)), steering="crab")
+    truck = Follower(path(route, [direction] * len(route)), steering="crab", dead_time=0.0)
     assert truck.run() is Reason.GOAL_REACHED
     assert truck.cross_track().max() < 0.05
     assert truck.pose[2] == 0.0

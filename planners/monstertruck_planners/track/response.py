@@ -1,0 +1,243 @@
+"""How the axles answer requests, estimated while driving: dead time and lag from the turns that requests bring about.
+
+Candidates are all pairs of a dead time and a lag. For each the turn between two poses is predicted from the requests
+and the speed; measured turns are regressed on it with a gain (the linkage may turn less than it should) and a trim (the
+axles may be off centre), both near 1 and 0 beforehand. What remains unexplained gives every candidate its probability.
+Turns about which the candidates agree say nothing: they are left out, and the estimate does not fade on a straight.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.truck import FourWheelSteering
+
+CELL: Final = 0.01
+"""Spacing of the history and of the candidates' dead times, s."""
+DEAD_TIMES: Final = 31
+"""Candidates: 0 to 0.3 s."""
+LAGS: Final = np.array((0.0, 0.05, 0.1, 0.15, 0.2))
+"""Candidates, s."""
+KEPT: Final = 100
+"""Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
+EARLY: Final = 1e-6
+"""Cells by which rounding may make an instant early."""
+PAUSE: Final = 0.5
+"""Poses further apart in time than this are not compared, s."""
+EXPECTED: Final = (0.05, 0.08)
+"""Mean and standard deviation of dead time and lag together of a truck that nobody has measured, s."""
+GAIN: Final = 0.15
+"""Standard deviation of the share by which the truck may turn more or less than requested."""
+TRIM: Final = 0.1
+"""Standard deviation of the curvature that is there without being requested, 1/m."""
+NOISE: Final = 0.003
+"""Standard deviation of a measured turn before any was compared, rad."""
+BELIEVED: Final = 5.0
+"""Turns that this is worth."""
+CORRELATED: Final = 3.0
+"""Turns that say as much as one independent turn: what the model does not know lasts longer than a step."""
+TELLING: Final = 0.001
+"""Turns whose predictions differ by less than this say nothing, rad."""
+MEMORY: Final = 150.0
+"""Telling turns after which the older ones count for a third."""
+
+
+class Response(NamedTuple):
+    """How the axles follow requests."""
+
+    dead_time: float
+    """From a request to the first movement of the wheels, s."""
+    lag: float
+    """Time constant with which the axles then turn, s."""
+
+    @property
+    def total(self) -> float:
+        """Delay of slow requests, s."""
+        return self.dead_time + self.lag
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseEstimate:
+    """Dead time and lag, each the mean over the candidates."""
+
+    response: Response
+    deviation: float
+    """Standard deviation of their sum, s."""
+    shape_deviation: float
+    """Standard deviation of the dead time alone, s: how the sum is divided shows later."""
+    samples: int
+    """Telling turns so far."""
+
+
+class ResponseEstimator:
+    """See the module.
+
+    Args:
+        geometry: the truck's.
+        rate: greatest turning rate of the axles, rad/s.
+    """
+
+    def __init__(self, geometry: FourWheelSteering, rate: float) -> None:
+        self._geometry = geometry
+        self._rate = rate
+        dead_times = CELL * np.arange(DEAD_TIMES)
+        self._dead_times, self._lags = np.broadcast_arrays(dead_times, LAGS[:, None])
+        self._totals = self._dead_times + self._lags
+        self._prior = 0.5 * ((self._totals - EXPECTED[0]) / EXPECTED[1]) ** 2
+        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
+        shape = self._totals.shape
+        self._xx: Array = np.zeros(shape)
+        self._xy: Array = np.zeros(shape)
+        self._xd: Array = np.zeros(shape)
+        self._yy = self._yd = self._dd = self._count = 0.0
+        self._samples = 0
+        self._variance = NOISE**2
+        self.estimate = self._judged()
+        self.forget_requests()
+        self._end = DEAD_TIMES + 1  # a truck begins with its wheels straight
+
+    def forget_requests(self) -> None:
+        """Requests were not obeyed, so the axles are somewhere; what was learnt stays."""
+        self._request = (0.0, 0.0)
+        self._bend = 0.0
+        """Turn per metre that is requested, rad/m."""
+        self._most = math.inf
+        """By which it can change in one cell, rad/m."""
+        self._curvatures = [0.0] * len(LAGS)
+        self._turns = [0.0] * len(LAGS)
+        self._history = np.zeros((len(LAGS), 4 * KEPT))
+        """Turn per metre, summed up over time, at the end of each cell, rad s/m."""
+        self._end = 1
+        """Cells written."""
+        self._begin = math.nan
+        """Time of the first cell, s."""
+        self._seen: tuple[float, float, float, bool] | None = None
+        """Time (s), yaw (rad), speed (m/s) and kind of the last yaw."""
+
+    def request(self, t: float, angles: tuple[float, float]) -> None:
+        """Note axle angles, rad, requested at ``t``."""
+        if math.isnan(self._begin):
+            self._begin = t - (self._end - 1) * CELL
+        self._fill(t)
+        change = max(abs(new - old) for new, old in zip(angles, self._request, strict=True))
+        bend = self._geometry.body_twist(1.0, *angles)[2]
+        if change > 0.0:
+            self._most = self._rate * CELL * abs(bend - self._bend) / change
+        self._request, self._bend = angles, bend
+
+    def observe(self, t: float, yaw: float, speed: float, *, measured: bool = False) -> bool:
+        """Compare the turn since the last pose with the requests; whether that said anything.
+
+        Args:
+            t: s.
+            yaw: rad.
+            speed: forward, m/s.
+            measured: the yaw is a sensor's; turns are taken between yaws of one kind only.
+        """
+        before, self._seen = self._seen, (t, yaw, speed, measured)
+        if before is None or before[3] is not measured or not 0.0 < t - before[0] <= PAUSE or math.isnan(self._begin):
+            return False
+        self._fill(t)
+        first, last = self._at(before[0]), self._at(t)
+        if first is None or last is None:
+            return False
+        x = np.asarray(0.5 * (before[2] + speed) * (last - first))
+        if float(x.max() - x.min()) < TELLING:
+            return False
+        self._learn(x, wrap_angle(yaw - before[1]), 0.5 * (before[2] + speed) * (t - before[0]))
+        self.estimate = self._judged()
+        return True
+
+    def _fill(self, t: float) -> None:
+        """Write the cells that end up to ``t``."""
+        count = math.floor((t - self._begin) / CELL + EARLY) + 1 - self._end
+        if count > 2 * KEPT:
+            self.forget_requests()
+            return
+        for _ in range(count):
+            if self._end == len(self._history[0]):
+                self._history[:, : 2 * KEPT] = self._history[:, 2 * KEPT :]
+                self._end -= 2 * KEPT
+                self._begin += 2 * KEPT * CELL
+            for i, keep in enumerate(self._keep):
+                change = (1.0 - keep) * (self._bend - self._curvatures[i])
+                self._curvatures[i] += min(max(change, -self._most), self._most)
+                self._turns[i] += CELL * self._curvatures[i]
+            self._history[:, self._end] = self._turns
+            self._end += 1
+
+    def _at(self, t: float) -> Array | None:
+        """The sums at ``t`` less each dead time, shape (lags, dead times); None if that is before the history."""
+        cells = (t - self._begin) / CELL + EARLY
+        i = math.floor(cells)
+        if i < DEAD_TIMES or i >= self._end:
+            return None
+        after = min(i + 1, self._end - 1)
+        low, high = (self._history[:, j - DEAD_TIMES + 1 : j + 1][:, ::-1] for j in (i, after))
+        return low + (cells - i) * (high - low)
+
+    def _learn(self, x: Array, y: float, way: float) -> None:
+        fade = 1.0 - 1.0 / MEMORY
+        self._xx = fade * self._xx + x * x
+        self._xy = fade * self._xy + x * y
+        self._xd = fade * self._xd + x * way
+        self._yy = fade * self._yy + y * y
+        self._yd = fade * self._yd + y * way
+        self._dd = fade * self._dd + way * way
+        self._count = fade * self._count + 1.0
+        self._samples += 1
+
+    def _judged(self) -> ResponseEstimate:
+        by_gain, by_trim = self._variance / GAIN**2, self._variance / TRIM**2
+        xx, xy, dd = self._xx + by_gain, self._xy + by_gain, self._dd + by_trim
+        gained = (dd * xy**2 - 2 * self._xd * xy * self._yd + xx * self._yd**2) / (xx * dd - self._xd**2)
+        left = self._yy + by_gain - gained
+        least = float(left.min())
+        self._variance = (least + BELIEVED * NOISE**2) / (self._count + BELIEVED)
+        cost = (left - least) / (2 * self._variance * CORRELATED) + self._prior
+        weights = np.exp(float(cost.min()) - cost)
+        weights /= weights.sum()
+        response = Response(float((weights * self._dead_times).sum()), float((weights * self._lags).sum()))
+        spreads = (self._totals - response.total, self._dead_times - response.dead_time)
+        deviations = [math.sqrt(float((weights * spread**2).sum())) for spread in spreads]
+        return ResponseEstimate(response, deviations[0], deviations[1], self._samples)
+
+
+STEP: Final = 0.05
+"""Estimated lags are rounded to multiples of this, s: every lag needs gains of its own."""
+MOVED: Final = 0.01
+"""An estimate that differs by less than this from the one in use changes nothing, s."""
+SURE: Final = 3.0
+"""Standard deviations by which the estimate must differ from the configured response to contradict it."""
+DIFFERENT: Final = 0.03
+"""And this, s: what is not modelled looks like a delay of this size."""
+DIVIDED: Final = 0.05
+"""Likewise of the dead time alone, s."""
+
+
+def rounded(estimate: ResponseEstimate) -> Response:
+    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of ``STEP``."""
+    found = estimate.response
+    lag = STEP * round(found.lag / STEP) if estimate.shape_deviation < STEP / 2 else 0.0
+    return Response(max(found.total - lag, 0.0), lag)
+
+
+def choose(used: Response, configured: Response | None, estimate: ResponseEstimate) -> Response:
+    """The response to use next: the configured one unless the estimate contradicts it; ``used`` itself for no change.
+
+    A configured response that was contradicted counts again when the estimate comes back to it.
+    """
+    found = estimate.response
+    if configured is not None:
+        share = 1.0 if used == configured else 0.5
+        near = abs(found.total - configured.total) <= SURE * estimate.deviation + share * DIFFERENT
+        alike = abs(found.dead_time - configured.dead_time) <= SURE * estimate.shape_deviation + share * DIVIDED
+        if near and alike:
+            return configured
+    new = rounded(estimate)
+    same = used != configured and used.lag == new.lag and abs(new.total - used.total) < MOVED
+    return used if same else new
