@@ -75,6 +75,18 @@ class LocalisationStatus(StrEnum):
     """Where on the saved map this is, is being searched for; the pose means nothing."""
 
 
+class OdometryUse(StrEnum):
+    """Whether SLAM predicts the motion between scans by odometry."""
+
+    NONE = "none"
+    """There is no odometry: scans alone."""
+    USED = "used"
+    MISSING = "missing"
+    """No finite odometry at the scans for a second: scans alone."""
+    CONTRADICTED = "contradicted"
+    """The motion by the scans is another one: scans alone, until both agree again."""
+
+
 class SlamHealth(Message):
     """How well the newest scan fitted the map, and what has happened since the start."""
 
@@ -103,6 +115,7 @@ class SlamHealth(Message):
     """Scans lost because the worker was too slow."""
     offset: float | None = None
     """Seconds by which odometry runs ahead of the scans, if it clearly does."""
+    odometry: OdometryUse = OdometryUse.NONE
 
 
 class OdometryHealth(Message):

@@ -104,6 +104,8 @@ class Reason(StrEnum):
     WHEEL_GRIP = "wheel_grip", 0, "the wheels hold the ground again"
     HEADING_RETURNED = "heading_returned", 0, "the headings of the compass count again"
     POSE_FOUND = "pose_found", 0, "the scans fit the map again"
+    ODOMETRY_DROPPED = "odometry_dropped", 96, "scans contradict odometry, or it is missing: mapping uses scans alone"
+    ODOMETRY_RETURNED = "odometry_returned", 0, "odometry agrees with the scans again: mapping uses it"
     LOOP_CLOSED = "loop_closed", 0, "a place was recognised and the map corrected"
     MAP_SAVED = "map_saved", 0, "the map was saved"
 

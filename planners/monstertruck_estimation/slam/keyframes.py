@@ -97,6 +97,11 @@ class EdgeList:
         for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
             rows.set(rows.view[:count])
 
+    def loosen(self, kept: NDArray[np.bool_]) -> None:
+        """Multiply the standard deviations of the marked edges by ``LOOSENED``."""
+        self._information.view[kept] /= LOOSENED**2
+        self._spread.view[kept] *= LOOSENED**2
+
     def replace(self, edges: Edges, spread: Array, odometry: NDArray[np.bool_]) -> None:
         """Replace all edges."""
         self._ends.set(np.stack((edges.origin, edges.target), axis=1))
@@ -180,6 +185,8 @@ LINK_MAX_CORRECTION: Final = (0.15, 0.1)
 """Greatest correction of an edge between keyframes that were matched to one submap, m and rad."""
 LINK_FLOOR: Final = (0.005, 0.005, 0.002)
 """Least standard deviation of an edge between scans, m and rad."""
+LOOSENED: Final = 30.0
+"""Factor on the standard deviation of an edge of odometry that the scans contradict."""
 VIEW: Final = 0.7
 """Metres that one radian between two views counts as."""
 
@@ -212,6 +219,11 @@ class KeyframeMap:
         place, turn = deviations(covariance)
         information: Array = np.asarray(np.linalg.inv(covariance + 1e-6 * np.eye(3)), dtype=np.float64)
         self.edges.add(new - 1, new, delta, information, (place**2, turn**2), odometry=True)
+
+    def loosen_odometry(self, since: int) -> None:
+        """Loosen the edges of odometry to keyframes after ``since``, ns."""
+        after = np.array([key.stamp for key in self.frames]) > since
+        self.edges.loosen(self.edges.odometry & after[self.edges.edges().target])
 
     def add_scan_edges(self, local: Numbers) -> None:
         """Add edges from the newest keyframe to those of ``local`` that it overlaps, the nearest first."""

@@ -30,7 +30,7 @@ from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEst
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 LEVELS: Final = 7
 QUERY_POINTS: Final = 300
@@ -165,6 +165,11 @@ class LocalisationEstimator:
         """See ``Estimator``."""
         return self._motion.twist
 
+    @property
+    def odometry(self) -> OdometryUse:
+        """See ``Estimator``."""
+        return self._motion.use
+
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
         """See ``Estimator``."""
         stamp = inputs.stamp
@@ -186,13 +191,14 @@ class LocalisationEstimator:
             match, status, events = self._search(scan, guess, covariance, odom)
         if "found" in events:
             self._scan_odometry.forget()
-        moved = self._scan_odometry.take(stamp, match, match.pose, alone=odom is None)
+        alone = odom is None or self.odometry is not OdometryUse.USED
+        moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
         self._pose, self._covariance = match.pose, match.covariance
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
         correction = None if odom is None else compose(self._pose, inverse(odom))
         placed = (self._pose, self._covariance, correction)
-        return estimate(stamp, placed, match, status, events, self._offset.offset, moved)
+        return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """See ``Estimator``: a saved map never changes, but is published once."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from typing import Any, Final, Protocol
@@ -15,7 +15,7 @@ from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import GridBuilder
-from monstertruck_estimation.slam.keyframes import KeyframeMap, Trajectory
+from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
@@ -31,7 +31,7 @@ from monstertruck_estimation.slam.storage import SavedGraph, saved_graph
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 DESKEW_PERIOD: Final = (0.02, 0.5)
 """Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing)."""
@@ -121,18 +121,22 @@ class Mapper:
             return None
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
         delta, noise = self._motion.predict(dt, odom)
-        guess, covariance = _moved(self._pose, self._covariance, delta, noise)
+        match = self._matched(scan, delta, noise)
+        other = self._motion.other
+        if not fits(match) and other is not None and self._submap is not None:
+            instead = self._matched(scan, *other)
+            if fits(instead):
+                (delta, noise), match = other, instead
+        if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
+            scan = again(velocity(between(self._pose, match.pose), dt))
+            match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
-        if self._submap is None:
-            match = rejected(guess, covariance, MatchStatus.EMPTY)
-        else:
-            match = self._front.match(scan, delta, guess, covariance, self._submap)
-            if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
-                scan = again(velocity(between(self._pose, match.pose), dt))
-                match = self._front.match(scan, delta, guess, covariance, self._submap)
-        doubtful = not match.accepted or match.overlap < LOW_OVERLAP
-        self._doubts = self._doubts + 1 if doubtful else 0
+        self._doubts = 0 if fits(match) else self._doubts + 1
+        trusted = not self._motion.check.contradicted
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
+        if trusted and self._motion.check.contradicted:
+            self.map.loosen_odometry(stamp - round(self._motion.check.since * SECOND))
+            self._since_key = self._since_key[0], self._since_key[1] * LOOSENED**2
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
         events: tuple[MappingEvent, ...] = () if match.accepted or not len(self.map) else (MappingEvent.REJECTED,)
         if self._key_is_due(scan):
@@ -144,6 +148,18 @@ class Mapper:
         odom_now = self._motion.odom
         correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
         return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, scan, events)
+
+    @property
+    def odometry(self) -> OdometryUse:
+        """Whether the motion between scans is predicted by odometry."""
+        return self._motion.use
+
+    def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
+        """Match ``scan`` after a motion ``delta`` of covariance ``noise``."""
+        guess, covariance = _moved(self._pose, self._covariance, delta, noise)
+        if self._submap is None:
+            return rejected(guess, covariance, MatchStatus.EMPTY)
+        return self._front.match(scan, delta, guess, covariance, self._submap)
 
     def finish(self) -> None:
         """Search for remaining loop closures and register all keyframes jointly: seconds of work."""
@@ -197,6 +213,11 @@ class Mapper:
         self._submap = self.map.submap(self._local)
 
 
+def fits(match: ScanMatch) -> bool:
+    """Whether the scan fits the map without a doubt."""
+    return match.accepted and match.overlap >= LOW_OVERLAP
+
+
 def _evenly(dt: float, period: float) -> float:
     """``dt`` as the nearest number of whole revolutions."""
     return dt if period <= 0 else max(round(dt / period), 1) * period
@@ -221,6 +242,11 @@ class Estimator(Protocol):
     @property
     def twist(self) -> Vector:
         """Velocity of base by the last scans, m/s and rad/s."""
+        ...
+
+    @property
+    def odometry(self) -> OdometryUse:
+        """Whether the motion between scans is predicted by odometry."""
         ...
 
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
@@ -271,11 +297,17 @@ class MappingEstimator:
         """See ``Estimator``."""
         return self.mapper.twist
 
+    @property
+    def odometry(self) -> OdometryUse:
+        """See ``Estimator``."""
+        return self.mapper.odometry
+
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
         """See ``Estimator``."""
         odom = None if inputs.odom is None else np.array(inputs.odom)
-        swept = odom is None and inputs.time_increment > 0
-        again = partial(prepare_input, inputs, self.mapper.config.longest) if swept else None
+        alone = self.mapper.odometry is not OdometryUse.USED or odom is None
+        swept = alone and inputs.time_increment > 0
+        again = partial(prepare_input, replace(inputs, odom=None), self.mapper.config.longest) if swept else None
         period = inputs.time_increment * math.tau / inputs.angle_increment if swept else 0.0
         step = self.mapper.step(scan, inputs.stamp, odom, again, period)
         if step is None:
@@ -289,10 +321,10 @@ class MappingEstimator:
         self._moved |= MappingEvent.CLOSED in step.events
         if accepted:
             self.builder.add(step.scan, step.stamp, step.pose, inputs.mount)
-            if inputs.odom is not None:
+            if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
         closed = MappingEvent.CLOSED in step.events
-        moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=inputs.odom is None, corrected=closed)
+        moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=alone, corrected=closed)
         status = (
             LocalisationStatus.LOST
             if self._misfits >= LOST_AFTER
@@ -306,6 +338,7 @@ class MappingEstimator:
             tuple(map(str, step.events)),
             self._offset.offset,
             moved,
+            self.mapper.odometry,
         )
 
     def changes(self) -> tuple[list[GridPatch], bool]:
@@ -347,6 +380,7 @@ def estimate(
     events: tuple[str, ...],
     offset: float | None,
     moved: ScanIncrement | None = None,
+    odometry: OdometryUse = OdometryUse.NONE,
 ) -> SlamEstimate:
     """Plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
     pose, covariance, correction = placed
@@ -364,6 +398,7 @@ def estimate(
         events=events,
         offset=offset,
         moved=moved,
+        odometry=odometry,
     )
 
 

@@ -7,23 +7,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, rotation
+from monstertruck_estimation.se2 import between, compose, rotation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.health import OdometryUse
 
-TRUST_MEMORY: Final = 40
-"""Scans over which the robust_weights in odometry is learned."""
+NOISE_MEMORY: Final = 40
+"""Scans over which the noise of odometry is learned."""
 MAX_INNOVATION: Final = 4.0
 """Normalised innovations count as this at most."""
-TRUST_LIMITS: Final = (1.0, 3.0)
-"""Limits of the factor on the standard deviation of the odometry."""
+NOISE_LIMITS: Final = (1.0, 3.0)
+"""Limits of the factors on the standard deviations of odometry."""
 CLEAR_MATCH: Final = (0.15, 0.75)
 """Least degeneracy and overlap of a match that is compared with odometry."""
-FIT_NOISE: Final = 0.01
-"""Standard deviation of a match itself, m."""
+FIT_NOISE: Final = (0.01, 0.005)
+"""Standard deviation of a match itself, m and rad."""
+MISSING_AFTER: Final = 1.0
+"""Seconds without finite odometry after which it is missing."""
 
 
 def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
@@ -34,11 +37,94 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
     return vx, vy, wz
 
 
-class MotionPredictor:
-    """Predicts the motion between two scans, and adapts the noise of odometry to the matches.
+COMPARED: Final = 5.0
+"""Seconds over which odometry is compared with the scans."""
+SAMPLE: Final = 0.25
+"""Least length of a step of the comparison, s: the noise of single matches would add up to a way."""
+FEWEST_SAMPLES: Final = 3
+TOLERANCE: Final = 0.3
+"""Share of the way, or of the turn, by which they may differ,"""
+SLACK: Final = (0.2, 0.2)
+"""and what may come from clocks that disagree, m and rad."""
+CONTRADICTIONS: Final = 2
+"""Comparisons in a row that contradict odometry before it is dropped."""
+AGREEMENT: Final = 0.4
+"""Mean error of a step, as share of the motion, with which odometry is used again"""
+AGREED: Final = (2.0, 2.0)
+"""after as much motion, m and rad."""
 
-    Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factor
-    follows the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972).
+
+class OdometryCheck:
+    """Compares ways and turns by odometry with those by the scans, which know nothing of the wheels.
+
+    Over some seconds, and in lengths and sums: clocks that disagree shift both a little and change neither. What was
+    contradicted, ways or turns, must agree step by step over ``AGREED`` before odometry counts again: a turn of the
+    wrong sign agrees as long as the robot drives straight.
+    """
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[float, float, float, float, float]] = deque()
+        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
+        self._row = 0
+        self._wrong = np.zeros(2, bool)
+        self._agreed = np.zeros((2, 2))
+        self.since = 0.0
+        """Seconds before the newest scan from which on odometry is contradicted."""
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether odometry is not to be used."""
+        return bool(self._wrong.any())
+
+    def add(self, dt: float, odom: Array, moved: Array) -> None:
+        """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans."""
+        self._seconds += dt
+        self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
+        if self._seconds < SAMPLE:
+            return
+        way, turn = math.hypot(*self._odom[:2]), float(self._odom[2])
+        way_by_scans, turn_by_scans = math.hypot(*self._scans[:2]), float(self._scans[2])
+        self._steps.append((self._seconds, way, way_by_scans, turn, turn_by_scans))
+        while len(self._steps) > FEWEST_SAMPLES and sum(step[0] for step in self._steps) > COMPARED:
+            self._steps.popleft()
+        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
+        self._judge()
+
+    def restart(self) -> None:
+        """Forget the steps: the next motion does not follow the last one."""
+        self._steps.clear()
+        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
+        self._row = 0
+
+    def _judge(self) -> None:
+        """Compare over the last three and more steps; drop odometry, or take it back."""
+        rows = np.array(self._steps)[::-1]
+        sums, lengths = np.cumsum(rows, axis=0), np.cumsum(np.abs(rows), axis=0)
+        off = np.abs(np.stack((sums[:, 1] - sums[:, 2], sums[:, 3] - sums[:, 4]), axis=1))
+        motion = np.stack((lengths[:, 1:3].max(axis=1), lengths[:, 3:5].max(axis=1)), axis=1)
+        wrong = (off > TOLERANCE * motion + SLACK)[FEWEST_SAMPLES - 1 :].any(axis=0)
+        self._row = self._row + 1 if wrong.any() else 0
+        if self._row >= CONTRADICTIONS:
+            if not self.contradicted:
+                self.since = float(sums[-1, 0])
+            self._wrong |= wrong
+            self._agreed[wrong] = 0.0
+        if self.contradicted:
+            step = np.abs(rows[0, 1:])
+            errors = abs(step[0] - step[1]), abs(rows[0, 3] - rows[0, 4])
+            self._agreed += np.stack(((max(step[:2]), max(step[2:])), errors), axis=1)
+            enough, good = self._agreed[:, 0] >= AGREED, self._agreed[:, 1] <= AGREEMENT * self._agreed[:, 0]
+            self._agreed[enough & ~good] = 0.0
+            self._wrong &= ~(enough & good)
+            if not self._wrong.any():
+                self.restart()
+
+
+class MotionPredictor:
+    """Predicts the motion between two scans, adapts the noise of odometry to the matches, and drops wrong odometry.
+
+    Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factors
+    follow the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972), of ways and of turns.
 
     Args:
         config: initial noise.
@@ -46,15 +132,37 @@ class MotionPredictor:
 
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
-        self._square = 1.0
+        self._squares = np.ones(2)
         self._odom: Array | None = None
+        self._by_odometry: tuple[Array, Array] | None = None
+        self._by_motion = np.zeros(3), np.zeros((3, 3))
         self._delta = np.zeros(3)
         self._dt = 0.0
+        self._seen = False
+        self._missing = 0.0
+        self.check = OdometryCheck()
 
     @property
-    def factor(self) -> float:
-        """Factor on the standard deviation of the way."""
-        return min(max(math.sqrt(self._square), TRUST_LIMITS[0]), TRUST_LIMITS[1])
+    def factors(self) -> tuple[float, float]:
+        """Factors on the standard deviations of way and turn."""
+        place, turn = np.clip(np.sqrt(self._squares), *NOISE_LIMITS).tolist()
+        return place, turn
+
+    @property
+    def use(self) -> OdometryUse:
+        """Whether odometry predicts the motion."""
+        if not self._seen:
+            return OdometryUse.NONE
+        if self._missing >= MISSING_AFTER:
+            return OdometryUse.MISSING
+        return OdometryUse.CONTRADICTED if self.check.contradicted else OdometryUse.USED
+
+    @property
+    def other(self) -> tuple[Array, Array] | None:
+        """The prediction that ``predict`` did not choose, and its covariance; None without odometry."""
+        if self._by_odometry is None:
+            return None
+        return self._by_odometry if self.check.contradicted else self._by_motion
 
     @property
     def odom(self) -> Array | None:
@@ -69,39 +177,46 @@ class MotionPredictor:
     def predict(self, dt: float, odom: Array | None) -> tuple[Array, Array]:
         """Motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""
         config = self._config
-        known = odom is not None and bool(np.isfinite(odom).all())
-        delta = None
-        if known and self._odom is not None:
-            delta = between(self._odom, np.asarray(odom, dtype=float))
-            if math.hypot(delta[0], delta[1]) > config.fastest[0] * dt + config.fastest[1]:
-                delta = None
-        if delta is not None:
-            way, turned = math.hypot(delta[0], delta[1]), abs(float(delta[2]))
-            place = self.factor * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
-            by_turn, by_way = config.odometry_turn
-            turn = math.hypot(config.odometry_floor[1], math.hypot(by_turn * turned, by_way * way))
-        else:
-            delta = self._delta * (min(dt / self._dt, 3.0) if self._dt > 0 else 0.0)
-            place = config.odometry_floor[0] + config.blind_speed[0] * dt
-            turn = config.odometry_floor[1] + config.blind_speed[1] * dt
-        if known:
-            self._odom = np.array(odom, dtype=float)
-        return delta, np.diag((place**2, place**2, turn**2))
+        now = None if odom is None or not np.isfinite(odom).all() else np.array(odom, dtype=float)
+        self._seen |= now is not None
+        self._missing = self._missing + dt if now is None else 0.0
+        delta = None if now is None or self._odom is None else between(self._odom, now)
+        if delta is not None and math.hypot(delta[0], delta[1]) > config.fastest[0] * dt + config.fastest[1]:
+            delta = None
+        self._odom = now
+        self._by_odometry = None if delta is None else (delta, self._noise(delta))
+        place = config.odometry_floor[0] + config.blind_speed[0] * dt
+        turn = config.odometry_floor[1] + config.blind_speed[1] * dt
+        motion = self._delta * (min(dt / self._dt, 3.0) if self._dt > 0 else 0.0)
+        self._by_motion = motion, np.diag((place**2, place**2, turn**2))
+        return self._by_motion if self._by_odometry is None or self.check.contradicted else self._by_odometry
+
+    def _noise(self, delta: Array) -> Array:
+        """Covariance, shape (3, 3), of the motion ``delta`` by odometry."""
+        config, (by_turn, by_way) = self._config, self._config.odometry_turn
+        way, turned = math.hypot(delta[0], delta[1]), abs(float(delta[2]))
+        place = self.factors[0] * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
+        turn = self.factors[1] * math.hypot(config.odometry_floor[1], math.hypot(by_turn * turned, by_way * way))
+        return np.diag((place**2, place**2, turn**2))
 
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
         """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""
         self._dt, self._delta = dt, moved
-        if (
-            self._odom is None
-            or not match.accepted
-            or match.degeneracy < CLEAR_MATCH[0]
-            or match.overlap < CLEAR_MATCH[1]
-        ):
+        if self._by_odometry is None or not match.accepted or match.overlap < LOW_OVERLAP:
+            self.check.restart()
+            return
+        by_odometry = self._by_odometry[0]
+        # Along a corridor the match has the way from the prediction: it says nothing of it, but it measures the turn.
+        compared = (*by_odometry[:2], moved[2]) if match.degenerate else moved
+        self.check.add(dt, by_odometry, np.array(compared))
+        clear = match.degeneracy >= CLEAR_MATCH[0] and match.overlap >= CLEAR_MATCH[1]
+        if not clear or delta is not by_odometry:
             return
         off = between(delta, moved)
-        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE**2)
-        innovation = min(place, MAX_INNOVATION**2) * self.factor**2
-        self._square += (innovation - self._square) / TRUST_MEMORY
+        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE[0] ** 2)
+        turn = off[2] ** 2 / (noise[2, 2] + FIT_NOISE[1] ** 2)
+        innovations = np.minimum((place, turn), MAX_INNOVATION**2) * np.square(self.factors)
+        self._squares += (innovations - self._squares) / NOISE_MEMORY
 
 
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))

@@ -30,7 +30,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse, SlamHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
@@ -92,6 +92,7 @@ class SlamService:
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._status: LocalisationStatus | None = None
+        self._use = OdometryUse.NONE
         self._refused: str | None = None
         self._left_out = 0
         self._offset_reported = False
@@ -296,8 +297,9 @@ class SlamService:
             return
         self._refused = None
         found = self._status is not None and self._status not in MATCHED and estimate.status in MATCHED
+        at_once = found or self._newest is None or estimate.odometry is OdometryUse.CONTRADICTED
         if estimate.map_from_odom is not None and estimate.status is not LocalisationStatus.SEARCHING:
-            self._correction.set_target(estimate.map_from_odom, at_once=found or self._newest is None)
+            self._correction.set_target(estimate.map_from_odom, at_once=at_once)
         self._newest = estimate
         if estimate.moved is not None:
             self._motions.put(scan_motion(estimate.stamp, estimate.moved, now, self._motions.next_seq()))
@@ -317,6 +319,12 @@ class SlamService:
             self._offset_reported = True
             text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"
             self._events(Reason.TIME_OFFSET, Severity.WARNING, self.name, text, offset=estimate.offset)
+        if estimate.odometry is not self._use:
+            previous, self._use = self._use, estimate.odometry
+            if estimate.odometry in {OdometryUse.CONTRADICTED, OdometryUse.MISSING}:
+                self._events(Reason.ODOMETRY_DROPPED, Severity.WARNING, self.name, str(estimate.odometry))
+            elif previous in {OdometryUse.CONTRADICTED, OdometryUse.MISSING}:
+                self._events(Reason.ODOMETRY_RETURNED, Severity.INFO, self.name, str(estimate.odometry))
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
@@ -397,4 +405,5 @@ def slam_health(
         left_out=lost[0],
         drops=lost[1],
         offset=estimate.offset,
+        odometry=estimate.odometry,
     )

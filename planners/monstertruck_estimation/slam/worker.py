@@ -3,6 +3,8 @@
 A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from monstertruck_estimation.slam import storage
@@ -14,6 +16,7 @@ from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
+from monstertruck_schemas.health import OdometryUse
 
 MIN_POINTS = 3
 """A scan with fewer points is left out."""
@@ -45,7 +48,9 @@ class SlamWorker:
         if inputs.scan is not None:
             refused = self._refusal(inputs.scan)
             if refused is None:
-                scan = prepare_input(inputs.scan, self._longest, estimator.twist)
+                wrong = estimator.odometry is OdometryUse.CONTRADICTED
+                swept = replace(inputs.scan, twist=estimator.twist) if wrong else inputs.scan
+                scan = prepare_input(swept, self._longest, estimator.twist)
                 if len(scan) < MIN_POINTS:
                     refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
                 else:

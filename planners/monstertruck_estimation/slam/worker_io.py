@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import Vector
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.elementary import Array
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from monstertruck_schemas.sensor import LaserScan
 
 UNKNOWN: Final = -1
@@ -130,6 +130,7 @@ class SlamEstimate:
     """Seconds by which odometry runs ahead of the scans; None = none found."""
     moved: ScanIncrement | None = None
     """None for the first scan, and after rejected matches."""
+    odometry: OdometryUse = OdometryUse.NONE
 
 
 @dataclass(frozen=True, slots=True)

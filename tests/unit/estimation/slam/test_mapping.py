@@ -11,6 +11,7 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_schemas.health import OdometryUse
 from tests.unit.estimation.slam.kit import (
     BEAMS,
     CORRIDOR,
@@ -220,6 +221,32 @@ def test_odometry_that_lies_once_does_no_harm(lie):
     mapper = Mapper()
     drive(mapper, ROOM, truth, odom)
     assert errors(mapper.trajectory()[1], truth).max() < 0.08
+
+
+def wrong(odom, kind):
+    """Odometry with its steps mirrored, scaled or missing from the third second on."""
+    steps = between(odom[:-1], odom[1:])
+    factor = {"mirrored": (1, 1, -1), "stuck": (0, 0, 0), "half": (0.5, 0.5, 0.5), "double": (2, 2, 2)}
+    if kind in factor:
+        steps[30:] *= factor[kind]
+    poses = np.array(list(itertools.accumulate(steps, compose, initial=odom[0])))
+    if kind == "nan":
+        poses[30:] = np.nan
+    return poses
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "stuck", "half", "double", "nan"])
+def test_wrong_odometry_is_reported_and_costs_nothing_against_scans_alone(kind):
+    truth = rounds(160, 0.9)
+    alone, mapper = Mapper(), Mapper()
+    drive(alone, ROOM, truth, None)
+    odom = wrong(drifting(truth), kind)
+    drive(mapper, ROOM, truth[:81], odom[:81])
+    assert mapper.odometry is (OdometryUse.MISSING if kind == "nan" else OdometryUse.CONTRADICTED)
+    for k in range(81, len(truth)):
+        mapper.step(scan(ROOM, truth[k]), int(k * 1e8), odom[k])
+    best = errors(alone.trajectory()[1], truth).mean()
+    assert errors(mapper.trajectory()[1], truth).mean() < max(1.2 * best, 0.02)
 
 
 def test_a_stale_odometry_does_not_spoil_the_map():

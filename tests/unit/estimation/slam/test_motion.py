@@ -3,8 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.motion import ScanOdometry
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.motion import MotionPredictor, OdometryCheck, ScanOdometry
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
+from monstertruck_schemas.health import OdometryUse
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))
 
@@ -92,3 +94,72 @@ def test_a_corridor_says_nothing_along_itself():
     sizes = np.sqrt(np.diag(np.array(moved.covariance).reshape(3, 3)))
     assert sizes[0] > 10.0
     assert sizes[1] < 0.1
+
+
+STEP = np.array((0.05, 0.0, 0.02))
+"""Motion of a tenth of a second."""
+
+
+def compared(check, wrong, count, motion=STEP):
+    """Takes ``count`` motions by the scans and what odometry makes of them."""
+    for _ in range(count):
+        check.add(0.1, motion * wrong, motion)
+    return check
+
+
+@pytest.mark.parametrize(
+    "wrong", [(1, 1, -1), (0, 0, 0), (0.5, 0.5, 0.5), (2, 2, 2)], ids=["mirrored", "stuck", "half", "double"]
+)
+def test_odometry_that_the_scans_contradict_is_dropped_within_five_seconds(wrong):
+    check = compared(OdometryCheck(), 1.0, 100)
+    assert not check.contradicted
+    assert compared(check, np.array(wrong), 50).contradicted
+    assert 0.5 < check.since <= 5.5
+
+
+def test_odometry_of_ordinary_error_is_used():
+    assert not compared(OdometryCheck(), np.array((1.15, 1.0, 0.85)), 300).contradicted
+
+
+def test_a_turn_of_the_wrong_sign_is_not_used_again_for_driving_straight():
+    check = compared(OdometryCheck(), np.array((1, 1, -1)), 60)
+    assert compared(check, 1.0, 200, np.array((0.05, 0.0, 0.0))).contradicted
+    assert not compared(check, 1.0, 200).contradicted
+
+
+def test_one_late_odometry_is_no_contradiction():
+    check = compared(OdometryCheck(), 1.0, 50)
+    for wrong in (0.0, 2.0):
+        check.add(0.3, wrong * STEP * 10, STEP * 10)
+    assert not compared(check, 1.0, 50).contradicted
+
+
+def test_a_corridor_does_not_contradict_the_way_by_odometry():
+    model = MotionPredictor(MapperConfig())
+    for k in range(100):
+        delta, noise = model.predict(0.1, np.array((0.05 * k, 0.0, 0.0)))
+        model.learn(0.1, delta, noise, np.zeros(3), match((0.0, 0.0, 0.0), degeneracy=0.01))
+    assert model.use is OdometryUse.USED
+
+
+def test_noise_of_turns_is_learned():
+    model = MotionPredictor(MapperConfig())
+    for k in range(200):
+        delta, noise = model.predict(0.1, np.array((0.05 * k, 0.0, 0.0)))
+        moved = delta + np.array((0.0, 0.0, 0.15 * (-1) ** k))
+        model.learn(0.1, delta, noise, moved, match((0.0, 0.0, 0.0)))
+    assert model.factors[0] == 1.0
+    assert model.factors[1] > 2.0
+
+
+def test_the_first_odometry_after_a_gap_is_no_motion():
+    model = MotionPredictor(MapperConfig())
+    model.predict(0.1, np.zeros(3))
+    for _ in range(30):
+        model.predict(0.1, np.full(3, np.nan))
+    assert model.use is OdometryUse.MISSING
+    delta, _ = model.predict(0.1, np.array((1.0, 0.0, 0.5)))
+    assert delta.tolist() == [0.0, 0.0, 0.0]
+    delta, _ = model.predict(0.1, np.array((1.1, 0.0, 0.5)))
+    assert np.hypot(*delta[:2]) == pytest.approx(0.1)
+    assert model.use is OdometryUse.USED
