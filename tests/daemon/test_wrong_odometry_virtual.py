@@ -1,4 +1,4 @@
-"""Mapping in the whole daemon with odometry whose turns have the wrong sign: it is reported, and the pose stays true."""
+"""Mapping in the daemon with odometry whose turns have the wrong sign: it is reported, and the pose stays true."""
 
 from dataclasses import replace
 from pathlib import Path
