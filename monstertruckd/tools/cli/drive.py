@@ -14,7 +14,7 @@ from monstertruckd.tools.cli.output import on_terminal, until_stopped
 def drive(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = ENDPOINT,
-    mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, to begin with.")] = SteeringMode.FRONT,
+    mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, or twist.")] = SteeringMode.FRONT,
     speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Speed to begin with, m/s.")] = SPEEDS[1],
     angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Full lock of an axle, degrees.")] = 22.5,
     hold: Annotated[
@@ -27,6 +27,7 @@ def drive(
     `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
     `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
     the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
+    `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.
     """
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.cli.drive_session import DriveSession

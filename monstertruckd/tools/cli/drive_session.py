@@ -183,7 +183,10 @@ class DriveSession:
         if request is None:
             return
         try:
-            await client.drive(request.speed, request.front, request.rear, lease=LEASE)
+            if request.twist is None:
+                await client.drive(request.speed, request.front, request.rear, lease=LEASE)
+            else:
+                await client.drive_twist(*request.twist, lease=LEASE)
         except TruckError as error:  # shown: the robot may come back
             self._stream.trouble = str(error)
         else:
@@ -230,7 +233,8 @@ def draw(state: ScreenState, teleop: Teleop, stream: Stream, width: int) -> Rend
 
 def _controls(state: ScreenState, teleop: Teleop, stream: Stream) -> Panel:
     table = Table.grid(padding=(0, 1))
-    table.add_row(_asked(stream), Text(f"{teleop.speed:.2f} m/s (+/-)", style="bold"), _wheels(teleop), _link(stream))
+    steering = _twist(stream) if teleop.mode is SteeringMode.TWIST else _wheels(teleop)
+    table.add_row(_asked(stream), Text(f"{teleop.speed:.2f} m/s (+/-)", style="bold"), steering, _link(stream))
     body = Table.grid()
     body.add_row(table)
     body.add_row(_modes(teleop))
@@ -249,9 +253,11 @@ def _message(state: ScreenState, stream: Stream) -> Text:
 
 def _asked(stream: Stream) -> Text:
     if stream.request is None:
-        return Text("silent   ", style="dim")
-    speed = stream.request.speed
-    return Text(f"{ARROWS[(speed > 0) - (speed < 0)]:9}", style="bold green" if speed else "cyan")
+        return Text("silent    ", style="dim")
+    speed, *others = stream.request.twist or (stream.request.speed,)
+    moving = speed or any(others)
+    text = "turn, side" if any(others) and not speed else ARROWS[(speed > 0) - (speed < 0)]
+    return Text(f"{text:10}", style="bold green" if moving else "cyan")
 
 
 def _wheels(teleop: Teleop) -> Text:
@@ -259,6 +265,11 @@ def _wheels(teleop: Teleop) -> Text:
     at = round(STEPS * (1.0 - teleop.steer / teleop.angle))
     cells[STEPS], cells[at] = "┼", "●"
     return Text(f"{''.join(cells)} {math.degrees(teleop.steer):+5.1f}°")
+
+
+def _twist(stream: Stream) -> Text:
+    vx, vy, wz = (None if stream.request is None else stream.request.twist) or (0.0, 0.0, 0.0)
+    return Text(f"ahead {vx:+.2f} left {vy:+.2f} m/s turn {math.degrees(wz):+.0f}°/s")
 
 
 def _link(stream: Stream) -> Text:
@@ -273,4 +284,6 @@ def _modes(teleop: Teleop) -> Text:
         text.append(f"{key} {mode.value}  ", style="reverse" if mode is teleop.mode else "dim")
     if teleop.mode is SteeringMode.HYBRID:
         text.append(f"z/c drift {math.degrees(teleop.drift):+.1f}°", style="bold")
+    if teleop.mode is SteeringMode.TWIST:
+        text.append("a/d turn z/c left, right", style="bold")
     return text

@@ -8,10 +8,11 @@ SPEEDS: Final = (0.05, 0.1, 0.15, 0.2, 0.3, 0.5)
 
 
 class SteeringMode(StrEnum):
-    """How one steering key moves two axles."""
+    """What the driving keys ask for: the angles of two axles, or the twist of the base."""
 
     FRONT = "front"
     REAR = "rear"
     COUNTER = "counter"
     CRAB = "crab"
     HYBRID = "hybrid"
+    TWIST = "twist"

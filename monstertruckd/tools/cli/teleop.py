@@ -32,6 +32,9 @@ _NAMES: Final = {"\r": "enter", "\n": "enter", " ": "space", "\x1b": "escape", "
 STEPS: Final = 8
 """Key presses from straight to full lock."""
 
+TURN_RADIUS: Final = 0.2
+"""A turning key asks for the rate at which a point this far from the base has the present speed, m."""
+
 MODE_KEYS: Final = {str(number): mode for number, mode in enumerate(SteeringMode, start=1)}
 
 THROTTLE: Final = {"up": 1, "w": 1, "down": -1, "s": -1}
@@ -111,13 +114,15 @@ def _name(part: bytes) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class TeleopRequest:
-    """Requested motion."""
+    """Requested motion, in one of the two forms."""
 
     speed: float
     """m/s."""
     front: float
     """rad, left positive."""
     rear: float
+    twist: tuple[float, float, float] | None = None
+    """Velocity of the base, vx, vy, wz (m/s, m/s, rad/s), in place of the others."""
 
 
 def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]:
@@ -139,6 +144,8 @@ def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]
             return steer, steer
         case SteeringMode.HYBRID:
             return steer, drift - steer
+        case SteeringMode.TWIST:
+            return 0.0, 0.0
 
 
 @dataclass(slots=True)
@@ -159,6 +166,9 @@ class Teleop:
     _steer: int = 0
     _drift: int = 0
     _throttle: int = 0
+    _turn: int = 0
+    _side: int = 0
+    """Of a twist: 1 to the left, -1 to the right, 0 none."""
     _last: str = ""
     _until: int = 0
     """The driving keys are valid until then."""
@@ -195,6 +205,7 @@ class Teleop:
             self._drive(key, now)
         elif key in MODE_KEYS:
             self.mode = MODE_KEYS[key]
+            self._turn = self._side = 0
         elif key in ("+", "="):
             self.level = min(self.level + 1, len(SPEEDS) - 1)
         elif key in ("-", "_"):
@@ -210,11 +221,17 @@ class Teleop:
 
     def _drive(self, key: str, now: int) -> None:
         """Take a driving key: it sets its own part and extends the rest."""
-        self._steer = _stepped(self._steer, STEERING.get(key, 0))
-        self._drift = _stepped(self._drift, DRIFTING.get(key, 0))
-        if key == CENTRE:
-            self._steer = self._drift = 0
         standing = now <= self._until
+        if not standing:
+            self._turn = self._side = 0
+        if self.mode is SteeringMode.TWIST:
+            self._turn = STEERING.get(key, self._turn)
+            self._side = DRIFTING.get(key, self._side)
+        else:
+            self._steer = _stepped(self._steer, STEERING.get(key, 0))
+            self._drift = _stepped(self._drift, DRIFTING.get(key, 0))
+        if key == CENTRE:
+            self._steer = self._drift = self._turn = self._side = 0
         self._throttle = THROTTLE.get(key, self._throttle if standing else 0)
         seconds = self.hold if standing and key == self._last else self.first_hold
         self._until = max(self._until, now + round(seconds * SECOND))
@@ -222,17 +239,25 @@ class Teleop:
 
     def release(self) -> None:
         """Release all keys."""
-        self._until = self._resting = self._throttle = 0
+        self._until = self._resting = self._throttle = self._turn = self._side = 0
 
     def request(self, now: int) -> TeleopRequest | None:
         """The present request: the keys' motion, one standstill after it, then none."""
-        front, rear = axles(self.mode, self.steer, self.drift)
-        rear = math.copysign(min(abs(rear), self.angle), rear)
         if now <= self._until:
             self._asking = True
-            return TeleopRequest(self._throttle * self.speed, front, rear)
-        asked, self._asking, self._throttle = self._asking, now <= self._resting, 0
-        return TeleopRequest(0.0, front, rear) if asked or self._asking else None
+            return self._motion()
+        asked, self._asking = self._asking, now <= self._resting
+        self._throttle = self._turn = self._side = 0
+        return self._motion() if asked or self._asking else None
+
+    def _motion(self) -> TeleopRequest:
+        """What the keys ask for."""
+        ahead = self._throttle * self.speed
+        if self.mode is SteeringMode.TWIST:
+            twist = (ahead, self._side * self.speed, self._turn * self.speed / TURN_RADIUS)
+            return TeleopRequest(0.0, 0.0, 0.0, twist)
+        front, rear = axles(self.mode, self.steer, self.drift)
+        return TeleopRequest(ahead, front, math.copysign(min(abs(rear), self.angle), rear))
 
 
 def _stepped(steps: int, by: int) -> int:

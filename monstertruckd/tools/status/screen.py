@@ -136,6 +136,9 @@ def _truck(state: ScreenState) -> Panel:
     if gate is not None:
         _row(table, "gate", Text(gate.mode.value.upper(), style=MODE_STYLE[gate.mode]))
         _row(table, "driver", f"{gate.holder or '-'}{f' ({gate.role.value})' if gate.role else ''}")
+        if gate.form is not None and gate.twist is not None:
+            vx, vy, wz = gate.twist.vx, gate.twist.vy, math.degrees(gate.twist.wz)
+            _row(table, gate.form.value, f"{vx:+.2f} {vy:+.2f} m/s {wz:+.0f}°/s")
         _row(table, "lease left", "-" if gate.lease_left is None else f"{gate.lease_left * 1000:.0f} ms")
         _row(table, "why", Text("\n".join(r.text for r in gate.reasons[:3]) or "-", style="yellow"))
         _row(table, "limit", f"{gate.speed_limit:.2f} m/s, stops in {gate.stopping_distance * 100:.1f} cm")

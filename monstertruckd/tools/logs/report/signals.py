@@ -149,10 +149,36 @@ FIGURES: Final = (
         "m/s",
         0.2,
         (
-            Curve("asked by tracker", t.PLAN_DRIVE, _scaled("speed")),
-            Curve("asked from outside", t.REQ_DRIVE, _scaled("speed")),
+            Curve("asked by tracker", t.PLAN_DRIVE, _scaled("pace")),
+            Curve("asked from outside", t.REQ_DRIVE, _scaled("pace")),
             Curve("commanded", t.CMD_DRIVE, _scaled("speed")),
             Curve("measured", t.ODOMETRY, lambda m: m.twist.vx),
+        ),
+        zero=True,
+    ),
+    Figure(
+        "Sideways speed",
+        "m/s",
+        0.2,
+        (
+            Curve("asked from outside", t.REQ_DRIVE, lambda m: None if m.twist is None else m.twist.vy),
+            Curve("commanded", t.GATE, lambda m: None if m.twist is None else m.twist.vy),
+            Curve("measured", t.ODOMETRY, lambda m: m.twist.vy),
+        ),
+        zero=True,
+    ),
+    Figure(
+        "Yaw rate",
+        "°/s",
+        10,
+        (
+            Curve(
+                "asked from outside",
+                t.REQ_DRIVE,
+                lambda m: None if m.twist is None else math.degrees(m.twist.wz),
+            ),
+            Curve("commanded", t.GATE, lambda m: None if m.twist is None else math.degrees(m.twist.wz)),
+            Curve("measured", t.ODOMETRY, lambda m: math.degrees(m.twist.wz)),
         ),
         zero=True,
     ),

@@ -7,6 +7,7 @@ import io
 from monstertruck_runtime.clock import WallClock
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.cli.drive_session import DriveSession
+from monstertruckd.tools.cli.teleop import TeleopRequest
 
 
 class Gone(io.StringIO):
@@ -45,3 +46,25 @@ async def test_an_emergency_stop_that_the_end_follows_at_once_has_left():
     session._commands.put_nowait("end")
     await asyncio.wait_for(session._obey(robot), 1.0)
     assert robot.published == [Order.ESTOP]
+
+
+class Driven(Robot):
+    """A client that keeps the requests it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.requests = []
+
+    async def drive(self, *motion, lease):
+        self.requests.append(("axles", *motion))
+
+    async def drive_twist(self, *motion, lease):
+        self.requests.append(("twist", *motion))
+
+
+async def test_each_mode_sends_its_form_of_request():
+    robot = Driven()
+    session = DriveSession(None, WallClock(), None, io.StringIO())
+    await session._request(robot, TeleopRequest(0.1, 0.2, 0.0))
+    await session._request(robot, TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.1, 0.5)))
+    assert robot.requests == [("axles", 0.1, 0.2, 0.0), ("twist", 0.0, 0.1, 0.5)]

@@ -108,6 +108,31 @@ def test_modes_turn_left_by_their_own_axles(mode: SteeringMode, front: float, re
     assert axles(mode, 0.2, 0.1) == (front, rear)
 
 
+def test_keys_of_the_twist_mode_turn_and_move_sideways():
+    teleop = Teleop(mode=SteeringMode.TWIST)
+    teleop.press("a", START)
+    assert teleop.request(START) == TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.0, pytest.approx(0.5))), "on the spot"
+    teleop.press("w", after(0.1))
+    assert teleop.request(after(0.1)).twist == pytest.approx((0.1, 0.0, 0.5))
+    teleop.press("d", after(0.2))
+    assert teleop.request(after(0.2)).twist == pytest.approx((0.1, 0.0, -0.5))
+    assert teleop.request(after(1.0)).twist == (0.0, 0.0, 0.0), "one standstill of the same form"
+    assert teleop.request(after(1.1)) is None
+    teleop.press("z", after(2.0))
+    assert teleop.request(after(2.0)).twist == pytest.approx((0.0, 0.1, 0.0)), "what was held before is forgotten"
+    teleop.press("c", after(2.1))
+    assert teleop.request(after(2.1)).twist == pytest.approx((0.0, -0.1, 0.0))
+    teleop.press("x", after(2.2))
+    assert teleop.request(after(2.2)).twist == (0.0, 0.0, 0.0)
+
+
+def test_another_mode_forgets_the_twist():
+    teleop = Teleop(mode=SteeringMode.TWIST)
+    teleop.press("a", START)
+    teleop.press("1", START)
+    assert teleop.request(START) == TeleopRequest(0.0, 0.0, 0.0)
+
+
 def test_no_mode_asks_for_more_than_full_lock():
     teleop = Teleop(angle=0.4, mode=SteeringMode.HYBRID)
     for key in "dz" * STEPS:
