@@ -73,6 +73,8 @@ class LocalisationStatus(StrEnum):
     """They have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
     """Where on the saved map this is, is being searched for; the pose means nothing."""
+    OUTSIDE = "outside"
+    """What is seen fits no place of the saved map: the robot is outside it. The search goes on."""
 
 
 class OdometryUse(StrEnum):

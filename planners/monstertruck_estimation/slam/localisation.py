@@ -1,8 +1,7 @@
-"""Localisation in a saved map: tracking by scan matching, and the search over the whole map for a kidnapped robot.
+"""Localisation in a saved map: tracking by scan matching; the whole map is searched for a robot of unknown place.
 
-During the search a local map is built (one scan of a 4 m lidar looks alike in many rooms); it is matched as a whole to
-the saved one by branch and bound (Hess et al. 2016, section V). A place is accepted
-at once if no other is nearly as good, otherwise when a second search from elsewhere finds the same.
+What the search finds is compared with the whole map again over the next metres, and every match with the saved grid:
+a match that fits walls, but whose beams cross others, is none.
 """
 
 import math
@@ -12,10 +11,12 @@ import numpy as np
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.correlation import Submap, correlate, merged
-from monstertruck_estimation.slam.mapping import LOST_AFTER, Mapper, MappingEvent, estimate, status_of
+from monstertruck_estimation.slam.correlation import Submap, merged
+from monstertruck_estimation.slam.global_search import GlobalLocaliser
+from monstertruck_estimation.slam.map_evidence import EvidenceGrid
+from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, status_of
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry
-from monstertruck_estimation.slam.registration import Cloud, register
+from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
     MatchStatus,
@@ -24,7 +25,7 @@ from monstertruck_estimation.slam.scan_matcher import (
     deviations,
     rejected,
 )
-from monstertruck_estimation.slam.scans import Scan, downsample_indices
+from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, surface_elements
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
@@ -32,28 +33,16 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
-LEVELS: Final = 7
-QUERY_POINTS: Final = 300
-QUERY_KEYS: Final = 6
-"""Newest keyframes that make the query: more would carry the drift of a search without odometry."""
-MIN_SCORE: Final = 0.6
-MIN_OVERLAP: Final = 0.85
-"""Share of the query's points that must fit the place found: in a recording from an office right places had 0.92 and
-more, wrong ones 0.84 at most."""
-UNIQUE_RATIO: Final = 0.85
-"""A place is unique if the next best scores less than this share of it."""
-AMBIGUOUS_RATIO: Final = 0.97
-"""A place is ambiguous if another scores more than this share of it."""
-MIN_SEPARATION: Final = 1.0
-"""Distance at which places are different, m."""
-CONFIRM_TOLERANCE: Final = (0.3, 0.1)
-"""Two hypotheses found the same if they differ by less, m and rad."""
-BASELINE: Final = 0.5
-"""Way between two hypotheses that count as two, m."""
 FOUND_DEVIATION: Final = (0.05, 0.02)
 """Standard deviation of a pose found by global localisation, m and rad."""
 LOST_DEVIATION: Final = (1.0, 0.5)
 """Standard deviation from which the robot is searched for on the whole map, m and rad."""
+MAX_CONTRADICTION: Final = 0.3
+"""Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
+CHECKED_WAY: Final = (3.0, 9.0)
+"""Way after which the search that confirms a place found ends, and after which it ends without having done so, m."""
+CHECK_TOLERANCE: Final = (0.5, 0.2)
+"""The search and the tracked pose are the same place if they differ by less, m and rad."""
 
 
 def submap_of(saved: SavedMap) -> Submap:
@@ -71,70 +60,6 @@ def submap_of(saved: SavedMap) -> Submap:
     return Submap(Cloud.of(surfaces))
 
 
-class GlobalLocaliser:
-    """Global localisation: finds the robot anywhere on a map.
-
-    Args:
-        submap: surfaces of the whole map.
-        config: of the local map.
-    """
-
-    def __init__(self, submap: Submap, config: MapperConfig) -> None:
-        self._submap = submap
-        self._mapper = Mapper(config)
-        self._hypotheses: list[tuple[Array, Array]] = []
-        low, high = submap.cloud.points.min(axis=0), submap.cloud.points.max(axis=0)
-        self._middle = np.array((*((low + high) / 2), 0.0))
-        self._half = float((high - low).max() / 2) + 1.0
-
-    def step(self, scan: Scan, stamp: int, odom: Array | None) -> Array | None:
-        """Add a scan; returns the pose of base in the map, shape (3,), once it is found."""
-        step = self._mapper.step(scan, stamp, odom)
-        if step is None or MappingEvent.KEY not in step.events:
-            return None
-        here = self._mapper.map.poses[-1]
-        query = self._query(here)
-        found = self._search_map(query)
-        if found is None:
-            return None
-        pose, unique = found
-        if unique or self._confirmed(here, pose):
-            return pose
-        self._hypotheses.append((here.copy(), pose))
-        return None
-
-    def _query(self, here: Array) -> Scan:
-        known = self._mapper.map
-        numbers = known.around(len(known) - 1, QUERY_KEYS)
-        return merged([known.frames[k].scan for k in numbers], between(here, known.poses[numbers]))
-
-    def _search_map(self, query: Scan) -> tuple[Array, bool] | None:
-        """Best pose of the query on the map, and whether it is the only one."""
-        kept = downsample_indices(query.points, 0.1)
-        if len(kept) > QUERY_POINTS:
-            kept = kept[np.linspace(0, len(kept) - 1, QUERY_POINTS).astype(np.intp)]
-        points = query.points[kept]
-        if len(points) < 30:
-            return None
-        anywhere = (1e6, 1e6)
-        grid = self._submap.grid(LEVELS)
-        peak = correlate(grid, points, self._middle, (self._half, math.pi), anywhere, MIN_SCORE, MIN_SEPARATION)
-        if peak is None or peak.rival > AMBIGUOUS_RATIO * peak.score:
-            return None
-        fit = register(query, self._submap.cloud, peak.pose)
-        if fit.overlap < MIN_OVERLAP:
-            return None
-        return fit.pose, peak.rival < UNIQUE_RATIO * peak.score
-
-    def _confirmed(self, here: Array, pose: Array) -> bool:
-        for then, found in self._hypotheses:
-            step = between(then, here)
-            off = between(compose(found, step), pose)
-            if math.hypot(step[0], step[1]) >= BASELINE and math.hypot(off[0], off[1]) < CONFIRM_TOLERANCE[0]:
-                return abs(float(off[2])) < CONFIRM_TOLERANCE[1]
-        return False
-
-
 class LocalisationEstimator:
     """An ``Estimator`` in a saved map.
 
@@ -150,7 +75,12 @@ class LocalisationEstimator:
         self._submap = submap_of(saved)
         self._front = PlanarMatcher()
         self._motion = MotionPredictor(config)
-        self._global = GlobalLocaliser(self._submap, config) if start is None else None
+        self._evidence = EvidenceGrid(saved.grid)
+        self._global = self._search_anew() if start is None else None
+        self._tracking = start is not None
+        """Whether the place is known; with a search under way it is being checked."""
+        self._checked = 0.0
+        """Way since the place was found, m."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
         self._stamp: int | None = None
@@ -183,20 +113,29 @@ class LocalisationEstimator:
         covariance = by_pose @ self._covariance @ by_pose.T + by_delta @ noise @ by_delta.T
         self._stamp = stamp
         self.counts["scans"] += 1
-        if self._global is None:
-            match, status = self._track(scan, delta, guess, covariance)
-            self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
-            events: tuple[str, ...] = () if match.accepted else ("rejected",)
+        events: tuple[str, ...] = ()
+        mount = inputs.mount
+        found = None if self._global is None else self._global.step(scan, stamp, odom, mount)
+        if not self._tracking:
+            match, status = self._unknown(guess, covariance)
+            if found is not None:
+                match, status = self._found(scan, found, mount)
+                events = ("found",)
+                self._scan_odometry.forget()
         else:
-            match, status, events = self._search(scan, guess, covariance, odom)
-        if "found" in events:
-            self._scan_odometry.forget()
+            match, status = self._track(scan, delta, guess, covariance, mount)
+            self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
+            events = () if match.accepted else ("rejected",)
+            if self._global is not None and self._refuted(match.pose, found, delta):
+                match, status = self._unknown(guess, covariance)
+                events = ("refuted",)
         alone = odom is None or self.odometry is not OdometryUse.USED
         moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
         self._pose, self._covariance = match.pose, match.covariance
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
-        correction = None if odom is None else compose(self._pose, inverse(odom))
+        odom_now = self._motion.odom
+        correction = None if odom is None or odom_now is None else compose(self._pose, inverse(odom_now))
         placed = (self._pose, self._covariance, correction)
         return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
 
@@ -216,36 +155,54 @@ class LocalisationEstimator:
     def finish(self) -> None:
         """See ``Estimator``: there is nothing to optimise."""
 
-    def _track(self, scan: Scan, delta: Array, guess: Array, covariance: Array) -> tuple[ScanMatch, LocalisationStatus]:
+    def _track(
+        self, scan: Scan, delta: Array, guess: Array, covariance: Array, mount: Vector
+    ) -> tuple[ScanMatch, LocalisationStatus]:
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         place, turn = deviations(match.covariance)
         fits = match.accepted and match.overlap >= LOW_OVERLAP
+        if fits:
+            evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
+            fits = evidence.contradiction <= MAX_CONTRADICTION
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
         self._misfits = 0 if fits else self._misfits + 1
         self.counts["rejected"] += not match.accepted
         if self._misfits >= 3 * LOST_AFTER or place > LOST_DEVIATION[0] or turn > LOST_DEVIATION[1]:
-            self._global = GlobalLocaliser(self._submap, self._config)
+            self._global, self._tracking = self._search_anew(), False
             self.counts["searches"] += 1
             return match, LocalisationStatus.SEARCHING
         lost = self._misfits >= LOST_AFTER and not match.accepted
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
 
-    def _search(
-        self, scan: Scan, guess: Array, covariance: Array, odom: Array | None
-    ) -> tuple[ScanMatch, LocalisationStatus, tuple[str, ...]]:
+    def _search_anew(self) -> GlobalLocaliser:
+        return GlobalLocaliser(self._submap, self._evidence, self._config)
+
+    def _unknown(self, guess: Array, covariance: Array) -> tuple[ScanMatch, LocalisationStatus]:
+        outside = self._global is not None and self._global.outside
+        status = LocalisationStatus.OUTSIDE if outside else LocalisationStatus.SEARCHING
+        return rejected(guess, covariance, MatchStatus.EMPTY), status
+
+    def _found(self, scan: Scan, pose: Array, mount: Vector) -> tuple[ScanMatch, LocalisationStatus]:
+        """Track from ``pose``; the search goes on, as a check."""
+        self._tracking, self._checked, self._misfits = True, 0.0, 0
+        place, turn = FOUND_DEVIATION
+        return self._track(scan, np.zeros(3), pose, np.diag((place**2, place**2, turn**2)), mount)
+
+    def _refuted(self, pose: Array, found: Array | None, delta: Array) -> bool:
+        """Whether the check says that the robot is not at ``pose``; it ends when it has confirmed the place."""
         assert self._global is not None
-        assert self._stamp is not None
-        pose = self._global.step(scan, self._stamp, odom)
-        if pose is None:
-            return rejected(guess, covariance, MatchStatus.EMPTY), LocalisationStatus.SEARCHING, ()
-        self._global, self._misfits = None, 0
-        match, status = self._track(
-            scan,
-            np.zeros(3),
-            pose,
-            np.diag((FOUND_DEVIATION[0] ** 2, FOUND_DEVIATION[0] ** 2, FOUND_DEVIATION[1] ** 2)),
-        )
-        return match, status, ("found",)
+        self._checked += math.hypot(delta[0], delta[1])
+        elsewhere = False
+        if found is not None:
+            off = between(pose, found)
+            elsewhere = math.hypot(off[0], off[1]) > CHECK_TOLERANCE[0] or abs(float(off[2])) > CHECK_TOLERANCE[1]
+        if not (elsewhere or self._global.outside):
+            if self._checked >= CHECKED_WAY[0 if found is not None else 1]:
+                self._global = None
+            return False
+        self._global, self._tracking = self._search_anew(), False
+        self.counts["searches"] += 1
+        return True
 
 
 def patch_of(saved: SavedMap) -> GridPatch:

@@ -42,6 +42,8 @@ HISTORY: Final = 128
 """Poses of odometry kept: 2.5 s at 50 Hz."""
 STALE: Final = SECOND // 5
 """Odometry older than the scan by more than this is not used, ns."""
+PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
+"""The pose in map means nothing."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
 
 
@@ -298,7 +300,7 @@ class SlamService:
         self._refused = None
         found = self._status is not None and self._status not in MATCHED and estimate.status in MATCHED
         at_once = found or self._newest is None or estimate.odometry is OdometryUse.CONTRADICTED
-        if estimate.map_from_odom is not None and estimate.status is not LocalisationStatus.SEARCHING:
+        if estimate.map_from_odom is not None and estimate.status not in PLACELESS:
             self._correction.set_target(estimate.map_from_odom, at_once=at_once)
         self._newest = estimate
         if estimate.moved is not None:
@@ -331,8 +333,11 @@ class SlamService:
         if estimate.status is LocalisationStatus.DEGENERATE:
             text = f"along {estimate.direction:.2f} rad in map"
             self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)
+        elif estimate.status is LocalisationStatus.OUTSIDE:
+            self._events(Reason.OUTSIDE_MAP, Severity.WARNING, self.name, "the search goes on")
         elif estimate.status not in MATCHED:
-            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, str(estimate.status))
+            text = "the place found was wrong: searching" if "refuted" in estimate.events else str(estimate.status)
+            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, text)
         elif before is not None:
             self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.status))
 

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_estimation.slam.storage import surface_elements
+from monstertruck_estimation.slam.config import MapperConfig, SlamConfig
+from monstertruck_estimation.slam.localisation import LocalisationEstimator
+from monstertruck_estimation.slam.scans import prepare_input
+from monstertruck_estimation.slam.storage import load, surface_elements
 from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
 from monstertruck_runtime.clock import SECOND
@@ -106,10 +108,9 @@ PLACES = [(1.5, 3.95, 0.0), (6.85, 4.6, 1.6), (4.5, 6.4, 0.0)]
 
 @pytest.mark.parametrize("start", PLACES)
 def test_a_robot_that_knows_its_place_keeps_it(plain: Path, start: tuple[float, float, float]):
-    worker = SlamWorker()
-    worker.step(WorkerInput(start=Start(SlamConfig(mode="localisation", map=plain), start)))
+    estimator = LocalisationEstimator(load(plain), MapperConfig(), start)
     for scan, truth in _scans(start, 20, odom=False):
-        estimate = worker.step(WorkerInput(scan=scan)).estimate
+        estimate = estimator.step(prepare_input(scan, 30.0, estimator.twist), scan)
         assert estimate is not None
         assert estimate.status is LocalisationStatus.LOCALISED
         assert estimate.overlap > 0.85

@@ -1,0 +1,85 @@
+"""Localisation: never at once, never against the evidence of the grid, checked afterwards, and outside of the map."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.localisation import LocalisationEstimator
+from monstertruck_estimation.slam.scans import prepare_input
+from monstertruck_estimation.slam.storage import SavedMap
+from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.health import LocalisationStatus
+from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds
+from tests.unit.estimation.slam.test_map_evidence import drawn
+
+PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST}
+EMPTY = [*ROOM[:4], *ROOM[8:]]
+"""The same room without the box in its middle."""
+
+
+def followed(saved: SavedMap, walls, truth, *, odom=True, start=None) -> list[SlamEstimate]:
+    """Estimates at the true poses, ten a second."""
+    estimator, rng = LocalisationEstimator(saved, MapperConfig(), start), np.random.default_rng(3)
+    estimates = []
+    for k, pose in enumerate(truth):
+        inputs = ScanInput(
+            stamp=SECOND + k * SECOND // 10,
+            ranges=ranges(walls, pose, noise=0.01, rng=rng),
+            start_angle=LIDAR.start_angle,
+            angle_increment=LIDAR.angle_increment,
+            range_min=LIDAR.range_min,
+            range_max=LIDAR.range_max,
+            odom=tuple(between(truth[0], pose).tolist()) if odom else None,
+        )
+        estimate = estimator.step(prepare_input(inputs, 30.0, estimator.twist), inputs)
+        assert estimate is not None
+        estimates.append(estimate)
+    return estimates
+
+
+@pytest.mark.parametrize("odom", [True, False])
+def test_a_place_is_found_by_a_second_look_and_is_right(odom: bool):
+    truth = rounds(80, laps=0.6)
+    estimates = followed(SavedMap(drawn(), None), ROOM, truth, odom=odom)
+    found = next(k for k, estimate in enumerate(estimates) if estimate.status in PLACED)
+    way = np.hypot(*np.diff(truth[: found + 1, :2], axis=0).T).sum()
+    assert 0.5 <= way < 3.0
+    for estimate, pose in zip(estimates[found:], truth[found:], strict=True):
+        assert estimate.status in PLACED
+        assert math.hypot(*(np.array(estimate.pose) - pose)[:2]) < 0.1
+
+
+@pytest.mark.parametrize("odom", [True, False])
+def test_a_room_that_only_fits_is_outside_the_map(odom: bool):
+    truth = rounds(160, laps=1.0)
+    estimates = followed(SavedMap(drawn(), None), EMPTY, truth, odom=odom)
+    assert not PLACED & {estimate.status for estimate in estimates}
+    assert estimates[99].status is LocalisationStatus.SEARCHING
+    assert estimates[-1].status is LocalisationStatus.OUTSIDE
+
+
+def test_a_robot_that_stands_still_outside_the_map_is_told():
+    walls = box(-9.0, -1.0, -6.0, 4.0)
+    estimates = followed(SavedMap(drawn(), None), walls, np.tile((-8.0, 1.0, 0.3), (120, 1)))
+    assert estimates[-1].status is LocalisationStatus.OUTSIDE
+
+
+def test_a_wrong_place_is_refuted_within_metres():
+    """A closed room of the map looks as the robot's, which has a door: driven through it, the robot is elsewhere."""
+    open_side = [*box(-3.0, -2.0, 3.0, 2.5)[:1], ((3.0, -2.0), (3.0, -0.5)), ((3.0, 0.5), (3.0, 2.5)), *ROOM[2:]]
+    walls = [*open_side, *box(3.0, -3.0, 9.0, 3.0)[:1], ((9.0, -3.0), (9.0, 3.0)), ((9.0, 3.0), (3.0, 3.0))]
+    way = np.linspace(0.0, 1.0, 40)[:, None]
+    legs = [(-2.4, 0.0, -1.0), (-1.8, -1.3, 0.0), (2.0, -1.3, 0.7), (2.2, 0.0, 0.0), (7.0, 0.0, 0.0)]
+    truth = np.concatenate([np.array(a) + way * (np.array(b) - np.array(a)) for a, b in itertools.pairwise(legs)])
+    saved = SavedMap(drawn(), None)
+    estimates = followed(saved, walls, truth, start=tuple(truth[0].tolist()))
+    inside = [estimate.status for estimate in estimates[:60]]
+    assert set(inside) <= PLACED
+    beyond = [k for k, pose in enumerate(truth) if pose[0] > 4.0]
+    assert estimates[-1].status not in {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE}
+    assert any(estimates[k].status not in PLACED for k in beyond)
