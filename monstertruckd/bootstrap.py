@@ -1,7 +1,7 @@
 """Set up everything on a bare machine, then run the demo or the tests.
 
 Uses nothing but Python's standard library: no pip, no venv module, no root. It fetches the pinned ``uv`` from the
-package index (checked by sha256), lets it build ``.venv`` beside ``pyproject.toml`` from the committed lock file,
+package index (checked by sha256), lets it build ``.venv`` next to ``pyproject.toml`` from the committed lock file,
 and runs the command there. A second run finds everything in place.
 
     python3 -m monstertruckd.bootstrap demo     the truck drives a lap

@@ -267,7 +267,7 @@ def run_session(
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One estimate beside its truth."""
+    """One estimate and its truth."""
 
     name: str
     """wizard.estimate"""

@@ -65,7 +65,7 @@ def run_with(target: Path, *arguments: str, cwd: Path = ROOT) -> str:
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Installs a distribution with one module and entry points (``group:name``) beside this one, for this process."""
+    """Installs a distribution with one module and entry points (``group:name``) for this process, in addition."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
     def put(distribution, module, text, places):

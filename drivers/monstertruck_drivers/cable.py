@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import DeviceLostError, PortBusyError
 class DeviceEnd:
     """The device's side of a port: what an emulator reads and writes, whoever has the host side open.
 
-    Bytes for nobody are dropped, as a USB device's are. ``baud`` paces both directions like a real
+    Bytes without a reader are dropped, as a USB device's are. ``baud`` paces both directions like a real
     line (10 bits a byte). Faults of the cable live here too.
     """
 
@@ -26,9 +26,9 @@ class DeviceEnd:
         self.baud: int | None = None
         self.faults = LineFaults()
         self.on_plug: Callable[[bool], None] | None = None
-        """Told True/False when the cable is plugged/unplugged."""
+        """Called with True/False when the cable is plugged/unplugged."""
         self.on_bytes: Callable[[bool, bytes], None] | None = None
-        """Told of all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
+        """Called with all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
         self._received = Link(name, lambda _: None, lambda: None)
         self._out = _Way()
         self._in = _Way()
@@ -292,6 +292,6 @@ class PtyPort:
         self._timer = None
         frame = bytes(self._frame)
         self._frame.clear()
-        # What a pty has no room for, of about 10 kB, is lost as a USB device's bytes are that nobody fetches in time.
+        # What a pty of about 10 kB has no room for is lost, as are bytes of a USB device that are not fetched in time.
         with contextlib.suppress(BlockingIOError):
             os.write(self._fds[0], frame)

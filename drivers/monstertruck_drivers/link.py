@@ -189,7 +189,7 @@ class Link:
             self._set_alarm(asyncio.get_running_loop(), due)
 
     def end_wait(self) -> None:
-        """Tell nobody any more."""
+        """Stop notifying."""
         self._waiting = self._due = None
 
     async def _more(self, due: float | None = None, count: int = 1) -> None:

@@ -1,6 +1,6 @@
 """Who may do what over Zenoh, derived from the topic table.
 
-Groups out of the robot may only leave it and requests may only enter it, so that nobody can forge the robot's
+Groups out of the robot may only leave it and requests may only enter it, so that no other peer can forge the robot's
 state to the others. A rule covers a declaration only if it contains the whole declared key expression.
 """
 

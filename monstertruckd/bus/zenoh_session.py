@@ -260,7 +260,7 @@ def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     """Put function of one topic; a full queue drops the message rather than stalling the loop.
 
-    Each priority has a queue of its own: what others say at Zenoh's ordinary one, and answers, are in nobody's way.
+    Each priority has a queue of its own: others send at Zenoh's ordinary one, and neither they nor answers delay ours.
     """
     priority = zenoh.Priority.DATA_LOW if topic.name in BULKY else zenoh.Priority.DATA_HIGH
     if topic.retained:

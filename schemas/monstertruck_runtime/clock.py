@@ -200,7 +200,7 @@ class _Timer(NamedTuple):
 class _VirtualSelector(selectors.DefaultSelector):
     """Where asyncio waits, once each turn of a loop: it knows of no timers, so for ever if nothing is ready.
 
-    The kernel is asked only when another thread has woken the loop, when files beside its own wake-up pipe are watched,
+    The kernel is asked only when another thread has woken the loop, when files other than its wake-up pipe are watched,
     or when there is no timer to jump to.
     """
 

@@ -76,7 +76,7 @@ def load_map(path: Path) -> WorldMap:
 
 
 def save_map(world: WorldMap, path: Path) -> None:
-    """Write ``path`` (YAML) and a grey PNG of the same stem beside it; ``load_map`` reads back an equal map.
+    """Write ``path`` (YAML) and a grey PNG of the same stem in the same folder; ``load_map`` reads back an equal map.
 
     Raises:
         OSError: a file could not be written; the YAML is the last one.

@@ -142,7 +142,7 @@ class KindSection:
         return tuple(self.catalog.settings.values())
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """The union, told apart by ``kind``."""
+        """The union, discriminated by ``kind``."""
         choices = {name: handler.generate_schema(model) for name, model in self.catalog.settings.items()}
         return core_schema.tagged_union_schema(choices, "kind" if self.default is None else self._kind)
 

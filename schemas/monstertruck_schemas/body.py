@@ -81,7 +81,7 @@ class IndependentBody(BodyConfig):
 
 
 class DifferentialBody(BodyConfig):
-    """Two driven wheels (left, right) beside the base point, and casters; nothing is steered."""
+    """Two driven wheels, left and right of the base point, and casters; nothing is steered."""
 
     kind: Literal["differential"]
 

@@ -103,7 +103,7 @@ class GoalState(Message):
     routes: Annotated[int, Field(ge=0)] = 0
     """Routes driven so far, the present one included."""
     recoveries: Annotated[int, Field(ge=0)] = 0
-    """Steps of the recovery ladder taken so far."""
+    """Recovery behaviours run so far."""
 
 
 class StabiliserCommand(Message):

@@ -31,7 +31,7 @@ class LaserScan(Message):
     codes: UInt8Array
     """Shape (n,); 255 = valid, otherwise the sensor's own error code (devices' manual)."""
     tilt: Annotated[float, Field(ge=0)] | None = None
-    """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = nobody measures it."""
+    """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = not measured."""
 
     @property
     def angle_increment(self) -> float:

@@ -14,7 +14,7 @@ Seconds = Annotated[float, Field(ge=0)]
 TIMEOUT_MIN = 0.005
 """Seconds; below that a busy host misses answers that came in time."""
 SCHEDULING = 0.002
-"""Seconds a host may take beside the line and the adapter."""
+"""Seconds a host may take in addition to line and adapter."""
 
 
 class JointConfig(Schema):

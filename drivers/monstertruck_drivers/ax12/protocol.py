@@ -203,7 +203,7 @@ def write(unit: int, start: Register, data: bytes) -> bytes:
 
 
 def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
-    """Write to several units in one packet, which nobody answers.
+    """Write to several units in one packet, which is not answered.
 
     Args:
         start: first register.

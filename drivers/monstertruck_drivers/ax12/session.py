@@ -12,7 +12,7 @@ from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 
 RETRIES: Final = 2
 GAP: Final = 100e-6
-"""Seconds between a packet that nobody answers and the next one."""
+"""Seconds between a packet without an answer and the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Ax12Session:
         return answer.error
 
     async def sync_write(self, start: Register, data: Mapping[int, bytes]) -> None:
-        """Write to several units in one packet; nobody answers.
+        """Write to several units in one packet; there is no answer.
 
         Raises:
             DeviceLostError: unplugged.

@@ -15,7 +15,7 @@ class PackConfig(Schema):
     """A lithium-polymer pack and its limits; the default is 6S.
 
     Low, critical, clear and overcharged are compared with the voltage at rest (the measured one plus what the
-    motor's current costs), collapsed with the measured one. A pack is told apart from a wrong scale only by the
+    motor's current costs), collapsed with the measured one. A pack is distinguished from a wrong scale only by the
     scale's own calibration: 5 % of error make a full pack overcharged.
     """
 

@@ -87,7 +87,7 @@ class MaestroSession:
         )
 
     async def _speaks(self) -> bool:
-        """Whether bytes come that nobody asked for; they are dropped."""
+        """Whether unrequested bytes come; they are dropped."""
         try:
             async with self._clock.deadline(QUIET):
                 return bool(await self._link.read())

@@ -77,7 +77,9 @@ class Os4000Driver:
         heard = await session.listen(LISTEN)
         missing = NEEDED & ~observed_fields(heard)
         if missing:
-            raise ProtocolError(f"{self._port.name}: the compass does not send {_names(missing)}, although told to")
+            raise ProtocolError(
+                f"{self._port.name}: the compass does not send {_names(missing)}, although configured to"
+            )
         for _, text in self._differences(heard).values():
             self._events(Reason.DEVICE_MISMATCH, Severity.WARNING, self.name, f"{text} even after setting it")
 

@@ -143,7 +143,7 @@ class HubCoordinator:
         return min(dues, default=None)
 
     def stop_watching(self) -> None:
-        """Nobody looks at the tree any more: nobody shall wait for it."""
+        """The tree is not read any more: no device waits for it."""
         self._judging.clear()
         self._outages.clear()
         self._looked = False

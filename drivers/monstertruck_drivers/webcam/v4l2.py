@@ -27,7 +27,7 @@ MJPG: Final = int.from_bytes(b"MJPG", "little")
 CAP_CAPTURE: Final = 0x1
 CAP_STREAMING: Final = 0x04000000
 CAP_DEVICE_CAPS: Final = 0x80000000
-"""The node's own capabilities are given beside those of the whole device."""
+"""The node's own capabilities are given in addition to those of the whole device."""
 FLAG_ERROR: Final = 0x40
 TIMESTAMP_MASK: Final = 0xE000
 TIMESTAMP_MONOTONIC: Final = 0x2000

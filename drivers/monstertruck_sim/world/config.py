@@ -258,7 +258,7 @@ class CompassModelConfig(Schema):
 
 
 class GroundTilt(Schema):
-    """The ground is level, or follows the profile that lies beside the map."""
+    """The ground is level, or follows the profile in the map's folder."""
 
     kind: Literal["ground"] = "ground"
 
@@ -282,7 +282,7 @@ class WorldConfig(Schema):
     """One simulated world with one truck in it."""
 
     map: str = "loop"
-    """Name of a built-in world, or path of a map_server YAML file (a ``NAME.profile.yaml`` beside it is its ground)."""
+    """Name of a built-in world, or path of a map_server YAML file (its ground: ``NAME.profile.yaml`` next to it)."""
     start: Pose2D | None = None
     """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
     noise: bool = True

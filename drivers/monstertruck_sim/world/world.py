@@ -82,7 +82,7 @@ class World:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """What stands in the world beside its map."""
+        """Obstacles in the world that are not on its map."""
         return self._obstacles
 
     def truth(self, time_ns: int) -> TruthState:
@@ -178,7 +178,7 @@ class World:
 
 
 def _find(name: str) -> BuiltIn:
-    """A built-in world, or the map file of that path with the ground profile beside it."""
+    """A built-in world, or the map file of that path with the ground profile in the same folder."""
     if name in BUILT_IN:
         return BUILT_IN[name]()
     path = Path(name)

@@ -61,7 +61,7 @@ class DriveWizard:
         if self.sign_only:
             return Result(
                 wizard="drive",
-                measured="the truck was told to roll forward, and did",
+                measured="the truck was commanded forward and rolled forward",
                 estimates=(_sign(inverted),),
                 partial=True,
             )
@@ -78,7 +78,7 @@ class DriveWizard:
     def _reversed(inverted: bool) -> Result:
         return Result(
             wizard="drive",
-            measured="the truck was told to roll forward and rolled backward",
+            measured="the truck was commanded forward and rolled backward",
             estimates=(_sign(not inverted),),
             unobserved=("the ratio: nothing is driven any further with the sign wrong",),
             partial=True,

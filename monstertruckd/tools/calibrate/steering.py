@@ -245,7 +245,7 @@ class Reach:
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
     def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
-        """What is told of it, and the limit of the pulse, us, where something stops the wheels.
+        """Text about it, and the limit of the pulse, us, where something stops the wheels.
 
         A limit set ``before`` hides the stop behind it, and stays.
         """

@@ -227,7 +227,7 @@ def linkage_command(
     png: Png = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Wheel angles over the servo angle: a linkage beside the truck's fitted front polynomials.
+    """Wheel angles over the servo angle: a linkage compared with the truck's fitted front polynomials.
 
     The truck's real lengths are published nowhere; the defaults are an example of the right size.
     """

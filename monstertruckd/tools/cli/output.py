@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from typer._click import Context
 
 PIPE_WIDTH: Final = 200
-"""Columns of text nobody looks at on a terminal: wide enough to cut nothing."""
+"""Width of text that does not go to a terminal: wide enough to cut nothing."""
 
 WIDE_CELL: Final = 48
 """Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
@@ -45,7 +45,7 @@ HELP_STYLE: Final = "markdown" if on_terminal(sys.stdout) and on_terminal(sys.st
 """Of help and usage errors: framed on terminals, bare text (None) as soon as one of the two streams is a pipe."""
 
 HELP_WIDTH: Final = {"max_content_width" if on_terminal(sys.stdout) else "terminal_width": PIPE_WIDTH}
-"""Setting of a command line: the terminal's own width, or lines nobody folds."""
+"""Setting of a command line: the terminal's own width, or lines that are not folded."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 

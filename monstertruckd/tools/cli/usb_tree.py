@@ -44,7 +44,7 @@ async def local_tree(clock: Clock) -> tuple[UsbNode, ...]:
 
 
 def draw(nodes: Iterable[UsbNode]) -> list[Tree]:
-    """One tree per bus; a hub nobody has seen yet shows by its name."""
+    """One tree per bus; a hub that has not been seen yet is shown by its name."""
     rows = {node.name: node for node in nodes}
     trees: dict[str, Tree] = {}
     roots = []

@@ -307,7 +307,7 @@ class _ScenarioRun:
             NoAnswerError: it takes too long.
         """
         truck = self.truck
-        self.station.silent = True  # nobody may arm with a deflected stick
+        self.station.silent = True  # arming needs a stick at rest
         await self._require(
             lambda: truck.gate is not None and truck.gate.mode.active, "the truck to be armed", Order.ARM
         )

@@ -50,7 +50,7 @@ class Book:
         )
 
     def as_computed(self, path: Path) -> Path:
-        """``path`` as it would be if nobody had driven another one."""
+        """``path`` as it would be if no other one had been driven."""
         computed = self._computed.get(path.name)
         if computed is None:
             return path

@@ -148,7 +148,7 @@ class Chain:
     Args:
         config: of the robot; see ``replayable``.
         clock: of the running replay.
-        unseen: ticks nobody recorded, see ``unseen_ticks``.
+        unseen: ticks that were not recorded, see ``unseen_ticks``.
         log: what was read from the log beforehand.
     """
 
@@ -341,7 +341,7 @@ def _near(instants: Sequence[int], stamp: int) -> int | None:
 
 
 def _nothing() -> None:
-    """Nobody waits for a service to be ready."""
+    """Readiness is of no interest here."""
 
 
 def _first(group: BaseExceptionGroup[Any]) -> BaseException:

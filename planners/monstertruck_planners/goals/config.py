@@ -28,7 +28,7 @@ class EscapeConfig(Schema):
     """Backing out, as by car_maneuver_recovery: away from the sides of the footprint that are not free."""
 
     room: Positive = 0.15
-    """A side is free if there is nothing this near beside it, m."""
+    """A side is free if there is no obstacle within this distance of it, m."""
     distance: Positive = 0.5
     """Driven at most, m."""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.4
@@ -43,7 +43,7 @@ class LocalConfig(Schema):
     """When routes are deformed, and what is made of it."""
 
     clearance: Share = 0.02
-    """A route with something nearer than this beside it is deformed, m; what the gate keeps beside the truck."""
+    """A route with an obstacle nearer than this is deformed, m; the gate's side clearance."""
     rejoin_clearance: Share = 0.03
     """More than that is needed to go back to the route, m..."""
     rejoin_distance: Positive = 0.06
@@ -62,7 +62,7 @@ class PlannerConfig(Schema):
     """How goals are reached."""
 
     route: AnyRoutePlanner = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
-    """Route planner; its margin has to exceed what the gate keeps beside the truck; backward the lidar sees nothing"""
+    """Route planner; its margin has to exceed the gate's side clearance; backward the lidar sees nothing"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.36

@@ -52,10 +52,10 @@ def blocked_sides(footprint: Footprint, points: Array, room: float) -> Sides:
     """Sides with a point nearer than ``room``, m; points have shape (n, 2) and are in the base frame."""
     x, y = points[:, 0] - footprint.offset, points[:, 1]
     length, width = footprint.half_length, footprint.half_width
-    beside, along = np.abs(y) <= width, np.abs(x) <= length
+    within, along = np.abs(y) <= width, np.abs(x) <= length
     return Sides(
-        front=bool((beside & (x > 0) & (x - length < room)).any()),
-        rear=bool((beside & (x < 0) & (-x - length < room)).any()),
+        front=bool((within & (x > 0) & (x - length < room)).any()),
+        rear=bool((within & (x < 0) & (-x - length < room)).any()),
         left=bool((along & (y > 0) & (y - width < room)).any()),
         right=bool((along & (y < 0) & (-y - width < room)).any()),
     )

@@ -35,7 +35,7 @@ LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED})
 """What it says where it leaves a path, to be planned anew from there."""
 
 MISSES: Final = 5
-"""Routes that may end beside the goal."""
+"""Routes that may end short of the goal's tolerance."""
 
 BLOCKS: Final = 2
 """Times a route may be blocked again before the truck has got on."""

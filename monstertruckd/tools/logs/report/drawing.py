@@ -1,6 +1,6 @@
 """Line plots as inline SVG: pure functions from numbers to markup.
 
-A plot is stretched to any width: lines keep their width (``non-scaling-stroke``), and every label is HTML beside it,
+A plot is stretched to any width: lines keep their width (``non-scaling-stroke``), and every label is HTML next to it,
 placed in per cent, so that nothing shrinks on a phone.
 """
 
