@@ -263,6 +263,23 @@ class GroundTilt(Schema):
     kind: Literal["ground"] = "ground"
 
 
+class RoughPatch(Schema):
+    """A rectangle of rough ground: waves along x and along y, added to the ground's height."""
+
+    x: float
+    """Of its middle, m."""
+    y: float
+    """m."""
+    length: Positive = 1.0
+    """Along x, m."""
+    width: Positive = 1.0
+    """Along y, m."""
+    height: Positive = 0.02
+    """Amplitude, m."""
+    wavelength: Positive = 0.45
+    """m."""
+
+
 class SinusoidTilt(Schema):
     """The body rocks with time, whatever the ground."""
 
@@ -292,3 +309,5 @@ class WorldConfig(Schema):
     camera: CameraConfig = CameraConfig()
     compass: CompassModelConfig = CompassModelConfig()
     tilt: TiltConfig = GroundTilt()
+    rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
+    """Patches of rough ground"""

@@ -1,7 +1,7 @@
 """What the devices' sensing elements feel: the physics behind the emulators."""
 
 from collections.abc import Callable
-from math import atan2, cos, degrees, pi, radians, sin
+from math import atan2, cos, degrees, hypot, pi, radians, sin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,8 @@ from monstertruck_drivers.emulation import CompassReading, JointSource, MotorRea
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.config import BatteryModelConfig, CameraConfig, CompassModelConfig, LidarConfig, MotorConfig
 from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
-from monstertruck_sim.world.truck_plant import TruckPlant
+from monstertruck_sim.world.terrain import Terrain
+from monstertruck_sim.world.truck_plant import GRAVITY, TruckPlant
 
 STEPS = 769
 SWEEP_NS = 100_000_000
@@ -32,14 +33,22 @@ class SimulatedLidar:
     """``RangeSource``: every beam leaves from where the truck is at that beam's instant.
 
     Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
-    as a maker's accuracy covers nearly all readings. A tilted beam meets level ground or passes over walls of finite
-    height; walls are upright and the ground is taken as level around the truck. Joints of a mount turn it about its own
-    centre.
+    as a maker's accuracy covers nearly all readings. A beam meets the ground or passes over upright walls of finite
+    height that stand on it. Joints of a mount turn it about its own centre.
+
+    Args:
+        plant: what carries it.
+        cast: ranges to the walls.
+        terrain: the ground; None = level.
+        config: true parameters.
+        seed: of the noise; None = none.
     """
 
-    def __init__(self, plant: TruckPlant, cast: Caster, config: LidarConfig, seed: int | None) -> None:
+    def __init__(
+        self, plant: TruckPlant, cast: Caster, terrain: Terrain | None, config: LidarConfig, seed: int | None
+    ) -> None:
         self.joints: JointSource | None = None
-        self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
+        self._plant, self._cast, self._terrain, self._config, self._seed = plant, cast, terrain, config, seed
         self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
         """Steps that never measure."""
 
@@ -54,13 +63,17 @@ class SimulatedLidar:
         poses = self._plant.poses(times)
         x, y, yaw, pitch, roll = poses
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
-        if self.joints is None and np.abs(poses[3:]).max() < _LEVEL:
+        if self.joints is None and self._terrain is None and np.abs(poses[3:]).max() < _LEVEL:
             ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range)
         else:
             beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
             if self.joints is not None:
                 beams = _turned(beams, *self.joints.angles(times))
-            ranges = self._tilted(xs, ys, yaw, _turned(beams, pitch, roll))
+            beams = _turned(beams, pitch, roll)
+            if self._terrain is None:
+                ranges = self._tilted(xs, ys, yaw, beams)
+            else:
+                ranges = self._over(self._terrain, poses, beams)
         return self._measure(ranges, time_ns)
 
     def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams) -> Array:
@@ -74,6 +87,23 @@ class SimulatedLidar:
             ranges[config.height + ranges * up > config.wall_height] = np.inf
         nearest: Array = np.minimum(ranges, ground)
         return nearest
+
+    def _over(self, terrain: Terrain, poses: Array, beams: Beams) -> Array:
+        """Ranges over uneven ground; arguments as of ``_tilted``."""
+        config, (x, y, yaw, pitch, _) = self._config, poses
+        forward, left, up = beams
+        xs, ys = x + config.x * np.cos(yaw), y + config.x * np.sin(yaw)
+        zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
+        level = np.hypot(forward, left)
+        headings, rises = yaw + np.arctan2(left, forward), up / level
+        walls = self._cast(xs, ys, headings, config.max_range)
+        hit = np.isfinite(walls)
+        way = np.where(hit, walls, 0.0)
+        foot = terrain.height(xs + way * np.cos(headings), ys + way * np.sin(headings))
+        walls[hit & (zs + rises * way > foot + config.wall_height)] = np.inf
+        ground = terrain.cast(xs, ys, zs, headings, rises, config.max_range)
+        ranges: Array = np.minimum(walls, ground) / level
+        return ranges
 
     def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
         config = self._config
@@ -164,8 +194,10 @@ class SimulatedServos:
 class SimulatedCompass:
     """``AttitudeSource``: a magnetometer and an accelerometer on the body, axes x forward, y left, z up.
 
-    The level field is turned by the deviation curve and by noise, tilted with the body, distorted by the truck's iron
-    and by the motor's current; the heading is what a tilt compensation makes of that field, so both agree.
+    The accelerometer feels the reaction to gravity and to the body's own acceleration, and pitch and roll are what it
+    takes for the vertical. The level field is turned by the deviation curve and by noise, tilted with the body,
+    distorted by the truck's iron and by the motor's current; the heading is what a compensation by that pitch and roll
+    makes of it.
     """
 
     def __init__(self, plant: TruckPlant, config: CompassModelConfig, seed: int | None) -> None:
@@ -197,6 +229,9 @@ class SimulatedCompass:
         heading += self.deviation(heading) + noise[0]
         level = (config.horizontal_field * cos(heading), config.horizontal_field * sin(heading), config.vertical_field)
         field = self._distorted(_to_body(level, pitch, roll))
+        forward, left = self._plant.acceleration
+        force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0), pitch, roll)
+        pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         x, y, _ = _to_level(field, pitch, roll)
         pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
         return CompassReading(
@@ -205,7 +240,7 @@ class SimulatedCompass:
             roll_deg=degrees(roll),
             temperature_c=config.temperature_c,
             field=field,
-            acceleration=_to_body((0.0, 0.0, 1.0), pitch, roll),
+            acceleration=_to_body((0.0, 0.0, hypot(*force)), pitch, roll),
         )
 
     def _distorted(self, field: Vector) -> Vector:

@@ -1,4 +1,4 @@
-"""Tilt of the body: from the ground's height under its wheels, or rocking with time."""
+"""The ground: its height, where beams meet it, and the tilt of a body on it; or a body that rocks with time."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -7,10 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
-from monstertruck_sim.world.config import SinusoidTilt
+from monstertruck_sim.world.config import RoughPatch, SinusoidTilt
+
+STEP = 0.05
+"""Horizontal distance between two looks along a beam, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,16 +28,63 @@ class Profile:
 
     points: tuple[tuple[float, float], ...]
 
-    def height(self, x: float) -> float:
-        """Metres."""
-        return float(np.interp(x, [p[0] for p in self.points], [p[1] for p in self.points]))
+    def height(self, x: ArrayLike) -> Array:
+        """Metres; of the shape of ``x``."""
+        return np.asarray(np.interp(x, [p[0] for p in self.points], [p[1] for p in self.points]))
 
-    def tilt(self, x: float, yaw: float, wheelbase: float, track: float) -> tuple[float, float]:
+
+LEVEL = Profile(((0.0, 0.0), (1.0, 0.0)))
+
+
+class Terrain:
+    """Height of the ground over the plane.
+
+    Args:
+        profile: along x.
+        patches: rough ground on it.
+    """
+
+    def __init__(self, profile: Profile, patches: tuple[RoughPatch, ...]) -> None:
+        self._profile, self._patches = profile, patches
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Metres at points in the map frame; all of one shape."""
+        z = self._profile.height(x)
+        for patch in self._patches:
+            dx, dy = x - patch.x, y - patch.y
+            inside = (abs(dx) < patch.length / 2) & (abs(dy) < patch.width / 2)
+            wave = 2 * pi / patch.wavelength
+            z = z + np.where(inside, patch.height / 2 * (np.sin(wave * dx) + np.sin(wave * dy)), 0.0)
+        return z
+
+    def tilt(self, x: float, y: float, yaw: float, wheelbase: float, track: float) -> tuple[float, float]:
         """Pitch (nose down positive) and roll (right side down positive) of a body on four wheels, rad."""
-        forward, left = cos(yaw), -sin(yaw)
-        rise = self.height(x + forward * wheelbase / 2) - self.height(x - forward * wheelbase / 2)
-        lean = self.height(x + left * track / 2) - self.height(x - left * track / 2)
-        return -atan(rise / wheelbase), atan(lean / track)
+        along, across = np.array((1, 1, -1, -1)) * wheelbase / 2, np.array((1, -1, 1, -1)) * track / 2
+        c, s = np.cos(yaw), np.sin(yaw)
+        fl, fr, rl, rr = self.height(x + c * along - s * across, y + s * along + c * across).tolist()
+        return -atan((fl + fr - rl - rr) / 2 / wheelbase), atan((fl + rl - fr - rr) / 2 / track)
+
+    def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
+        """Horizontal distances at which beams meet the ground; inf = not within ``reach``.
+
+        Args:
+            xs: origins, (n,), m.
+            ys: the same.
+            zs: the same.
+            headings: directions in the plane, (n,), rad.
+            rises: metres upwards a metre of horizontal distance, (n,).
+            reach: longest horizontal distance, m.
+        """
+        ways = np.arange(0.0, reach + STEP, STEP)
+        x = xs[:, None] + np.cos(headings)[:, None] * ways
+        y = ys[:, None] + np.sin(headings)[:, None] * ways
+        above = zs[:, None] + rises[:, None] * ways - self.height(x, y)
+        first = np.argmax(above < 0.0, axis=1)
+        beams = np.arange(len(xs))
+        before, after = above[beams, first - 1], above[beams, first]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            met = ways[first] - STEP * after / (after - before)
+        return np.where(above[beams, first] < 0.0, np.where(first > 0, met, 0.0), np.inf)
 
 
 def rocking(config: SinusoidTilt, elapsed_ns: int) -> tuple[float, float]:

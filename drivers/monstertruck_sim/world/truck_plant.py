@@ -29,6 +29,8 @@ GRAVITY = 9.81
 _HISTORY = 120
 _FREED = 0.005
 _SLIP_PERIOD_NS = 200_000_000
+_FELT = 0.05
+"""Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
 
 Pose = tuple[float, float, float]
 Contact = Callable[[float, float, float], float]
@@ -117,6 +119,8 @@ class TruckPlant:
         self._slipping = [False] * count
         self._stuck_at: Pose | None = None
         self._twist = (0.0, 0.0, 0.0)
+        self.acceleration = (0.0, 0.0)
+        """Of the body, forward and left, as a sensor on it feels it, m/s^2; gravity is not in it."""
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_HISTORY)
 
     @property
@@ -205,7 +209,9 @@ class TruckPlant:
             shaft.step(dt)
             current = self._drive(i, shaft, dt)
             watts += current**2 * resistance + abs(current * constant * shaft.rpm * RPM)
+        before = self._twist
         self._move(dt)
+        self._accelerate(before, dt)
         self.battery.step(dt, watts)
 
     def _steer(self, dt: float) -> None:
@@ -242,6 +248,13 @@ class TruckPlant:
             current = idle + (load + inertia) / motor.torque_constant
         self.currents[i] = current
         return current
+
+    def _accelerate(self, before: tuple[float, float, float], dt: float) -> None:
+        vx, vy, wz = self._twist
+        true = (vx - before[0]) / dt - wz * vy, (vy - before[1]) / dt + wz * vx
+        share = 1.0 - exp(-dt / _FELT)
+        forward, left = (felt + share * (now - felt) for felt, now in zip(self.acceleration, true, strict=True))
+        self.acceleration = forward, left
 
     def _move(self, dt: float) -> None:
         config, steering, wheels = self.config, self._steering, self._wheel_speeds

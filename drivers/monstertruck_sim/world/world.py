@@ -21,7 +21,7 @@ from monstertruck_sim.world.sensors import (
     SimulatedServos,
     SimulatedView,
 )
-from monstertruck_sim.world.terrain import load_profile, profile_path, rocking
+from monstertruck_sim.world.terrain import LEVEL, Terrain, load_profile, profile_path, rocking
 from monstertruck_sim.world.truck_plant import Pose, TruckPlant, TruthState
 
 _ROOM = 0.05
@@ -47,7 +47,8 @@ class World:
         start = (config.start.x, config.start.y, config.start.yaw) if config.start else place.start
         noise_seed = seed if config.noise else None
         self.map = place.map
-        self._profile = place.profile
+        uneven = place.profile is not None or bool(config.rough)
+        self._terrain = Terrain(place.profile or LEVEL, config.rough) if uneven else None
         self._tilt: TiltConfig = config.tilt
         self._truck = config.truck
         self._half_diagonal = hypot(config.truck.length, config.truck.width) / 2
@@ -61,7 +62,7 @@ class World:
         self._clear = clearance(self._occupied)
         self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiled now rather than within somebody's deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
-        self._lidar = SimulatedLidar(self._plant, self._cast, config.lidar, noise_seed)
+        self._lidar = SimulatedLidar(self._plant, self._cast, self._terrain, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
         self.view: ViewSource = SimulatedView(self._plant, self._cast, config.camera)
         self.motors: tuple[MotorPlant, ...] = tuple(
@@ -172,9 +173,9 @@ class World:
     def _attitude(self, elapsed_ns: int, x: float, y: float, yaw: float) -> tuple[float, float]:
         if isinstance(self._tilt, SinusoidTilt):
             return rocking(self._tilt, elapsed_ns)
-        if self._profile is None:
+        if self._terrain is None:
             return 0.0, 0.0
-        return self._profile.tilt(x, yaw, self._truck.wheelbase, self._truck.track)
+        return self._terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)
 
 
 def _find(name: str) -> BuiltIn:

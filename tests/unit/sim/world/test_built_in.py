@@ -12,9 +12,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.built_in import BUILT_IN, lap, make_worlds
-from monstertruck_sim.world.config import LidarConfig, ServoModelConfig, SimTruckConfig, WorldConfig
+from monstertruck_sim.world.config import LidarConfig, RoughPatch, ServoModelConfig, SimTruckConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Disc, penetration
-from monstertruck_sim.world.terrain import Profile, load_profile
+from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain, load_profile
 from monstertruck_sim.world.world import World
 
 CONFIGS = Path(__file__).parents[4] / "configs"
@@ -66,14 +66,32 @@ def test_lap_file():
     np.testing.assert_allclose([[float(v) for v in line.split(",")[:3]] for line in lines[1:]], lap(), atol=1e-4)
 
 
-def test_profile_gives_pitch_and_roll_by_heading():
-    slope = Profile(((0.0, 0.0), (10.0, 10.0 * np.tan(radians(10)))))
-    assert slope.tilt(5, 0.0, 0.32, 0.26) == pytest.approx((-radians(10), 0.0))  # uphill: nose up
-    assert slope.tilt(5, pi, 0.32, 0.26) == pytest.approx((radians(10), 0.0))
-    assert slope.tilt(5, pi / 2, 0.32, 0.26) == pytest.approx((0.0, -radians(10)))  # left wheels lower
-    assert slope.tilt(5, -pi / 2, 0.32, 0.26) == pytest.approx((0.0, radians(10)))
-    half = slope.tilt(0.0, 0.0, 0.32, 0.26)[0]
+def test_terrain_gives_pitch_and_roll_by_heading():
+    slope = Terrain(Profile(((0.0, 0.0), (10.0, 10.0 * np.tan(radians(10))))), ())
+    assert slope.tilt(5, 0, 0.0, 0.32, 0.26) == pytest.approx((-radians(10), 0.0))  # uphill: nose up
+    assert slope.tilt(5, 0, pi, 0.32, 0.26) == pytest.approx((radians(10), 0.0))
+    assert slope.tilt(5, 0, pi / 2, 0.32, 0.26) == pytest.approx((0.0, -radians(10)))  # left wheels lower
+    assert slope.tilt(5, 0, -pi / 2, 0.32, 0.26) == pytest.approx((0.0, radians(10)))
+    half = slope.tilt(0.0, 0, 0.0, 0.32, 0.26)[0]
     assert -radians(10) < half < 0
+
+
+def test_a_rough_patch_tilts_the_truck_there_and_nowhere_else():
+    rough = Terrain(LEVEL, (RoughPatch(x=2.0, y=0.0, length=1.0, width=0.8, height=0.02, wavelength=0.45),))
+    xs = np.linspace(0.0, 4.0, 201)
+    tilts = np.array([np.hypot(*rough.tilt(x, 0.1, 0.0, 0.32, 0.26)) for x in xs])
+    on = abs(xs - 2.0) < 0.5 + 0.16
+    assert tilts[on].max() > 0.05
+    assert not tilts[~on].any()
+    assert not any(rough.tilt(x, 1.0, 0.0, 0.32, 0.26) != (0.0, 0.0) for x in xs)
+
+
+def test_beams_meet_the_ground_where_it_rises_to_them():
+    slope = Terrain(Profile(((1.0, 0.0), (2.0, 0.5))), ())
+    headings = np.array((0.0, 0.0, pi, pi / 3))
+    rises = np.array((0.0, -0.1, 0.0, 0.0))
+    met = slope.cast(np.zeros(4), np.zeros(4), np.full(4, 0.25), headings, rises, 5.6)
+    assert met == pytest.approx((1.5, (0.25 + 0.5) / 0.6, np.inf, 1.5 / np.cos(pi / 3)), abs=1e-6)
 
 
 def test_ramp_world_tilts_the_truck():

@@ -5,9 +5,18 @@ from math import degrees, pi, radians
 import numpy as np
 import pytest
 
-from monstertruck_sim.world.config import BatteryModelConfig, CompassModelConfig, Iron, LidarConfig, SinusoidTilt
+from monstertruck_schemas.base import Pose2D
+from monstertruck_sim.world.config import (
+    BatteryModelConfig,
+    CompassModelConfig,
+    Iron,
+    LidarConfig,
+    SinusoidTilt,
+    WorldConfig,
+)
 from monstertruck_sim.world.obstacles import Box, Disc
 from monstertruck_sim.world.sensors import FAILED, NO_RETURN, TOO_NEAR
+from monstertruck_sim.world.world import World
 
 ANGLES = (np.arange(769) - 384) * 2 * pi / 1024
 WALLS = [(-2.05, -2.05, 2.05, -2.0), (-2.05, 2.0, 2.05, 2.05), (-2.05, -2, -2, 2), (2.0, -2, 2.05, 2)]
@@ -167,6 +176,39 @@ def test_heading_survives_tilt_and_vectors_agree(field):
         signs.add((np.sign(up[0]), np.sign(up[1])))
     assert len(signs) == 4
     assert down @ up < 0
+
+
+def test_the_accelerometer_feels_the_drive(field):
+    driver = field()
+    driver.drive(0.5, acceleration=30_000.0)
+    driver.wait(0.5)
+    first, reading = driver.world.truth(driver.now), driver.world.compass.compass(driver.now)
+    gained = (driver.wait(0.01).v - first.v) / 0.01
+    assert gained > 0.2
+    assert reading.acceleration[0] * 9.81 == pytest.approx(gained, rel=0.3)
+    assert reading.pitch_deg == pytest.approx(degrees(np.arctan(gained / 9.81)), rel=0.3)
+    driver.wait(5)
+    assert driver.world.compass.compass(driver.now).pitch_deg == pytest.approx(0.0, abs=0.01)
+    driver.steer(0.4, -0.4)
+    truth = driver.wait(2)
+    reading = driver.world.compass.compass(driver.now)
+    assert reading.acceleration[1] * 9.81 == pytest.approx(truth.v * truth.wz, rel=0.02)
+    assert reading.roll_deg == pytest.approx(degrees(np.arctan(truth.v * truth.wz / 9.81)), rel=0.02)
+
+
+def test_a_ramp_ahead_is_seen_as_geometry(field):
+    world = World(WorldConfig(map="ramp", noise=False), seed=1)
+    scan = world.lidar.scan(0)
+    foot, lidar, rise = 1.0, 0.14, np.tan(radians(8))
+    assert LidarConfig().height > 0.2108, "the landing is below the scanning plane"
+    low = World(WorldConfig(map="ramp", noise=False, lidar=LidarConfig(height=0.15)), seed=1).lidar.scan(0)
+    assert scan[384] == NO_RETURN
+    assert low[384] == pytest.approx((foot + 0.15 / rise - lidar) * 1000, abs=2)
+    down = World(WorldConfig(map="ramp", noise=False, start=Pose2D(x=1.75, y=0.0, yaw=pi)), seed=1).lidar.scan(0)
+    height = 0.25 + (1.75 - foot) * rise - 0.14 * rise  # of the lidar, over the level ground
+    assert down[384] == pytest.approx(
+        1000 * min(height / np.sin(radians(8)), (1.75 + 1.0 - 0.14) / np.cos(radians(8))), abs=15
+    )
 
 
 def test_compass_error_is_smooth_fixed_and_below_half_a_degree(field):
