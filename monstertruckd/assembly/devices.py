@@ -12,7 +12,7 @@ from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubNode, HubPort, PortPower
 from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSource
 from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
-from monstertruck_estimation.scan_tilt import TiltStamper
+from monstertruck_estimation.scan_tilt import ScanAngles, TiltStamper
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Delivery, latest
 from monstertruck_runtime.ports import Publisher
@@ -158,8 +158,14 @@ def _publisher(
 def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
     """Where scans go: with the tilt of their plane, as far as compass and stabiliser tell it."""
     out = bus.publisher(topics.SCAN, Writer.DRIVER)
-    if config.devices.compass is None:
-        return out
-    stabiliser = config.devices.stabiliser
-    joints = bus.subscribe(topics.STABILISER, RECENT) if stabiliser is not None else None
-    return TiltStamper(out, bus.subscribe(topics.COMPASS, RECENT), joints)
+    angles = scan_angles(config, bus, RECENT)
+    return out if angles is None else TiltStamper(out, angles)
+
+
+def scan_angles(config: TruckConfig, bus: Bus, delivery: Delivery) -> ScanAngles | None:
+    """Angles of body and lidar mount at the time of scans; None without a compass."""
+    devices = config.devices
+    if devices.compass is None:
+        return None
+    joints = bus.subscribe(topics.STABILISER, delivery) if devices.stabiliser is not None else None
+    return ScanAngles(bus.subscribe(topics.COMPASS, delivery), joints)

@@ -6,6 +6,8 @@ from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
+from monstertruck_estimation.ground.grid import GroundGrid
+from monstertruck_estimation.ground.service import GroundService
 from monstertruck_estimation.odometry import OdometryContext
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
@@ -17,6 +19,7 @@ from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import Writer
+from monstertruckd.assembly.devices import scan_angles
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 
@@ -70,6 +73,36 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
     compass, slam_runs = config.devices.compass is not None, config.slam is not None
     context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs)
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
+    ground = _build_ground(config, bus, clock)
+    if ground is not None:
+        yield ground
+
+
+def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService | None:
+    """Where routes are planned by a robot that feels its tilt."""
+    devices, slam = config.devices, config.slam
+    if config.ground is None or config.planner is None or devices.compass is None:
+        return None
+    lidar = devices.lidar
+    known = slam.map if slam is not None else config.planner.map
+    folder = known.parent if known is not None and known.suffix else known
+    geometry = config.geometry
+    return GroundService(
+        config.ground,
+        clock,
+        footprint=(geometry.length, geometry.width),
+        wheelbase=geometry.wheelbase,
+        mount=None if lidar is None else lidar.mount,
+        compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)),
+        angles=None if lidar is None else scan_angles(config, bus, fifo(ODOMETRIES)),
+        pose=bus.subscribe(topics.ODOMETRY if slam is None else topics.POSE, latest()),
+        scan=None if lidar is None else bus.subscribe(topics.SCAN, fifo(SCANS)),
+        slip=bus.subscribe(topics.FUSION, latest()),
+        out=bus.publisher(topics.GROUND, Writer.ESTIMATION),
+        events=bus.event_sink(),
+        grid=GroundGrid() if folder is None else GroundGrid.load(folder),
+        save=slam.save if slam is not None and slam.mode == "mapping" else None,
+    )
 
 
 def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
@@ -82,8 +115,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
         clock,
         scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
         odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
-        compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)) if devices.compass is not None else None,
-        joints=bus.subscribe(topics.STABILISER, fifo(ODOMETRIES)) if devices.stabiliser is not None else None,
+        angles=scan_angles(config, bus, fifo(ODOMETRIES)),
         pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
         whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
         tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),

@@ -11,6 +11,7 @@ from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
+from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import Chassis, Dimensions
@@ -112,6 +113,8 @@ class TruckConfig(Schema):
     map: MapRender | None = None
     slam: SlamConfig | None = None
     """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""
+    ground: GroundConfig | None = GroundConfig()
+    """Tilt and roughness of the ground, for the routes of a robot with a compass; null = not estimated"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
     """The minute before every trip of the gate; null = not kept"""

@@ -71,23 +71,50 @@ class AngleHistory:
         return old[0] + share * (new[0] - old[0]), old[1] + share * (new[1] - old[1])
 
 
+class ScanAngles:
+    """Angles of body and mount when a scan was taken.
+
+    Args:
+        compass: the body's tilt.
+        joints: of the mount; None = the lidar is fixed to the body.
+    """
+
+    def __init__(self, compass: Mailbox[Attitude], joints: Mailbox[StabiliserFeedback] | None) -> None:
+        self._compass = compass
+        self._feedback = joints
+        self._body = AngleHistory()
+        self._mount = AngleHistory()
+
+    @property
+    def jointed(self) -> bool:
+        """Whether the mount has joints."""
+        return self._feedback is not None
+
+    def at(self, scan: LaserScan) -> tuple[float, float, float, float] | None:
+        """Roll and pitch of the body, pitch and roll of the joints in the middle of ``scan``, rad; None = unknown."""
+        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
+        middle = scan.stamp + round(scan.time_increment * len(scan.ranges) / 2 * SECOND)
+        body = self._body.at(middle)
+        if self._feedback is None:
+            return None if body is None else (*body, 0.0, 0.0)
+        self._mount.extend(
+            (f.stamp, (f.pitch, f.roll)) for f in self._feedback.drain() if f.pitch is not None and f.roll is not None
+        )
+        joints = self._mount.at(middle)
+        return None if body is None or joints is None else (*body, *joints)
+
+
 class TiltStamper:
     """Publisher of scans that adds their ``tilt``.
 
     Args:
         out: where scans go.
-        compass: the body's tilt.
-        joints: of the mount; None = the lidar is fixed to the body.
+        angles: of body and mount.
     """
 
-    def __init__(
-        self, out: Publisher[LaserScan], compass: Mailbox[Attitude], joints: Mailbox[StabiliserFeedback] | None
-    ) -> None:
+    def __init__(self, out: Publisher[LaserScan], angles: ScanAngles) -> None:
         self._out = out
-        self._compass = compass
-        self._feedback = joints
-        self._body = AngleHistory()
-        self._mount = AngleHistory()
+        self._angles = angles
 
     def next_seq(self) -> int:
         """Sequence number for the next scan."""
@@ -95,19 +122,6 @@ class TiltStamper:
 
     def put(self, message: LaserScan) -> None:
         """Publish a scan with the tilt its plane had in its middle."""
-        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
-        if self._feedback is not None:
-            self._mount.extend(
-                (f.stamp, (f.pitch, f.roll))
-                for f in self._feedback.drain()
-                if f.pitch is not None and f.roll is not None
-            )
-        middle = message.stamp + round(message.time_increment * len(message.ranges) / 2 * SECOND)
-        self._out.put(message.model_copy(update={"tilt": self._tilt(middle)}))
-
-    def _tilt(self, time_ns: int) -> float | None:
-        body = self._body.at(time_ns)
-        if self._feedback is None:
-            return None if body is None else plane_tilt(*body)
-        joints = self._mount.at(time_ns)
-        return UNKNOWN if body is None or joints is None else plane_tilt(*body, *joints)
+        angles = self._angles.at(message)
+        unknown = UNKNOWN if self._angles.jointed else None
+        self._out.put(message.model_copy(update={"tilt": unknown if angles is None else plane_tilt(*angles)}))

@@ -1,7 +1,7 @@
 """Messages of the ``state`` group: what the robot believes and in which state it is."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import Field
 
@@ -14,6 +14,7 @@ from monstertruck_schemas.base import (
     Pose2D,
     Schema,
     Twist2D,
+    UInt8Array,
 )
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm, Role
@@ -76,6 +77,29 @@ class Grid(Message):
     """Pose of the outer corner of cell (0, 0)."""
     cells: Int8Array
     """Shape (height * width,): -1 unknown, 0 free ... 100 occupied."""
+
+
+TILT_STEP: Final = 0.005
+"""Unit of ``Ground.tilt``, rad."""
+ROUGHNESS_STEP: Final = 0.001
+"""Unit of ``Ground.roughness``, m."""
+GROUND_UNKNOWN: Final = 255
+"""Value of a cell of ``Ground`` that was neither driven over nor seen."""
+
+
+class Ground(Message):
+    """What the ground is like where it is known: row 0 is the lowest y, column 0 the lowest x."""
+
+    resolution: Annotated[float, Field(gt=0)]
+    """Metres per cell."""
+    width: Annotated[int, Field(gt=0)]
+    height: Annotated[int, Field(gt=0)]
+    origin: Pose2D
+    """Pose of the outer corner of cell (0, 0)."""
+    tilt: UInt8Array
+    """Shape (height * width,): angle to the horizontal in units of ``TILT_STEP``; 255 unknown."""
+    roughness: UInt8Array
+    """Shape (height * width,): standard deviation of the height in units of ``ROUGHNESS_STEP``; 255 unknown."""
 
 
 class ClockOffset(Message):

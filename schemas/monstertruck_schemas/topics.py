@@ -38,7 +38,7 @@ from monstertruck_schemas.sensor import (
     StabiliserFeedback,
     SteeringFeedback,
 )
-from monstertruck_schemas.state import ClockOffset, GateState, Grid, Odometry, ScanMotion, Transforms
+from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, ScanMotion, Transforms
 from monstertruck_schemas.usb import UsbTree
 
 M = TypeVar("M", bound=Message)
@@ -151,6 +151,14 @@ MAP_TILES: Final = Topic(
     Grid,
     W.ESTIMATION,
     "Tiles of the occupancy grid that have changed since the message of the whole grid, one each",
+    foxglove="foxglove.Grid",
+)
+GROUND: Final = Topic(
+    "state/ground",
+    Ground,
+    W.ESTIMATION,
+    "Tilt and roughness of the ground that was driven over or seen",
+    retained=True,
     foxglove="foxglove.Grid",
 )
 GATE: Final = Topic(

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
@@ -28,7 +27,7 @@ class Profile:
 
     points: tuple[tuple[float, float], ...]
 
-    def height(self, x: ArrayLike) -> Array:
+    def height(self, x: Array) -> Array:
         """Metres; of the shape of ``x``."""
         return np.asarray(np.interp(x, [p[0] for p in self.points], [p[1] for p in self.points]))
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_estimation.scan_tilt import AngleHistory, plane_slopes
+from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
 from monstertruck_estimation.se2 import SmoothedCorrection, Vector, between, interpolate
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker_io import (
@@ -32,7 +32,7 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse, SlamHealth
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
+from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
@@ -56,8 +56,7 @@ class SlamService:
         clock: time.
         scan: lidar, bounded and counted.
         odometry: pose in odom; None = the robot has none, the pose is then published once a scan.
-        compass: tilt of the body, to discard hits of the ground.
-        joints: of the lidar's mount.
+        angles: of body and mount at the time of scans, to discard hits of the ground; None = no compass.
         pose: ``state/pose``.
         whole: ``state/map``.
         tiles: ``state/map_tiles``.
@@ -76,8 +75,7 @@ class SlamService:
         *,
         scan: Mailbox[LaserScan],
         odometry: Mailbox[Odometry] | None,
-        compass: Mailbox[Attitude] | None,
-        joints: Mailbox[StabiliserFeedback] | None,
+        angles: ScanAngles | None,
         pose: Publisher[Odometry],
         whole: Publisher[Grid],
         tiles: Publisher[Grid],
@@ -86,11 +84,10 @@ class SlamService:
         events: EventSink,
     ) -> None:
         self._config, self._mount, self._clock = config, mount, clock
-        self._scan, self._odometry, self._compass, self._joints = scan, odometry, compass, joints
+        self._scan, self._odometry, self._angles = scan, odometry, angles
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
         self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
-        self._body, self._angles = AngleHistory(), AngleHistory()
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._status: LocalisationStatus | None = None
@@ -247,18 +244,8 @@ class SlamService:
         return (x, y, yaw), (vx, vy, wz)
 
     def _slopes(self, scan: LaserScan) -> tuple[float, float] | None:
-        if self._compass is None:
-            return None
-        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
-        middle = scan.stamp + round(scan.time_increment * len(scan.ranges) / 2 * SECOND)
-        body = self._body.at(middle)
-        if self._joints is None:
-            return None if body is None else plane_slopes(*body, yaw=self._mount.yaw)
-        self._angles.extend(
-            (f.stamp, (f.pitch, f.roll)) for f in self._joints.drain() if f.pitch is not None and f.roll is not None
-        )
-        angles = self._angles.at(middle)
-        return None if body is None or angles is None else plane_slopes(*body, *angles, yaw=self._mount.yaw)
+        angles = None if self._angles is None else self._angles.at(scan)
+        return None if angles is None else plane_slopes(*angles, yaw=self._mount.yaw)
 
     def _start(self, odom: Vector | None) -> Vector:
         """Where a new map begins: the present pose in map."""

@@ -29,7 +29,7 @@ from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
-from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
+from monstertruck_schemas.state import Grid, Ground, Odometry, Transform, Transforms
 
 
 def _files(file: FileDescriptor) -> dict[str, FileDescriptorProto]:
@@ -266,6 +266,45 @@ def _read_grid(proto: Any) -> Grid:
     )
 
 
+_GROUND: Final = ("tilt", "roughness")
+"""Layers of a ``Ground``: a byte each in every cell."""
+
+
+def _write_ground(ground: Ground, proto: Any) -> None:
+    layers = [getattr(ground, name) for name in _GROUND]
+    if any(layer.size != ground.width * ground.height for layer in layers):
+        msg = f"ground of {ground.width} x {ground.height} has {[layer.size for layer in layers]} cells"
+        raise InputError(msg)
+    _write_header(ground, proto)
+    origin = ground.origin.x, ground.origin.y, ground.origin.yaw
+    _write_planar(proto.pose, *origin)
+    proto.origin2d = _packed(*origin)
+    proto.column_count = ground.width
+    proto.row_stride = ground.width * len(_GROUND)
+    proto.cell_stride = len(_GROUND)
+    proto.cell_size.x = proto.cell_size.y = ground.resolution
+    for offset, name in enumerate(_GROUND):
+        proto.fields.add(name=name, offset=offset, type="UINT8")
+    proto.data = np.column_stack(layers).tobytes()
+
+
+def _read_ground(proto: Any) -> Ground:
+    width, data, stride = proto.column_count, proto.data, len(_GROUND)
+    if proto.cell_stride != stride or proto.row_stride != stride * width or width == 0 or len(data) % (stride * width):
+        msg = f"ground of {len(data)} bytes, {width} columns: expected whole rows of {stride} bytes per cell"
+        raise InputError(msg)
+    layers = np.frombuffer(data, np.uint8).reshape(-1, stride)
+    return Ground(
+        **_own_header(proto),
+        resolution=proto.cell_size.x,
+        width=width,
+        height=len(layers) // width,
+        origin=_pose2d(proto.origin2d, proto.pose),
+        tilt=layers[:, 0].copy(),
+        roughness=layers[:, 1].copy(),
+    )
+
+
 def _write_transforms(tree: Transforms, proto: Any) -> None:
     _write_counters(tree, proto)
     proto.stamp = tree.stamp
@@ -358,6 +397,7 @@ _BINDINGS: Final[dict[type[Message], _Binding]] = {
     Odometry: _binding("PoseInFrame", _write_odometry, _read_odometry),
     Path: _binding("PosesInFrame", _write_path, _read_path),
     Grid: _binding("Grid", _write_grid, _read_grid),
+    Ground: _binding("Grid", _write_ground, _read_ground),
     Transforms: _binding("FrameTransforms", _write_transforms, _read_transforms),
     LogRecord: _binding("Log", _write_log, _read_log),
 }

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.scan_tilt import UNKNOWN, AngleHistory, TiltStamper, plane_tilt
+from monstertruck_estimation.scan_tilt import UNKNOWN, AngleHistory, ScanAngles, TiltStamper, plane_tilt
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback, StabiliserJoint, TorqueState
@@ -79,7 +79,7 @@ def test_a_track_goes_straight_between_its_readings_and_a_little_beyond():
 
 def test_without_a_stabiliser_the_scan_has_the_bodys_tilt_in_its_middle():
     out, compass = Kept(), Mailbox[Attitude](RECENT)
-    stamper = TiltStamper(out, compass, None)
+    stamper = TiltStamper(out, ScanAngles(compass, None))
     stamper.put(scan(0))
     compass.put(attitude(100 * MS, pitch=0.1))
     compass.put(attitude(150 * MS, pitch=0.2))
@@ -91,7 +91,7 @@ def test_without_a_stabiliser_the_scan_has_the_bodys_tilt_in_its_middle():
 
 def test_joints_level_what_the_body_tilts():
     out, compass, feedback = Kept(), Mailbox[Attitude](RECENT), Mailbox[StabiliserFeedback](RECENT)
-    stamper = TiltStamper(out, compass, feedback)
+    stamper = TiltStamper(out, ScanAngles(compass, feedback))
     for at in (0, 50, 100):
         compass.put(attitude(at * MS, pitch=0.002 * at))
         feedback.put(joints(at * MS, pitch=-0.002 * at))
@@ -105,5 +105,5 @@ def test_a_mount_that_tells_nothing_makes_the_worst_of_the_scan(reading: Stabili
     compass.put(attitude(0, pitch=0.0))
     if reading is not None:
         feedback.put(reading)
-    TiltStamper(out, compass, feedback).put(scan(0))
+    TiltStamper(out, ScanAngles(compass, feedback)).put(scan(0))
     assert out.scans[0].tilt == UNKNOWN

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.error_model import discretise, exponential, riccati
 from monstertruck_planners.track.fuzzy import FuzzyInputs, Rules
 from monstertruck_planners.track.path_tracker import AxleModel, SpeedProfile
 from monstertruck_planners.track.segments import Reference, SegmentedPath
-from monstertruck_planners.track.service import TerrainEstimator
 from tests.unit.planners.kit import STEERING, circle, figure_eight, path, straight
 
 

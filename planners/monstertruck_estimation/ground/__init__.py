@@ -1,0 +1,1 @@
+"""Tilt and roughness of the ground."""

@@ -1,0 +1,170 @@
+"""Tilt and roughness of the ground by cells, from what the robot felt driving over it and what tilted scans hit."""
+
+import io
+import math
+import zipfile
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import replace_file
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Ground
+
+FILE: Final = "ground.npz"
+"""In the folder of a saved map."""
+RESOLUTION: Final = 0.1
+"""m."""
+MARGIN: Final = 20
+"""Cells added when the grid has to grow."""
+LARGEST: Final = 2000
+"""Cells a side at most; what lies outside is left out."""
+REMEMBERED: Final = 20
+"""Values a cell is the mean of; a later one counts as if there had been so many."""
+PATCH: Final = 0.3
+"""Side of the squares a plane is fitted to, m."""
+FEWEST: Final = 8
+"""Points of such a plane."""
+SPREAD: Final = 0.05
+"""Standard deviation they need in every direction, m."""
+
+Cells = NDArray[np.int64]
+
+
+class GroundGrid:
+    """Grows with what is observed; axes are those of the frame."""
+
+    def __init__(self) -> None:
+        self._corner: Cells = np.zeros(2, np.int64)
+        """Column and row of the lower left cell, counted from the frame's origin."""
+        self._counts: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._tilt = self._roughness = np.zeros((0, 0), np.float32)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was observed."""
+        return not self._counts.any()
+
+    def observe(self, points: Array, tilt: float, roughness: float) -> None:
+        """Count an observation of the cells of ``points``, (n, 2), m.
+
+        Args:
+            points: one or more in each cell that is observed.
+            tilt: of the ground, rad.
+            roughness: standard deviation of its height, m.
+        """
+        cells = np.unique(np.floor(points / RESOLUTION).astype(np.int64), axis=0)
+        if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
+            return
+        columns, rows = (cells - self._corner).T
+        count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, REMEMBERED)
+        for layer, value in ((self._tilt, tilt), (self._roughness, roughness)):
+            layer[rows, columns] += (value - layer[rows, columns]) / count
+
+    def message(self, stamp: int, seq: int, frame: str) -> Ground:
+        """The layers as published; of an empty grid there is none."""
+        rows, columns = self._counts.shape
+        x, y = (self._corner * RESOLUTION).tolist()
+        return Ground(
+            stamp=stamp,
+            received=stamp,
+            seq=seq,
+            frame=frame,
+            resolution=RESOLUTION,
+            width=columns,
+            height=rows,
+            origin=Pose2D(x=x, y=y, yaw=0.0),
+            tilt=self._quantised(self._tilt, TILT_STEP),
+            roughness=self._quantised(self._roughness, ROUGHNESS_STEP),
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the grid beside a saved map.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        content = io.BytesIO()
+        np.savez_compressed(
+            content, corner=self._corner, counts=self._counts, tilt=self._tilt, roughness=self._roughness
+        )
+        replace_file(folder / FILE, content.getvalue())
+
+    @classmethod
+    def load(cls, folder: Path) -> "GroundGrid":
+        """Read what ``save`` wrote; an empty grid if the map has none.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        grid, path = cls(), folder / FILE
+        if not path.exists():
+            return grid
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                corner, counts, tilt, roughness = (file[name] for name in ("corner", "counts", "tilt", "roughness"))
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path}: not a grid of the ground: {error}") from error
+        shapes = {counts.shape, tilt.shape, roughness.shape}
+        if corner.shape != (2,) or counts.ndim != 2 or len(shapes) != 1 or max(counts.shape) > LARGEST:
+            raise InputError(f"{path}: layers of shapes {sorted(shapes)}: expected one of at most {LARGEST} a side")
+        if not (np.isfinite(tilt).all() and np.isfinite(roughness).all()):
+            raise InputError(f"{path}: expected finite tilt and roughness")
+        grid._corner, grid._counts = corner.astype(np.int64), counts.astype(np.uint8)
+        grid._tilt, grid._roughness = tilt.astype(np.float32), roughness.astype(np.float32)
+        return grid
+
+    def _quantised(self, layer: NDArray[np.float32], step: float) -> NDArray[np.uint8]:
+        values: NDArray[np.uint8] = np.minimum(np.rint(layer / step), GROUND_UNKNOWN - 1).astype(np.uint8)
+        values[self._counts == 0] = GROUND_UNKNOWN
+        values = values.reshape(-1)
+        values.flags.writeable = False
+        return values
+
+    def _grow(self, low: Cells, high: Cells) -> bool:
+        """Make room for the cells from ``low`` to ``high``; False if that would be too large."""
+        size = np.array(self._counts.shape[::-1])
+        if not size.all():
+            self._corner, size = low.copy(), np.zeros(2, np.int64)
+        before = np.where(low < self._corner, self._corner - low + MARGIN, 0)
+        behind = np.where(high >= self._corner + size, high + 1 - self._corner - size + MARGIN, 0)
+        if not (before.any() or behind.any()):
+            return True
+        if (size + before + behind).max() > LARGEST:
+            return False
+        widths = ((before[1], behind[1]), (before[0], behind[0]))
+        self._counts = np.pad(self._counts, widths)
+        self._tilt, self._roughness = np.pad(self._tilt, widths), np.pad(self._roughness, widths)
+        self._corner = self._corner - before
+        return True
+
+
+def planes(points: Array) -> list[tuple[Array, float, float]]:
+    """Planes through points on the ground, square by square.
+
+    Args:
+        points: shape (n, 3), m.
+
+    Returns:
+        For each square with enough of them: its points (k, 2), the plane's tilt, rad, and the standard deviation of
+        the heights about it, m.
+    """
+    found = []
+    squares = np.floor(points[:, :2] / PATCH).astype(np.int64)
+    _, which = np.unique(squares, axis=0, return_inverse=True)
+    for number in range(int(which.max(initial=-1)) + 1):
+        own = points[which.reshape(-1) == number]
+        if len(own) < FEWEST:
+            continue
+        centred = own - own.mean(axis=0)
+        moments = centred[:, :2].T @ centred[:, :2] / len(own)
+        if np.linalg.eigvalsh(moments)[0] < SPREAD**2:
+            continue
+        slope = np.linalg.solve(moments, centred[:, :2].T @ centred[:, 2] / len(own))
+        rest = centred[:, 2] - centred[:, :2] @ slope
+        found.append((own[:, :2], math.atan(math.hypot(*slope)), float(rest.std())))
+    return found

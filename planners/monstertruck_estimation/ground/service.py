@@ -1,0 +1,206 @@
+"""The ground as a service: compass, scans and slip into a grid of tilt and roughness, published and saved."""
+
+import math
+from collections import deque
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.ground.config import GroundConfig
+from monstertruck_estimation.ground.grid import RESOLUTION, GroundGrid, planes
+from monstertruck_estimation.ground.terrain import TerrainEstimator
+from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND, Clock, Schedule, VirtualClock
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.threads import in_thread
+from monstertruck_schemas.body import Mount
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import OdometryHealth
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude, LaserScan
+from monstertruck_schemas.state import Ground, Odometry
+from monstertruck_schemas.topics import FUSION, ODOMETRY
+
+RATE: Final = 10.0
+"""Hz."""
+MOVED: Final = 0.05
+"""Metres between two observations of the ground under the robot..."""
+TURNED: Final = 0.2
+"""...or radians."""
+NEAR_GROUND: Final = 0.10
+"""Beams that go down and end this near to the robot's own level hit the ground, m."""
+DESCENT: Final = 0.03
+"""Metres a metre they have to fall."""
+KEPT: Final = 3 * SECOND
+"""Such points are put together for so long, ns: the robot's own height is integrated from its pitch and drifts."""
+FIT_EVERY: Final = SECOND
+"""Between two fits of planes to them, ns."""
+
+
+class GroundService:
+    """Publishes what was felt and seen of the ground.
+
+    Args:
+        config: periods.
+        clock: time.
+        footprint: length and width of the robot, m.
+        wheelbase: m.
+        mount: of the lidar; None = there is none.
+        compass: tilt of the body.
+        angles: body and mount at the time of scans; None = there is no lidar.
+        pose: in the frame of the routes.
+        scan: points on the ground; None = there is no lidar.
+        slip: what the odometry says of it.
+        out: ``state/ground``.
+        events: where failures to load or save are reported.
+        grid: what is known of the ground at the start.
+        save: folder the grid is saved to; None = nowhere.
+    """
+
+    name = "ground"
+
+    def __init__(
+        self,
+        config: GroundConfig,
+        clock: Clock,
+        *,
+        footprint: tuple[float, float],
+        wheelbase: float,
+        mount: Mount | None,
+        compass: Mailbox[Attitude],
+        angles: ScanAngles | None,
+        pose: Mailbox[Odometry],
+        scan: Mailbox[LaserScan] | None,
+        slip: Mailbox[OdometryHealth],
+        out: Publisher[Ground],
+        events: EventSink,
+        grid: GroundGrid,
+        save: Path | None = None,
+    ) -> None:
+        self._config, self._clock, self._wheelbase, self._mount = config, clock, wheelbase, mount
+        self._compass, self._angles, self._pose, self._scan, self._slip = compass, angles, pose, scan, slip
+        self._out, self._events, self._grid, self._save = out, events, grid, save
+        self._cells = _spread(*footprint)
+        self._terrain = TerrainEstimator()
+        self._attitude: Attitude | None = None
+        self._marked: Array | None = None
+        self._travelled: tuple[float, float] | None = None
+        """Where the robot's height was integrated to: x and y, m."""
+        self._height = 0.0
+        self._hits: deque[tuple[int, Array]] = deque()
+        self._changed = False
+
+    async def run(self, ready: Ready) -> None:
+        """Observe until cancelled, then save."""
+        self._changed = not self._grid.empty
+        ready()
+        schedule, now = Schedule(self._clock, RATE), self._clock.now()
+        due = {"message": now, "fit": now, "save": now + round(self._config.save_period * SECOND)}
+        try:
+            while True:
+                await schedule.next()
+                now = self._clock.now()
+                self._observe(now)
+                if now >= due["fit"]:
+                    due["fit"] = now + FIT_EVERY
+                    self._fit(now)
+                if now >= due["message"] and self._changed:
+                    due["message"] = now + round(self._config.period * SECOND)
+                    self._publish(now)
+                if now >= due["save"]:
+                    due["save"] = now + round(self._config.save_period * SECOND)
+                    if isinstance(self._clock, VirtualClock):
+                        self._write()
+                    else:
+                        await in_thread(self._write)
+        finally:
+            self._write()
+
+    def _observe(self, now: int) -> None:
+        for attitude in self._compass.drain():
+            if attitude.tilt_valid:
+                self._attitude = attitude
+                self._terrain.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
+        odometry, felt = self._pose.latest, self._attitude
+        scans = [] if self._scan is None else self._scan.drain()
+        if odometry is None or felt is None or now - odometry.received > ODOMETRY.fresh_for() * SECOND:
+            return
+        pose = np.array((odometry.pose.x, odometry.pose.y, odometry.pose.yaw))
+        self._climb(pose, felt.pitch)
+        for scan in scans:
+            self._see(scan, pose)
+        if self._marked is None:
+            self._marked = pose
+        elif np.hypot(*(pose - self._marked)[:2]) > MOVED or abs(pose[2] - self._marked[2]) > TURNED:
+            self._marked = pose
+            roughness = self._terrain.roughness * self._wheelbase / math.sqrt(2.0)
+            if (slip := self._slip.latest) is not None and slip.slipping and self._fresh(slip, now):
+                roughness = max(roughness, self._config.slip_roughness)
+            self._grid.observe(_placed(self._cells, pose), self._terrain.tilt, roughness)
+            self._changed = True
+
+    def _fresh(self, slip: OdometryHealth, now: int) -> bool:
+        return now - slip.received <= FUSION.fresh_for() * SECOND
+
+    def _climb(self, pose: Array, pitch: float) -> None:
+        """Integrate the robot's own height."""
+        x, y, yaw = pose.tolist()
+        if self._travelled is not None:
+            forward = (x - self._travelled[0]) * math.cos(yaw) + (y - self._travelled[1]) * math.sin(yaw)
+            self._height -= forward * math.sin(pitch)
+        self._travelled = (x, y)
+
+    def _see(self, scan: LaserScan, pose: Array) -> None:
+        """Keep the points of a scan at which it hit the ground."""
+        mount, angles = self._mount, None if self._angles is None else self._angles.at(scan)
+        if mount is None or angles is None:
+            return
+        sx, sy = plane_slopes(*angles, yaw=mount.yaw)
+        bearings = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
+        rise = np.cos(bearings) * sx + np.sin(bearings) * sy
+        valid = np.isfinite(scan.ranges) & (rise < -DESCENT)
+        ranges, rise, bearings = scan.ranges[valid], rise[valid], bearings[valid]
+        heights = mount.z + ranges * rise
+        hit = abs(heights) < NEAR_GROUND
+        level = ranges[hit] * np.sqrt(1.0 - rise[hit] ** 2)
+        local = np.column_stack((level * np.cos(bearings[hit]), level * np.sin(bearings[hit])))
+        in_frame = _placed(_placed(local, np.array(mount.planar)), pose)
+        self._hits.append((scan.stamp, np.column_stack((in_frame, heights[hit] + self._height))))
+
+    def _fit(self, now: int) -> None:
+        while self._hits and self._hits[0][0] < now - KEPT:
+            self._hits.popleft()
+        for points, tilt, roughness in planes(np.vstack([hits for _, hits in self._hits] or [np.empty((0, 3))])):
+            self._grid.observe(points, tilt, roughness)
+            self._changed = True
+
+    def _publish(self, now: int) -> None:
+        self._changed = False
+        pose = self._pose.latest
+        if pose is not None and not self._grid.empty:
+            self._out.put(self._grid.message(now, self._out.next_seq(), pose.frame))
+
+    def _write(self) -> None:
+        if self._save is None or self._grid.empty:
+            return
+        try:
+            self._save.mkdir(parents=True, exist_ok=True)
+            self._grid.save(self._save)
+        except OSError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"ground not saved: {error}")
+
+
+def _spread(length: float, width: float) -> Array:
+    """Points over a rectangle round the origin, at least one in each cell, (n, 2)."""
+    xs, ys = (np.linspace(-v / 2, v / 2, math.ceil(2 * v / RESOLUTION) + 1) for v in (length, width))
+    grid: Any = np.meshgrid(xs, ys)
+    return np.asarray(np.stack(grid, axis=-1).reshape(-1, 2))
+
+
+def _placed(points: Array, pose: Array) -> Array:
+    """Points (n, 2) of the frame at ``pose``, (3,), in the frame of the pose."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.asarray(points @ np.array(((c, s), (-s, c))) + pose[:2])

@@ -1,0 +1,37 @@
+"""Tilt under the robot, and how much it has changed lately."""
+
+import math
+from typing import Final
+
+WINDOW: Final = 2.0
+"""Time constant of the roughness, s."""
+
+
+class TerrainEstimator:
+    """Tilt, and its standard deviation over the last seconds (both axes together, exponentially weighted)."""
+
+    def __init__(self) -> None:
+        self.tilt = 0.0
+        """Angle between the robot's z axis and the vertical, rad."""
+        self._mean = (0.0, 0.0)
+        self._variance = 0.0
+        self._t: float | None = None
+
+    @property
+    def roughness(self) -> float:
+        """Standard deviation, rad."""
+        return math.sqrt(self._variance)
+
+    def add(self, t: float, roll: float, pitch: float) -> None:
+        """Count a sample taken at ``t`` seconds; one that is not newer than the last is left out."""
+        self.tilt = math.acos(min(math.cos(roll) * math.cos(pitch), 1.0))
+        if self._t is None:
+            self._mean = (roll, pitch)
+        elif t > self._t:
+            share = 1.0 - math.exp((self._t - t) / WINDOW)
+            off = (roll - self._mean[0], pitch - self._mean[1])
+            self._variance = (1.0 - share) * (self._variance + share * (off[0] ** 2 + off[1] ** 2))
+            self._mean = (self._mean[0] + share * off[0], self._mean[1] + share * off[1])
+        else:
+            return
+        self._t = t
