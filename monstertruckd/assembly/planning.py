@@ -140,6 +140,7 @@ def build_goals(
             path=bus.subscribe(topics.PATH, latest()),
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
+            ground=bus.subscribe(topics.GROUND, latest()),
         ),
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),

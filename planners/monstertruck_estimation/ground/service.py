@@ -24,6 +24,8 @@ from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import Ground, Odometry
 from monstertruck_schemas.topics import FUSION, ODOMETRY
 
+WINDOW: Final = 0.7
+"""Time constant of the roughness, s: about 0.15 m of way."""
 RATE: Final = 10.0
 """Hz."""
 MOVED: Final = 0.05
@@ -84,7 +86,7 @@ class GroundService:
         self._compass, self._angles, self._pose, self._scan, self._slip = compass, angles, pose, scan, slip
         self._out, self._events, self._grid, self._save = out, events, grid, save
         self._cells = _spread(*footprint)
-        self._terrain = TerrainEstimator()
+        self._terrain = TerrainEstimator(WINDOW)
         self._attitude: Attitude | None = None
         self._marked: Array | None = None
         self._travelled: tuple[float, float] | None = None

@@ -1,16 +1,17 @@
 """Tilt under the robot, and how much it has changed lately."""
 
 import math
-from typing import Final
-
-WINDOW: Final = 2.0
-"""Time constant of the roughness, s."""
 
 
 class TerrainEstimator:
-    """Tilt, and its standard deviation over the last seconds (both axes together, exponentially weighted)."""
+    """Tilt, and its standard deviation over the last seconds (both axes together, exponentially weighted).
 
-    def __init__(self) -> None:
+    Args:
+        window: time constant of the standard deviation, s.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window = window
         self.tilt = 0.0
         """Angle between the robot's z axis and the vertical, rad."""
         self._mean = (0.0, 0.0)
@@ -28,7 +29,7 @@ class TerrainEstimator:
         if self._t is None:
             self._mean = (roll, pitch)
         elif t > self._t:
-            share = 1.0 - math.exp((self._t - t) / WINDOW)
+            share = 1.0 - math.exp((self._t - t) / self._window)
             off = (roll - self._mean[0], pitch - self._mean[1])
             self._variance = (1.0 - share) * (self._variance + share * (off[0] ** 2 + off[1] ** 2))
             self._mean = (self._mean[0] + share * off[0], self._mean[1] + share * off[1])

@@ -10,7 +10,7 @@ from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid, Odometry
+from monstertruck_schemas.state import Grid, Ground, Odometry
 
 Pose = tuple[float, float, float]
 Place = tuple[float, float, float | None]
@@ -44,6 +44,8 @@ class PlanTask:
     setup: Setup | None = None
     grid: Grid | None = None
     """A newer map than before."""
+    ground: Ground | None = None
+    """Newer tilt and roughness of the ground than before."""
     clear: bool = False
     """Forget obstacles of older scans, but for those near the truck, and the route so far."""
     afresh: bool = False

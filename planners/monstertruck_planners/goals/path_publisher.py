@@ -15,7 +15,7 @@ from monstertruck_schemas.plan import GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest, Role
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import GateState, Grid, Odometry
+from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 
 SOURCE: Final = "goals"
 AT_REST: Final = 0.01
@@ -42,6 +42,7 @@ class GoalInputs:
     scan: Subscription[LaserScan] | None
     grid: Subscription[Grid] | None
     """None = the configured map."""
+    ground: Subscription[Ground] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,13 @@ An obstacle is kept until a scan sees through its place: a robot that looks ahea
 behind it, so nothing is forgotten by age.
 """
 
+import math
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, placed, points_relative, rectangle_distance
@@ -27,7 +29,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Grid, Ground
 
 Cells = NDArray[np.int8]
 
@@ -159,12 +161,52 @@ class StaticMap:
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
 
 
+def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array, Array]:
+    """Worst tilt, rad, and roughness, m, within ``reach`` (m) of a map's cells, 0 where nothing is known.
+
+    Both of the map's shape: what a vehicle meets whose middle is there.
+    """
+    pad = math.ceil(reach / ground.resolution)
+    shape = np.array((ground.height, ground.width)) + 2 * pad
+    origin = (ground.origin.x, ground.origin.y, ground.origin.yaw)
+    x0, y0, yaw = placed(np.array([(-pad * ground.resolution, -pad * ground.resolution, 0.0)]), origin)[0].tolist()
+    corner = (x0, y0, yaw)
+    row, column = _cells_within(grid, corner, shape * ground.resolution)
+    centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * grid.resolution
+    there = points_relative(placed(centres, grid.origin)[:, :2], corner) / ground.resolution
+    x, y = np.floor(there).astype(int).T
+    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    row, column, x, y = row[inside], column[inside], x[inside], y[inside]
+    layers = []
+    for layer, step in ((ground.tilt, TILT_STEP), (ground.roughness, ROUGHNESS_STEP)):
+        known = np.where(layer == GROUND_UNKNOWN, 0.0, layer * step).reshape(ground.height, ground.width)
+        worst = maximum_filter(np.pad(known, pad), 2 * pad + 1)
+        cells = np.zeros(grid.cells.shape)
+        cells[row, column] = worst[y, x]
+        layers.append(cells)
+    return layers[0], layers[1]
+
+
+def _cells_within(grid: StaticMap, corner: Pose, size: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of a map's cells round a rectangle: the pose of its corner, and its height and width, m."""
+    flat = np.array([(x, y, 0.0) for x in (0.0, size[1]) for y in (0.0, size[0])])
+    box = points_relative(placed(flat, corner)[:, :2], grid.origin) / grid.resolution
+    rows, columns = grid.cells.shape
+    left, bottom = np.clip(np.floor(box.min(axis=0)), 0, (columns, rows)).astype(int)
+    right, top = np.clip(np.ceil(box.max(axis=0)), 0, (columns, rows)).astype(int)
+    row, column = np.mgrid[bottom:top, left:right]
+    return row.ravel(), column.ravel()
+
+
 class PlanningStep:
     """Answers tasks one by one; without a clock equal tasks give equal answers."""
 
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._map: StaticMap | None = None
+        self._ground: Ground | None = None
+        self._layers: tuple[Array, Array] | None = None
+        """Tilt and roughness of the map's cells."""
         self._route_map: RouteMap | None = None
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
@@ -181,7 +223,9 @@ class PlanningStep:
         if self._setup is None:
             raise InputError("planning: expected a setup before anything else")
         if task.grid is not None:
-            self._map = StaticMap.of(task.grid, self._map)
+            self._map, self._layers = StaticMap.of(task.grid, self._map), None
+        if task.ground is not None:
+            self._ground, self._layers = task.ground, None
         if self._map is None:
             return PlanAnswer(Reason.NO_MAP, "no map yet")
         places = [value for place in task.via for value in place if value is not None]
@@ -204,6 +248,7 @@ class PlanningStep:
             self._now = processor_time
         if config.map is not None:
             world = load_map(config.map)
+            self._layers = None
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
     def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
@@ -224,11 +269,16 @@ class PlanningStep:
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
         cells = static_map.with_points(points) if len(points) else static_map.cells
+        if self._ground is not None and self._layers is None:
+            self._layers = ground_layers(self._ground, static_map, self._setup.footprint.width / 2)
+        tilt, roughness = self._layers or (None, None)
         self._route_map = route_map = RouteMap.from_cells(
             cells,
             static_map.resolution,
             static_map.origin,
             self._setup.config.route.unknown,
+            tilt,
+            roughness,
             previous=self._route_map,
         )
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))

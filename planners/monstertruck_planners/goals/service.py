@@ -33,7 +33,7 @@ from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid, Odometry
+from monstertruck_schemas.state import Grid, Ground, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 REPORT: Final = SECOND // 2
@@ -89,6 +89,7 @@ class GoalService:
         self._tasks: asyncio.TaskGroup | None = None
         self._fresh = True
         self._sent_grid: Grid | None = None
+        self._sent_ground: Ground | None = None
         self._scanned: LaserScan | None = None
         self._points: Array = np.empty((0, 2))
         self._changed = asyncio.Event()
@@ -275,6 +276,9 @@ class GoalService:
         pose = pose_of(odometry)
         points = placed(np.column_stack((points := self._scan(now), np.zeros(len(points)))), pose)[:, :2]
         grid = None if self._in.grid is None else self._in.grid.latest
+        ground = None if self._in.ground is None else self._in.ground.latest
+        if ground is not None and ground.frame != odometry.frame:
+            ground = None
         task = PlanTask(
             plan.what,
             pose,
@@ -282,11 +286,12 @@ class GoalService:
             points,
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
+            ground=ground if ground is not self._sent_ground or self._fresh else None,
             clear=plan.clear,
             afresh=plan.afresh,
             via=run.via,
         )
-        self._fresh, self._sent_grid = False, grid
+        self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
         self._planning = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: PlanTask) -> PlanAnswer:

@@ -49,7 +49,7 @@ class DriveCosts(GoalConfig):
     """Extra cost of a metre in contact, falling to 0 at ``clearance``, m."""
     tilt_cost: NotNegative = 2.0
     """Extra cost of a metre for each radian of tilt, m."""
-    roughness_cost: NotNegative = 10.0
+    roughness_cost: NotNegative = 100.0
     """Extra cost of a metre for each metre of roughness, m."""
 
 

@@ -29,6 +29,8 @@ from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 SOURCE: Final = "tracker"
 """Of the drive requests."""
 
+ROUGHNESS_WINDOW: Final = 2.0
+"""Time constant of the roughness that slows the truck down, s."""
 LOOKS: Final = 8
 """Poses ahead whose clearance counts."""
 
@@ -116,7 +118,7 @@ class TrackingStep:
         self._footprint = setup.footprint
         self._points = points or ScanPoints(setup.lidar)
         self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
-        self._terrain = TerrainEstimator()
+        self._terrain = TerrainEstimator(ROUGHNESS_WINDOW)
         self._seen: tuple[LaserScan, SegmentedPath] | None = None
         self._clearance_ahead = math.inf
         """Clearance ahead on that path, in that scan."""

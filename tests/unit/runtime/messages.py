@@ -11,7 +11,7 @@ from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import Cause, LogLevel, LogRecord, Measurement
 from monstertruck_schemas.plan import Path, Steering
 from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
-from monstertruck_schemas.state import Grid, Odometry, Transform, Transforms
+from monstertruck_schemas.state import Grid, Ground, Odometry, Transform, Transforms
 
 ns = st.integers(-(2**63), 2**63 - 1)
 number = st.floats(allow_nan=False, allow_infinity=False)
@@ -101,6 +101,18 @@ grids = st.tuples(st.integers(1, 5), st.integers(1, 5)).flatmap(
         cells=hnp.arrays(np.int8, size[0] * size[1], elements=st.integers(-1, 100)),
     )
 )
+grounds = st.tuples(st.integers(1, 5), st.integers(1, 5)).flatmap(
+    lambda size: st.builds(
+        Ground,
+        **header,
+        resolution=positive,
+        width=st.just(size[0]),
+        height=st.just(size[1]),
+        origin=poses,
+        tilt=hnp.arrays(np.uint8, size[0] * size[1]),
+        roughness=hnp.arrays(np.uint8, size[0] * size[1]),
+    )
+)
 trees = st.builds(
     Transforms,
     **header,
@@ -125,6 +137,7 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.PATH: paths,
     t.MAP: grids,
     t.MAP_TILES: grids,
+    t.GROUND: grounds,
     t.TRANSFORMS: trees,
     t.LOG: st.builds(LogRecord, **header, level=st.sampled_from(LogLevel), line=st.integers(0, 2**32 - 1)),
 }

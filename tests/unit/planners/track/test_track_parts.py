@@ -113,7 +113,7 @@ def test_sections_end_where_the_steering_changes():
 
 
 def test_rough_ground_is_felt_and_forgotten():
-    ground = TerrainEstimator()
+    ground = TerrainEstimator(2.0)
     for k in range(100):
         ground.add(0.05 * k, 0.05 * (-1) ** k, 0.0)
     assert ground.roughness == pytest.approx(0.05, rel=0.1)
