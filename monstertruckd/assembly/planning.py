@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any, Final
 
+from monstertruck_drivers.config import Devices
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.catalog import BEHAVIOURS
 from monstertruck_planners.collision import Footprint
@@ -86,7 +87,7 @@ def _build_tracker(
     if placement != "loop":
         actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
     return TrackerService(
-        TrackSetup(tracker, body.chassis.bicycle, body.footprint, body.points.mount),
+        TrackSetup(with_response(tracker, config.devices), body.chassis.bicycle, body.footprint, body.points.mount),
         clock,
         inputs=inputs,
         drive=requests,
@@ -95,6 +96,14 @@ def _build_tracker(
         actor=actor,
         points=body.points,
     )
+
+
+def with_response(tracker: TrackerConfig, devices: Devices) -> TrackerConfig:
+    """The tracker's settings; dead time and lag are those of the servos unless it has its own."""
+    servos = devices.steering
+    if servos is None or tracker.dead_time is not None or tracker.lag is not None:
+        return tracker
+    return tracker.model_copy(update={"dead_time": servos.driver.dead_time, "lag": servos.driver.lag})
 
 
 START_TIMEOUT: Final = 180.0

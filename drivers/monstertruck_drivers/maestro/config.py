@@ -81,6 +81,10 @@ class MaestroConfig(Schema):
     """Where every wheel has its own servo: the front right wheel's; ``front`` is the front left one's"""
     rear_right: ServoConfig | None = None
     """The rear right wheel's; ``rear`` is the rear left one's"""
+    dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
+    """From a steering command to the first movement of the wheels, s; null = not measured"""
+    lag: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Time constant with which the wheels then turn, s; null = not measured"""
     battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second both pulses and the error word are read."""

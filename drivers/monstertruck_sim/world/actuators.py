@@ -1,5 +1,6 @@
 """What the controllers move: the motor's shaft and the steering servos' arms."""
 
+from collections import deque
 from math import copysign, exp, floor, pi, radians
 
 from monstertruck_sim.world.config import MotorConfig, ServoModelConfig
@@ -50,7 +51,9 @@ class Shaft:
 
 
 class Servo:
-    """A hobby servo: measures its pulse in steps, ignores small changes, turns at a limited rate, limp without pulses.
+    """A hobby servo: measures its pulse in steps, ignores small changes, turns late and at a limited rate.
+
+    It is limp without pulses.
 
     Args:
         config: true pulse map and limits.
@@ -62,7 +65,11 @@ class Servo:
         self._right_stop = -radians(config.right_stop_deg)
         self._held_us: float | None = None
         self._target = 0.0
-        """Angle of the held pulse, rad."""
+        """Angle that the arm turns to, rad."""
+        self._elapsed = 0.0
+        """s."""
+        self._due: deque[tuple[float, float]] = deque()
+        """When (s) the angles (rad) of newer pulses become the target."""
         self.angle = 0.0
         """Of the arm, rad."""
 
@@ -75,12 +82,18 @@ class Servo:
         if self._held_us is None or abs(measured - self._held_us) > self._config.dead_band_us:
             self._held_us = measured
             target = radians((measured - self._config.centre_us) / self._config.us_per_degree)
-            self._target = min(max(target, self._right_stop), self._left_stop)
+            target = min(max(target, self._right_stop), self._left_stop)
+            self._due.append((self._elapsed + self._config.dead_time, target))
 
     def step(self, dt: float) -> None:
         """Turn towards the held pulse for dt seconds."""
+        while self._due and self._due[0][0] <= self._elapsed + 1e-9:
+            self._target = self._due.popleft()[1]
+        self._elapsed += dt
         if self._held_us is not None:
-            self.angle = _towards(self.angle, self._target, self._config.rate * dt)
+            lag = self._config.lag
+            target = self._target if lag == 0.0 else self._target + (self.angle - self._target) * exp(-dt / lag)
+            self.angle = _towards(self.angle, target, self._config.rate * dt)
 
 
 def _towards(value: float, target: float, step: float) -> float:

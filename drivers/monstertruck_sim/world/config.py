@@ -30,6 +30,10 @@ class ServoModelConfig(Schema):
     """Pulse change per degree of servo angle, us."""
     rate: Positive = 6.0
     """Greatest servo speed, rad/s (0.17 s for 60 degrees)."""
+    dead_time: NotNegative = 0.0
+    """From a new pulse to the first movement, s."""
+    lag: NotNegative = 0.0
+    """Time constant with which the arm then turns, s; 0: at its greatest speed"""
     dead_band_us: NotNegative = 2.0
     """The servo does not move for a smaller change of its pulse, us."""
     resolution_us: Positive = 1.0

@@ -61,8 +61,8 @@ class TrackerConfig(Schema):
     slow_roughness: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.05
     """Standard deviation of the tilt over the last seconds from which on it falls likewise, rad."""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """From a request to the first movement of the wheels, s; null: estimated while driving. A value that the truck's
-    motion contradicts is replaced by the estimate, with an event"""
+    """From a request to the first movement of the wheels, s; null: as the servos are configured, else estimated while
+    driving. A value that the truck's motion contradicts is replaced by the estimate, with an event"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
     """Time constant with which the axles then turn, s; null likewise"""
     steering_rate: Positive = 1.0
