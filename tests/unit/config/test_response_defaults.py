@@ -1,12 +1,14 @@
 """Dead time and lag of a tracker are those of the servos unless it has its own."""
 
+from pathlib import Path
+
 import pytest
 
 from monstertruck_drivers.config import Devices
 from monstertruck_planners.track.config import LqrConfig
 from monstertruckd.assembly.planning import with_response
 
-SERVOS = {"steering": {"port": {"path": "/dev/truck/steering"}, "driver": {"dead_time": 0.06, "lag": 0.03}}}
+SERVOS = {"steering": {"port": {"path": Path("/dev/truck/steering")}, "driver": {"dead_time": 0.06, "lag": 0.03}}}
 
 
 @pytest.mark.parametrize(
