@@ -97,7 +97,7 @@ def _show(result: "Check") -> None:
 
 
 def _greatest(row: "TopicComparison") -> str:
-    from monstertruckd.tools.replay_check.difference import Kind
+    from monstertruckd.tools.replay_check.comparison import Kind
 
     known = (row.greatest[kind] for kind in Kind if kind in row.greatest)
     parts = [f"{_amount(one)} at {one.at:.1f} s" for one in known]
@@ -105,7 +105,7 @@ def _greatest(row: "TopicComparison") -> str:
 
 
 def _amount(one: "Greatest") -> str:
-    from monstertruckd.tools.replay_check.difference import Kind
+    from monstertruckd.tools.replay_check.comparison import Kind
 
     match one.kind:
         case _ if math.isinf(one.value):

@@ -1,7 +1,7 @@
-"""Routes and deformations computed again: they count when the log shows it, and recorded ones are driven on.
+"""Answers of planner and local planner in a replay: computed again, delivered when the log shows the recorded ones.
 
-The truck drove the recorded path, whatever is found now. So that what comes after can be compared, it rests on the
-recorded one; what was computed is kept, to be held against it.
+The truck drove the recorded path, so the goal service gets that one, and what follows can be compared. The path that
+was computed is kept, to be compared with it.
 """
 
 import asyncio
@@ -27,14 +27,14 @@ BEFORE: Final = SECOND // 1000
 NOTHING: Final = PlanAnswer(Reason.OK, "", np.empty((0, 3)), np.empty(0))
 
 
-class Book:
+class ComputedPaths:
     """What was computed where another path was driven."""
 
     def __init__(self) -> None:
         self._computed: dict[str, PlanAnswer] = {}
 
     def settle(self, computed: PlanAnswer, driven: Path | None) -> PlanAnswer:
-        """What the goal service is answered: the path that was driven, where there was one."""
+        """The answer for the goal service: the path that was driven, where there was one."""
         if driven is None or _same(computed, driven):
             return computed
         self._computed[driven.name] = computed if computed.poses is not None else NOTHING
@@ -63,7 +63,7 @@ class Book:
 class _Replayed:
     """Takes steps in the loop, and takes from a log when their results count."""
 
-    def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: Book, latency: float) -> None:
+    def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: ComputedPaths, latency: float) -> None:
         self._inner = LoopActor(target, WallClock(), 0.0)  # not virtual: it answers at once
         self._clock, self._record, self._book = clock, record, book
         self._latency = round(latency * SECOND)
@@ -113,7 +113,7 @@ class ReplayedDeformer(_Replayed):
 class ReplayedActors(ActorFactory):
     """Actors of the goal service."""
 
-    def __init__(self, clock: PacedClock, record: GoalRecord, book: Book) -> None:
+    def __init__(self, clock: PacedClock, record: GoalRecord, book: ComputedPaths) -> None:
         super().__init__(clock, RemoteWorkQueue(CODEC))
         self._paced, self._record, self._book = clock, record, book
 

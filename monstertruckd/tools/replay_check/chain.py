@@ -31,7 +31,7 @@ from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
 from monstertruckd.recorder.reader import LogMessage
-from monstertruckd.tools.replay_check.answers import Book, ReplayedActors
+from monstertruckd.tools.replay_check.answers import ComputedPaths, ReplayedActors
 from monstertruckd.tools.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill, is_deformed
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
 from monstertruckd.tools.replay_check.recorded import Survey
@@ -156,7 +156,7 @@ class Chain:
         config = replayable(config)
         self._clock = clock
         self._ready = log.ready
-        self._goal_record, self._book = log.goals, Book()
+        self._goal_record, self._book = log.goals, ComputedPaths()
         self._calls = {} if config.planner is None else log.goals.calls(period_of(config.planner))
         self._goal_ticks = [] if config.planner is None else log.goals.ticks(period_of(config.planner))
         self._called = [one.state.stamp for one in log.goals.reports if one.sequence in self._calls]

@@ -25,9 +25,8 @@ from monstertruckd.tools.logs.messages import first_offset
 from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.tools.replay_check.comparison import TopicComparison
 from monstertruckd.tools.replay_check.pace import PacedClock
-from monstertruckd.tools.replay_check.recorded import Survey, preamble, recorded_config, survey
+from monstertruckd.tools.replay_check.recorded import RunLog, Survey, preamble, recorded_config, survey
 from monstertruckd.tools.replay_check.result import Check, Unreadable
-from monstertruckd.tools.replay_check.run_log import RunLog
 
 RESTS_ON_WORKER: Final = frozenset(
     topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
@@ -72,7 +71,7 @@ def check_log(
     _refuse_the_middle(log, found, compared)
     virtual = first_offset(log, metadata) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
-    rows = {
+    comparisons = {
         topic.name: TopicComparison(
             topic,
             tolerance if tolerance is not None else WORKER_TOLERANCE * (topic.name in loose),
@@ -86,12 +85,12 @@ def check_log(
 
     async def main(clock: PacedClock) -> None:
         chain = Chain(used, clock, unseen_ticks(own, found), found)
-        tap = chain.bus.tap(_into(rows, chain), (row.topic for row in rows.values()))
+        tap = chain.bus.tap(_into(comparisons, chain), (comparison.topic for comparison in comparisons.values()))
         async with chain.running():
-            relevant = (entry for entry in reader if entry.topic in rows or chain.takes(entry.topic))
+            relevant = (entry for entry in reader if entry.topic in comparisons or chain.takes(entry.topic))
             for bunch in _bunches(relevant, chain.ticks):
                 progress(reader.position)
-                await _feed(chain, bunch, rows, found, unreadable)
+                await _feed(chain, bunch, comparisons, found, unreadable)
             await chain.finish(found.end)
             tap.close()
 
@@ -106,7 +105,7 @@ def check_log(
         config,
         (found.end - found.start) / SECOND,
         end,
-        tuple(rows.values()),
+        tuple(comparisons.values()),
         tuple(unreadable),
         found.lost(),
         found.damage,
@@ -133,13 +132,13 @@ def _bunches(log: Iterable[LogMessage], ticks: Callable[[LogMessage], bool]) -> 
 async def _feed(
     chain: Chain,
     bunch: Sequence[LogMessage],
-    rows: Mapping[str, TopicComparison],
+    comparisons: Mapping[str, TopicComparison],
     found: Survey,
     unreadable: list[Unreadable],
 ) -> None:
     for entry in bunch:
-        if (row := rows.get(entry.topic)) is not None:
-            row.recorded(entry.sequence, entry.log_time, entry.payload)
+        if (comparison := comparisons.get(entry.topic)) is not None:
+            comparison.recorded(entry.sequence, entry.log_time, entry.payload)
     entry = bunch[0]
     if entry.topic in WORKER:
         await chain.answer(entry)
@@ -156,9 +155,9 @@ async def _feed(
         await chain.take(BY_NAME[entry.topic], message, entry.log_time)
 
 
-def _into(rows: Mapping[str, TopicComparison], chain: Chain) -> TapCallback:
+def _into(comparisons: Mapping[str, TopicComparison], chain: Chain) -> TapCallback:
     def take(topic: Topic[Message], message: Message, payload: bytes, at: int) -> None:
-        rows[topic.name].recomputed(at, chain.as_computed(topic, message, payload))
+        comparisons[topic.name].recomputed(at, chain.as_computed(topic, message, payload))
 
     return take
 

@@ -1,7 +1,7 @@
-"""What a log tells of goals beforehand: when they had their turns, what was asked by remote call, and what was found.
+"""Reads the record of goals from a log before its replay: ticks of the goal service, remote calls, and paths found.
 
-The goal service tells less than it does: most of its ticks leave nothing in the log, remote calls are not recorded, and
-results of its workers show in the paths that are driven, as its decisions do in its reports.
+The log does not hold all of it: most ticks publish nothing, and remote calls are not recorded. Results of the workers
+are inferred from the paths that were driven, decisions and calls from the reports on goals.
 """
 
 import itertools
@@ -30,7 +30,7 @@ LEASE: Final = 1.0
 PLANNED: Final = r"goal-\d+\.\d+"
 DEFORMED: Final = r"goal-\d+-(deformed|held-up)\.\d+"
 TOGETHER: Final = SECOND // 50
-"""What a tick tells has stamps this near to each other, ns."""
+"""Outputs of one tick have stamps this near to each other, ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Call:
     """The goal, or what is to become of it."""
 
     def request(self, gate: GateState, stamp: int, seq: int) -> GoalRequest | GoalControl:
-        """The request it carried, but for what no report tells, with the rights it must have had."""
+        """The request it carried, but for what is in no report, with the rights it must have had."""
         header: dict[str, Any] = {
             "stamp": stamp,
             "received": stamp,

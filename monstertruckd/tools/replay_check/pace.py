@@ -1,9 +1,9 @@
 """A clock on which services tick when they ticked in a recorded run, not when their schedules say so.
 
-A tick on the wall clock comes some time after it is due, and a reading that fell in between was taken or was not. The
-log tells: messages stand in it in the order in which they were handed over, and a service that reads its inputs and
-publishes without waiting in between had read exactly what stands before its output. So it is held until the replay
-has come to that output, and its time is then that output's stamp.
+A tick on the wall clock comes some time after it is due; whether a reading in between was taken follows from the log.
+Messages are logged in the order of their publication, and a service that reads its inputs and publishes without an
+await in between has read exactly those before its output. So its tick waits until the replay reaches that output, and
+has that output's stamp as its time.
 """
 
 import asyncio

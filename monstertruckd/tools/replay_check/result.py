@@ -46,33 +46,37 @@ class Check:
     @property
     def compared(self) -> int:
         """Outputs that were recorded and came again."""
-        return sum(row.compared for row in self.topics)
+        return sum(comparison.compared for comparison in self.topics)
 
     @property
     def equal(self) -> int:
         """Of them, equal bit for bit."""
-        return sum(row.equal for row in self.topics)
+        return sum(comparison.equal for comparison in self.topics)
 
     @property
     def first(self) -> First | None:
         """The first output that is off by more than its topic's tolerance."""
-        return min((row.first for row in self.topics if row.first), key=lambda first: first.at, default=None)
+        return min(
+            (comparison.first for comparison in self.topics if comparison.first),
+            key=lambda first: first.at,
+            default=None,
+        )
 
     @property
     def agrees(self) -> bool:
         """Whether everything came again within the tolerance."""
-        return all(row.agrees(self.end) for row in self.topics) and not self.unreadable
+        return all(comparison.agrees(self.end) for comparison in self.topics) and not self.unreadable
 
     @property
     def rounded(self) -> bool:
         """Whether it does not agree, but nothing is off by more than ``ROUNDING``."""
-        close = all(row.within(self.end, ROUNDING) for row in self.topics) and not self.unreadable
+        close = all(comparison.within(self.end, ROUNDING) for comparison in self.topics) and not self.unreadable
         return close and not self.agrees
 
     @property
     def sufficient(self) -> float:
         """Tolerance, SI units, with which a check that is ``rounded`` agrees."""
-        return max([ROUNDING, *(row.tolerance for row in self.topics if row.judged)])
+        return max([ROUNDING, *(comparison.tolerance for comparison in self.topics if comparison.judged)])
 
     @property
     def reason(self) -> Reason:
@@ -94,22 +98,22 @@ class Check:
             "compared": self.compared,
             "equal": self.equal,
             "first_difference": None if self.first is None else asdict(self.first),
-            "topics": {row.topic.name: self._row(row) for row in self.topics},
+            "topics": {comparison.topic.name: self._comparison(comparison) for comparison in self.topics},
             "unreadable": [asdict(message) for message in self.unreadable],
             "lost": self.lost,
             "damage": self.damage,
             "left_out": self.left_out,
         }
 
-    def _row(self, row: TopicComparison) -> dict[str, Any]:
+    def _comparison(self, comparison: TopicComparison) -> dict[str, Any]:
         return {
-            "tolerance": row.tolerance,
-            "judged": row.judged,
-            "compared": row.compared,
-            "equal": row.equal,
-            "differing": row.differing,
-            "missing": row.missing,
-            "extra": row.surplus(self.end),
-            "greatest": {str(one.kind): asdict(one) for one in row.greatest.values()},
-            "first_difference": None if row.first is None else asdict(row.first),
+            "tolerance": comparison.tolerance,
+            "judged": comparison.judged,
+            "compared": comparison.compared,
+            "equal": comparison.equal,
+            "differing": comparison.differing,
+            "missing": comparison.missing,
+            "extra": comparison.surplus(self.end),
+            "greatest": {str(one.kind): asdict(one) for one in comparison.greatest.values()},
+            "first_difference": None if comparison.first is None else asdict(comparison.first),
         }

@@ -10,7 +10,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid, Transforms
-from monstertruckd.tools.replay_check.difference import Difference, Kind, differences
+from monstertruckd.tools.replay_check.comparison import Difference, Kind, differences
 from tests.unit.tools.logs.log_kit import odometry
 
 HEADER = {"stamp": 1, "received": 1, "seq": 0}

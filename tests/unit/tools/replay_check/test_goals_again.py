@@ -12,7 +12,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.replay_check import check_log
-from monstertruckd.tools.replay_check.difference import Kind
+from monstertruckd.tools.replay_check.comparison import Kind
 from monstertruckd.tools.replay_check.result import ROUNDING
 from tests.unit.tools.replay_check.log_surgery import (
     BY_NAME,

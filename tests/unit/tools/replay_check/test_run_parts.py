@@ -14,7 +14,7 @@ from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.recorder import LogWriter
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.replay_check import parts_of
-from monstertruckd.tools.replay_check.run_log import RunLog
+from monstertruckd.tools.replay_check.recorded import RunLog
 from tests.unit.tools.replay_check.log_surgery import BY_NAME, LEVEL, attachments_of, chunks, computed_again, write
 
 
