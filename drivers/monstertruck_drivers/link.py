@@ -41,7 +41,7 @@ class Link:
         self._hang_up = hang_up
         self._buffer = bytearray()
         self._lost: str | None = None
-        self._waiting: Waiting | None = None
+        self._waiting: LinkWaiter | None = None
         self._due: float | None = None
         """Loop time at which the present wait has lasted too long."""
         self._alarm: asyncio.TimerHandle | None = None
@@ -57,7 +57,7 @@ class Link:
         if len(self._buffer) > BUFFER_LIMIT:
             del self._buffer[:-BUFFER_LIMIT]
         if self._waiting is not None:
-            self._waiting.news()
+            self._waiting.on_bytes()
 
     def lose(self, why: str) -> None:
         """The transport is gone; pending and later reads raise ``DeviceLostError``."""
@@ -65,7 +65,7 @@ class Link:
         if self._lost is None:
             self._lost = why
             if self._waiting is not None:
-                self._waiting.news()
+                self._waiting.on_bytes()
         if self._alarm is not None:
             self._alarm.cancel()
             self._alarm = None
@@ -174,7 +174,7 @@ class Link:
     async def __aexit__(self, *_: object) -> None:
         self.close()
 
-    def begin_wait(self, waiting: "Waiting", due: float | None) -> None:
+    def begin_wait(self, waiting: "LinkWaiter", due: float | None) -> None:
         """Tell ``waiting`` of the next bytes or the loss; or at ``due``, loop time, that it has waited too long.
 
         A time limit is one timer for many waits, set anew only when it rings.
@@ -218,17 +218,17 @@ class Link:
         if self._due - loop.time() > TIMER_STEP / 2:
             self._set_alarm(loop, self._due)
         else:
-            self._waiting.late()
+            self._waiting.on_timeout()
 
 
-class Waiting(Protocol):
-    """Who waits at a link."""
+class LinkWaiter(Protocol):
+    """Waits for bytes of a link."""
 
-    def news(self) -> None:
+    def on_bytes(self) -> None:
         """Bytes came, or the link is lost."""
         ...
 
-    def late(self) -> None:
+    def on_timeout(self) -> None:
         """The wait has lasted too long."""
         ...
 
@@ -244,11 +244,11 @@ class _Sleeper:
         self._enough = enough
         self.woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-    def news(self) -> None:
+    def on_bytes(self) -> None:
         if not self.woken.done() and self._enough():
             self.woken.set_result(None)
 
-    def late(self) -> None:
+    def on_timeout(self) -> None:
         if not self.woken.done():
             self.woken.set_exception(TimeoutError())
 

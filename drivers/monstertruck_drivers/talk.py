@@ -68,8 +68,8 @@ class Talk(Generic[T]):
             self._steps.close()
             self._finish(None, asyncio.CancelledError())
 
-    def news(self) -> None:
-        """See ``link.Waiting``."""
+    def on_bytes(self) -> None:
+        """See ``link.LinkWaiter``."""
         if not self._size:
             if not self._link.is_lost:
                 return
@@ -84,8 +84,8 @@ class Talk(Generic[T]):
             self._link.end_wait()
             self._advance(data)
 
-    def late(self) -> None:
-        """See ``link.Waiting``."""
+    def on_timeout(self) -> None:
+        """See ``link.LinkWaiter``."""
         if self._size:
             self._throw(TimeoutError())
         else:

@@ -1,4 +1,4 @@
-"""Thresholds that do not flicker: conditions that must hold, and levels that are left only by a margin."""
+"""Thresholds with hysteresis and dwell: conditions that must hold for a time, levels that are left only by a margin."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ class Dwell:
         self._since: int | None = None
 
     def update(self, time_ns: int, condition: bool) -> bool:
-        """Tell the condition at ``time_ns``."""
+        """Take the condition at ``time_ns``; whether it has held long enough."""
         if not condition:
             self._since = None
             return False

@@ -224,7 +224,7 @@ class _Session:
         """Older commands do not count."""
         self._goal = State.UNKNOWN
         self._goal_since = 0
-        self._told_late = False
+        self._late_reported = False
         self._status_due = 0
         self._current_due = 0
         self._reset_due = 0
@@ -402,10 +402,10 @@ class _Session:
         """One controlword towards ``goal``."""
         now = self._clock.now()
         if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
-            self._goal, self._goal_since, self._told_late = goal, now, False
+            self._goal, self._goal_since, self._late_reported = goal, now, False
         late = (now - self._goal_since) / SECOND
-        if late > GOAL_LIMIT and not self._told_late:
-            self._told_late = True
+        if late > GOAL_LIMIT and not self._late_reported:
+            self._late_reported = True
             text = f"controller stays in {self._state.name}, wanted {goal.name}"
             self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
         control = next_control(self._state, goal)

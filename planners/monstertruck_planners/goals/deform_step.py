@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, placed, poses_relative, scan_points
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Pose, Setup, Way
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup
 from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
@@ -169,7 +169,7 @@ class DeformStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._walls: DistanceField | None = None
-        self._way: Way | None = None
+        self._way: LocalRoute | None = None
         self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
 
@@ -216,7 +216,7 @@ class DeformStep:
             world = load_map(config.map)
             self._walls = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
 
-    def _begin(self, way: Way) -> None:
+    def _begin(self, way: LocalRoute) -> None:
         self._way, self._place = way, 0
         self._guide = PosePath(moved(way.poses, self._vehicle.reference), way.directions)
         self._travelled = self._guide.travelled

@@ -10,9 +10,9 @@ from monstertruck_planners.goals.exchange import (
     DeformAnswer,
     DeformTask,
     Finding,
+    LocalRoute,
     PlanAnswer,
     Setup,
-    Way,
     level,
     pose_of,
 )
@@ -176,7 +176,7 @@ class RouteDeformation:
         if self._route is not None and (self._fresh or self._sent_way != self._number):
             assert self._route.poses is not None
             assert self._route.directions is not None
-            way = Way(self._number, self._route.poses, self._route.directions, self._route.drivable)
+            way = LocalRoute(self._number, self._route.poses, self._route.directions, self._route.drivable)
             self._sent_way = self._number
         task = DeformTask(
             scan,

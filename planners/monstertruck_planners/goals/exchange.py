@@ -79,11 +79,11 @@ class PlanAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class LocalRoute:
     """A route to be deformed."""
 
     number: int
-    """Tells it from others."""
+    """Of its own."""
     poses: Array
     """Shape (n, 3): of the base."""
     directions: Array
@@ -101,7 +101,7 @@ class DeformTask:
     """Of the base, in the map's frame."""
     setup: Setup | None = None
     grid: Grid | None = None
-    way: Way | None = None
+    way: LocalRoute | None = None
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked"]

@@ -22,7 +22,7 @@ AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 LEASE: Final = 0.25
 """Lease of the request to stand still, s."""
-STUB: Final = 0.01
+STANDSTILL_PATH: Final = 0.01
 """Length of a path that leads nowhere, m."""
 CHECK_STEP: Final = 0.05
 """Metres between two poses of a path check."""
@@ -124,7 +124,7 @@ class PathPublisher:
         speed, report = abs(odometry.twist.vx), followed.report(self._in.tracker.latest)
         driven = followed.before + followed.along(report)
         if speed > AT_REST and report is not None:
-            rest = speed * speed / (2 * self._deceleration) + STUB
+            rest = speed * speed / (2 * self._deceleration) + STANDSTILL_PATH
             count = kept_poses(followed.travelled, report.along, rest)
             steering = followed.message.steering[:count]
             clearance = followed.message.clearance[:count]
@@ -132,7 +132,7 @@ class PathPublisher:
                 followed.poses[:count], followed.message.directions[:count], steering, name, driven, clearance
             )
         else:
-            ahead = np.array([[0.0, 0.0, 0.0], [STUB, 0.0, 0.0]])
+            ahead = np.array([[0.0, 0.0, 0.0], [STANDSTILL_PATH, 0.0, 0.0]])
             self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven)
 
     def halt(self, name: str) -> None:

@@ -343,10 +343,10 @@ class Waiter:
     def __init__(self) -> None:
         self.heard: list[str] = []
 
-    def news(self) -> None:
+    def on_bytes(self) -> None:
         self.heard.append("news")
 
-    def late(self) -> None:
+    def on_timeout(self) -> None:
         self.heard.append("late")
 
 

@@ -9,7 +9,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deform_step import DeformStep
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, Way
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
@@ -55,7 +55,7 @@ def begun(route: np.ndarray = ROUTE, directions: np.ndarray | None = None) -> tu
     """A step, and its first task."""
     config = PlannerConfig(local_planner=RsbandConfig())
     setup = Setup(config, FourWheelSteering(), Footprint(), ORIGIN)
-    way = Way(1, route, np.ones(len(route)) if directions is None else directions)
+    way = LocalRoute(1, route, np.ones(len(route)) if directions is None else directions)
     return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way)
 
 
@@ -109,7 +109,7 @@ def test_where_there_is_no_way_round_the_beginning_is_driven_and_then_it_is_bloc
     assert answer.text
     assert "new" in found
     assert 0.5 < pose[0] < 1.6 - 0.235, "as far as it is free"
-    step.step(DeformTask(scan_of(pose), pose, way=Way(2, ROUTE, np.ones(81))))
+    step.step(DeformTask(scan_of(pose), pose, way=LocalRoute(2, ROUTE, np.ones(81))))
     answer = step.step(DeformTask(scan_of(pose), pose))
     assert (answer.number, answer.finding) == (2, "free"), "what went away is forgotten"
 
