@@ -11,12 +11,22 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_json
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
-    from monstertruckd.tools.logs.scans import ScanLog
+    from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
 
 app = command_group("Build, show, save and use occupancy maps.")
 
 Log = Annotated[Path, typer.Argument(help="MCAP, CARMEN text (.gz), npz or URG text (.dat).", show_default=False)]
 MapPlace = Annotated[Path, typer.Argument(help="Folder of a saved map, or a map_server YAML.", show_default=False)]
+StartAngle = Annotated[float | None, typer.Option(help="Of an npz or CARMEN log: angle of the first beam, degrees.")]
+AngleIncrement = Annotated[float | None, typer.Option(help="The same: angle between beams, degrees.")]
+RangeMax = Annotated[float | None, typer.Option(min=0.1, help="The same: ranges from here on are no returns, m.")]
+LidarMount = Annotated[
+    tuple[float, float, float] | None, typer.Option("--mount", help="The same: lidar in base: x, y (m), yaw (degrees).")
+]
+Trajectory = Annotated[
+    Path | None,
+    typer.Option(help="Write the pose of every scan, at the middle of its sweep (TUM format)."),
+]
 Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
 
 
@@ -26,6 +36,11 @@ def build(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
     png: Png = None,
     front: Annotated[str, typer.Option(help="Scan matcher: planar or kiss.")] = "planar",
+    trajectory: Trajectory = None,
+    start_angle: StartAngle = None,
+    angle_increment: AngleIncrement = None,
+    range_max: RangeMax = None,
+    mount: LidarMount = None,
     json_output: JsonOption = False,
 ) -> None:
     """Build a map from a log's scans, and its odometry if it has any."""
@@ -33,19 +48,24 @@ def build(
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_estimation.slam.worker_io import WorkerInput
     from monstertruck_runtime.errors import InputError
-    from monstertruckd.tools.logs.scans import read_scans
+    from monstertruckd.tools.logs.trajectory import write_tum
 
     if front not in ("planar", "kiss"):
         raise InputError(f"--front {front}: expected planar or kiss")
-    scans = read_scans(log)
+    scans = _read(log, _geometry(start_angle, angle_increment, range_max, mount))
     worker = SlamWorker()
     facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front}))
-    done: WorkerOutput = worker.step(WorkerInput(finish=True, whole=True, save=output))
+    done: WorkerOutput = worker.step(
+        WorkerInput(finish=True, whole=True, save=output, trajectory=trajectory is not None)
+    )
     if done.error is not None:
         raise InputError(done.error)
     assert done.whole is not None
     rows, columns = done.whole.cells.shape
     facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
+    if trajectory is not None:
+        assert done.trajectory is not None
+        facts["trajectory"] = write_tum(trajectory, *done.trajectory, scans)
     if png is not None:
         from monstertruck_estimation.slam.storage import load
 
@@ -135,14 +155,24 @@ def load_command(
 
 
 @app.command("localise")
-def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
+def localise(
+    log: Log,
+    place: MapPlace,
+    png: Png = None,
+    trajectory: Trajectory = None,
+    start_angle: StartAngle = None,
+    angle_increment: AngleIncrement = None,
+    range_max: RangeMax = None,
+    mount: LidarMount = None,
+    json_output: JsonOption = False,
+) -> None:
     """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.storage import load
     from monstertruck_estimation.slam.worker import SlamWorker
-    from monstertruckd.tools.logs.scans import read_scans
+    from monstertruckd.tools.logs.trajectory import write_tum
 
-    saved, scans = load(place), read_scans(log)
+    saved, scans = load(place), _read(log, _geometry(start_angle, angle_increment, range_max, mount))
     facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
     known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
     facts |= {"map": place, "localised": len(known)}
@@ -150,9 +180,50 @@ def localise(log: Log, place: MapPlace, png: Png = None, json_output: JsonOption
         first = known[0]
         facts |= {"found_after_s": (first.stamp - scans.scans[0].stamp) / 1e9, "found_at": first.pose}
         facts["last_pose"] = known[-1].pose
+    if trajectory is not None:
+        stamps, poses = [estimate.stamp for estimate in known], [estimate.pose for estimate in known]
+        facts["trajectory"] = write_tum(trajectory, stamps, poses, scans)
     if png is not None:
         _draw(png, saved, [estimate.pose for estimate in known])
     _print(facts, json_output)
+
+
+def _geometry(
+    start_angle: float | None,
+    angle_increment: float | None,
+    range_max: float | None,
+    mount: tuple[float, float, float] | None,
+) -> "LogGeometry":
+    """Geometry by the options; angles in degrees."""
+    import math
+
+    from monstertruckd.tools.logs.scans import LogGeometry
+
+    return LogGeometry(
+        start_angle=None if start_angle is None else math.radians(start_angle),
+        angle_increment=None if angle_increment is None else math.radians(angle_increment),
+        range_max=range_max,
+        mount=None if mount is None else (mount[0], mount[1], math.radians(mount[2])),
+    )
+
+
+def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":
+    """Read a log; what is assumed of its geometry is remarked on."""
+    import math
+
+    from monstertruckd.tools.logs.scans import read_scans
+
+    log = read_scans(path, geometry)
+    if log.assumed:
+        scan = log.scans[0]
+        first, step = math.degrees(scan.start_angle), math.degrees(scan.angle_increment)
+        x, y, yaw = scan.mount
+        remark(
+            f"{path}: holds no {', '.join(log.assumed)}; taken: {len(scan.ranges)} beams from {first:g} degrees, "
+            f"{step:g} degrees apart, no return from {scan.range_max:g} m on, lidar at x {x:g}, y {y:g} m, "
+            f"yaw {math.degrees(yaw):g} degrees"
+        )
+    return log
 
 
 def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["SlamEstimate"]]:

@@ -5,7 +5,7 @@ import io
 import math
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +25,9 @@ BEGIN: Final = SECOND
 """Stamp of the first scan of a log with times of another origin, ns."""
 LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
+SHORTEST_RANGE: Final = 0.02
+NO_RETURN_SHARE: Final = 0.001
+"""The greatest range of an npz log means no return if at least this share of its beams has it."""
 URG_STEP: Final = math.tau / 1024
 URG_ERRORS: Final = 0.02
 """Shorter readings of a URG are error codes, m."""
@@ -34,19 +37,51 @@ URG_AHEAD: Final = 341
 
 
 @dataclass(frozen=True, slots=True)
+class LogGeometry:
+    """Geometry of the scans of a log that does not hold it (npz, CARMEN); None = as in the log, or assumed."""
+
+    start_angle: float | None = None
+    """Angle of the first beam, rad, counter-clockwise from ahead."""
+    angle_increment: float | None = None
+    """Angle between neighbouring beams, rad."""
+    range_min: float | None = None
+    """Shorter ranges are no returns, m."""
+    range_max: float | None = None
+    """Ranges from here on are no returns, m."""
+    time_increment: float | None = None
+    """Seconds between neighbouring beams."""
+    mount: Vector | None = None
+    """Planar pose of the sensor in base, m and rad."""
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """Fields that are not None."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
 class ScanLog:
     """A log's scans, in order."""
 
     make: str
     scans: list[ScanInput]
+    begin: float = 0.0
+    """Time of the log's own clock that is stamp 0 here, s."""
+    assumed: tuple[str, ...] = field(default=())
+    """Parts of the geometry that neither the log nor the caller gave."""
 
 
-def read_scans(path: Path) -> ScanLog:
+def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
     """Read any log with scans.
+
+    Args:
+        path: the log.
+        geometry: of a log that does not hold it; it overrides what an npz log says.
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is of no known format, damaged, or has no scans.
+        InputError: it is of no known format, damaged, has no scans, or brings the geometry that was given.
     """
     try:
         with path.open("rb") as file:
@@ -55,16 +90,19 @@ def read_scans(path: Path) -> ScanLog:
         raise NotFoundError(f"{path}: no such log") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    given = {} if geometry is None else geometry.known
     if head.startswith(MAGIC):
         log = ScanLog("mcap", list(_mcap(path)))
     elif head.startswith(b"PK"):
-        log = ScanLog("npz", list(_arrays(path)))
+        log = _arrays(path, given)
     elif path.name.removesuffix(".gz").endswith(".dat"):
-        log = ScanLog("urg", list(_urg(path)))
+        log = ScanLog("urg", list(_urg(path)), -BEGIN / SECOND)
     else:
-        log = ScanLog("carmen", list(_carmen(path)))
+        log = _carmen(path, given)
     if not log.scans:
         raise InputError(f"{path}: no scans: expected MCAP with sensor/scan, CARMEN text, npz or URG text")
+    if given and log.make in ("mcap", "urg"):
+        raise InputError(f"{path}: {next(iter(given))}: a log of this format ({log.make}) brings its geometry")
     return log
 
 
@@ -95,25 +133,75 @@ def _mcap(path: Path) -> Iterator[ScanInput]:
         yield inputs
 
 
-def _arrays(path: Path) -> Iterator[ScanInput]:
+def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
+    """An npz log; its geometry is what is ``given``, else its arrays of the same names, else assumed."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            times, ranges = file["t"], file["ranges"]
-            odom = file["odom"] if "odom" in file.files else None
+            arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected arrays t, ranges and perhaps odom: {error}") from error
-    lengths = {len(times), len(ranges), len(times if odom is None else odom)}
-    if ranges.ndim != 2 or len(lengths) != 1:
-        raise InputError(f"{path}: expected t (n,), ranges (n, beams), odom (n, 3); got lengths {sorted(lengths)}")
-    limit = min(math.floor(float(np.nanmax(ranges)) / 10) * 10.0, LONGEST_RANGE) or LONGEST_RANGE
-    for i, row in enumerate(ranges):
-        stamp = BEGIN + round((float(times[i]) - float(times[0])) * SECOND)
-        yield _sick(stamp, np.asarray(row, np.float64), None if odom is None else _vector(odom[i]), limit)
+    ranges = _array(path, arrays, "ranges", (-1, -1))
+    times = _array(path, arrays, "t", (len(ranges),))
+    odom = _array(path, arrays, "odom", (len(ranges), 3)) if "odom" in arrays else None
+    if not len(times):
+        return ScanLog("npz", [])
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        raise InputError(f"{path}: t: expected finite seconds, got {times[bad[0]]} in row {bad[0]}")
+    if not np.isfinite(ranges).any():
+        raise InputError(f"{path}: ranges: expected metres, got no finite value")
+    shapes: dict[str, tuple[int, ...]] = {item.name: () for item in fields(LogGeometry)} | {"mount": (3,)}
+    own = {name: _array(path, arrays, name, shape) for name, shape in shapes.items() if name in arrays}
+    known = {name: _vector(value) if name == "mount" else float(value) for name, value in own.items()} | given
+    _check(path, known)
+    scans = [
+        _sick(
+            BEGIN + round((time - float(times[0])) * SECOND),
+            row,
+            None if odom is None or not np.isfinite(odom[i]).all() else _vector(odom[i]),
+            {"range_max": _no_return(ranges)} | known,
+        )
+        for i, (time, row) in enumerate(zip(times.tolist(), ranges, strict=True))
+    ]
+    return ScanLog("npz", scans, float(times[0]) - BEGIN / SECOND, _missing(known))
 
 
-def _carmen(path: Path) -> Iterator[ScanInput]:
+def _array(path: Path, arrays: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+    """An array of numbers of this shape (-1 = any length)."""
+    wanted = f"{path}: {name}: expected numbers of shape ({', '.join('n' if k < 0 else str(k) for k in shape)})"
+    if name not in arrays:
+        raise InputError(f"{wanted}, got no such array")
+    values = arrays[name]
+    fits = values.ndim == len(shape) and all(k in (-1, n) for k, n in zip(shape, values.shape, strict=True))
+    if values.dtype.kind not in "fiu" or not fits:
+        raise InputError(f"{wanted}, got {values.dtype} of shape {values.shape}")
+    return np.asarray(values, np.float64)
+
+
+def _check(path: Path, geometry: dict[str, Any]) -> None:
+    for name, value in geometry.items():
+        if not np.isfinite(value).all() or (name == "angle_increment" and value == 0):
+            wanted = "finite numbers, not 0" if name == "angle_increment" else "finite numbers"
+            raise InputError(f"{path}: {name}: expected {wanted}, got {value}")
+
+
+def _no_return(ranges: Array) -> float:
+    """The range from which on there was no return: a greatest one that recurs, or infinity."""
+    finite = ranges[np.isfinite(ranges)]
+    greatest = float(finite.max())
+    recurs = np.count_nonzero(finite == greatest) >= max(NO_RETURN_SHARE * finite.size, 3)
+    return min(greatest if recurs else math.inf, LONGEST_RANGE)
+
+
+def _missing(known: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(item.name for item in fields(LogGeometry) if item.name not in known)
+
+
+def _carmen(path: Path, given: dict[str, Any]) -> ScanLog:
     opener: Any = gzip.open if path.suffix == ".gz" else open
+    _check(path, given)
     begin: float | None = None
+    scans: list[ScanInput] = []
     try:
         with opener(path, "rt", encoding="ascii") as lines:
             for number, line in enumerate(lines, start=1):
@@ -126,26 +214,25 @@ def _carmen(path: Path) -> Iterator[ScanInput]:
                     rest = words[2 + count :]
                     odom = (float(rest[3]), float(rest[4]), float(rest[5]))
                     time = float(rest[6])
-                except (ValueError, IndexError) as error:
+                    begin = time if begin is None else begin
+                    stamp = BEGIN + round((time - begin) * SECOND)
+                except (ValueError, IndexError, OverflowError) as error:
                     raise InputError(f"{path}:{number}: expected FLASER n, n ranges, 6 numbers, time") from error
-                begin = time if begin is None else begin
-                yield _sick(BEGIN + round((time - begin) * SECOND), ranges, odom, LONGEST_RANGE)
+                scans.append(_sick(stamp, ranges, odom, {"range_max": LONGEST_RANGE} | given))
     except (OSError, EOFError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a log with scans: {error}") from error
+    return ScanLog("carmen", scans, (begin or 0.0) - BEGIN / SECOND, _missing(given))
 
 
-def _sick(stamp: int, ranges: Array, odom: Vector | None, limit: float) -> ScanInput:
-    """Half a turn ahead: n beams, or n + 1 with both ends."""
+def _sick(stamp: int, ranges: Array, odom: Vector | None, geometry: dict[str, Any]) -> ScanInput:
+    """A scan of this ``geometry``; by default half a turn ahead: n beams, or n + 1 with both ends."""
     count = len(ranges)
-    return ScanInput(
-        stamp=stamp,
-        ranges=ranges,
-        start_angle=-math.pi / 2,
-        angle_increment=math.pi / max(count - count % 2, 1),
-        range_min=0.02,
-        range_max=limit,
-        odom=odom,
-    )
+    assumed = {
+        "start_angle": -math.pi / 2,
+        "angle_increment": math.pi / max(count - count % 2, 1),
+        "range_min": SHORTEST_RANGE,
+    }
+    return ScanInput(stamp=stamp, ranges=ranges, odom=odom, **(assumed | geometry))
 
 
 def _urg(path: Path) -> Iterator[ScanInput]:

@@ -152,6 +152,9 @@ class LocalisationEstimator:
         """See ``Estimator``."""
         return self._saved.graph
 
+    def trajectory(self) -> None:
+        """See ``Estimator``: the poses were estimated one by one."""
+
     def finish(self) -> None:
         """See ``Estimator``: there is nothing to optimise."""
 

@@ -265,6 +265,10 @@ class Estimator(Protocol):
         """The pose graph to save with the grid; None without one."""
         ...
 
+    def trajectory(self) -> tuple[NDArray[np.int64], Array] | None:
+        """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
+        ...
+
     def finish(self) -> None:
         """Optimise everything jointly."""
         ...
@@ -355,6 +359,10 @@ class MappingEstimator:
     def graph(self) -> SavedGraph | None:
         """See ``Estimator``."""
         return saved_graph(self.mapper.map)
+
+    def trajectory(self) -> tuple[NDArray[np.int64], Array]:
+        """See ``Estimator``."""
+        return self.mapper.trajectory()
 
     def finish(self) -> None:
         """See ``Estimator``."""

@@ -62,7 +62,9 @@ class SlamWorker:
         tiles, redrawn = estimator.changes() if inputs.tiles else ([], False)
         whole = estimator.patch() if inputs.whole or redrawn else None
         saved, error = self._save(inputs, estimator)
-        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, dict(estimator.counts), saved, error)
+        trajectory = estimator.trajectory() if inputs.trajectory else None
+        counts = dict(estimator.counts)
+        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory)
 
     def _begin(self, start: Start) -> None:
         config = start.config

@@ -94,6 +94,8 @@ class WorkerInput:
     """Folder to save the map to."""
     finish: bool = False
     """First optimise all keyframes jointly (seconds of work)."""
+    trajectory: bool = False
+    """Return the poses of all scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,3 +151,5 @@ class WorkerOutput:
     saved: str | None = None
     error: str | None = None
     """Why the map could not be saved."""
+    trajectory: tuple[NDArray[np.int64], Array] | None = None
+    """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""

@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.tools.logs.scans import read_scans
+from monstertruckd.tools.logs.scans import LogGeometry, read_scans
 
 URG = Path(__file__).resolve().parents[3] / "data" / "urg04lx_exp2.dat.gz"
 
@@ -55,6 +55,58 @@ def test_what_is_no_log_is_refused(tmp_path: Path, name: str, content: bytes, sa
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=said):
         read_scans(tmp_path / name)
+
+
+GOOD = {"t": np.arange(3.0), "ranges": np.full((3, 180), 2.0), "odom": np.zeros((3, 3))}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("t", np.array((0.0, math.nan, 1.0)), "t: expected finite seconds, got nan in row 1"),
+        ("t", np.zeros((3, 2)), r"t: expected numbers of shape \(3\), got float64 of shape \(3, 2\)"),
+        ("ranges", np.full((3, 180), math.nan), "ranges: expected metres, got no finite value"),
+        ("ranges", np.zeros(3), r"ranges: expected numbers of shape \(n, n\)"),
+        ("odom", np.zeros((3, 2)), r"odom: expected numbers of shape \(3, 3\), got float64 of shape \(3, 2\)"),
+        ("odom", np.zeros((2, 3)), r"odom: expected numbers of shape \(3, 3\)"),
+        ("t", np.array(("a", "b", "c")), "t: expected numbers"),
+        ("mount", np.zeros(2), "mount: expected numbers of shape"),
+        ("angle_increment", np.array(0.0), "angle_increment: expected finite numbers, not 0"),
+        ("range_max", np.array(math.nan), "range_max: expected finite numbers, got nan"),
+    ],
+)
+def test_arrays_that_are_wrong_are_named(tmp_path: Path, name: str, value: np.ndarray, said: str):
+    file = tmp_path / "a.npz"
+    np.savez(file, **GOOD | {name: value})
+    with pytest.raises(InputError, match=rf"a\.npz: {said}"):
+        read_scans(file)
+
+
+def test_infinite_ranges_are_no_returns_and_the_others_stay(tmp_path: Path):
+    file = tmp_path / "a.npz"
+    ranges = np.random.default_rng(1).uniform(0.5, 5.5, (3, 180))
+    ranges[:, ::7] = math.inf
+    odom = np.zeros((3, 3))
+    odom[1] = math.nan
+    np.savez(file, t=GOOD["t"], ranges=ranges, odom=odom)
+    log = read_scans(file)
+    assert [scan.odom is None for scan in log.scans] == [False, True, False]
+    for scan, row in zip(log.scans, ranges, strict=True):
+        assert ((scan.ranges >= scan.range_min) & (scan.ranges < scan.range_max)).tolist() == np.isfinite(row).tolist()
+
+
+def test_the_geometry_is_the_callers_or_the_logs_and_what_is_assumed_is_said(tmp_path: Path):
+    file = tmp_path / "a.npz"
+    np.savez(file, **GOOD, start_angle=np.array(-2.0), angle_increment=np.array(0.02), mount=np.array((0.1, 0.0, 0.5)))
+    log = read_scans(file, LogGeometry(range_max=4.0, start_angle=-1.5))
+    scan = log.scans[0]
+    assert (scan.start_angle, scan.angle_increment, scan.range_max) == (-1.5, 0.02, 4.0)
+    assert scan.mount == (0.1, 0.0, 0.5)
+    assert log.assumed == ("range_min", "time_increment")
+    with pytest.raises(InputError, match=r"range_max: a log of this format \(urg\) brings its geometry"):
+        read_scans(URG, LogGeometry(range_max=4.0))
+    np.savez(file, **GOOD)
+    assert set(read_scans(file).assumed) >= {"start_angle", "angle_increment", "range_max", "mount"}
 
 
 def test_no_such_file(tmp_path: Path):

@@ -1,0 +1,63 @@
+"""Trajectories as text of the TUM benchmark: one line ``t x y z qx qy qz qw`` per scan, metres and seconds.
+
+A scan's stamp, and the pose estimated for it, are of its first beam. Whoever draws a whole scan at one pose, or
+compares poses with another system, needs that of the middle: so each line has the time of the middle of the sweep, by
+the clock of the log, and the pose at that time (between the poses of neighbouring scans).
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.se2 import between, compose, interpolate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.small_files import replace_file
+from monstertruckd.tools.logs.scans import ScanLog
+
+
+def mid_sweep(stamps: Array, poses: Array, delay: float) -> Array:
+    """Poses, shape (n, 3), ``delay`` seconds after each stamp; after the last one the last motion goes on.
+
+    Args:
+        stamps: shape (n,), s, rising.
+        poses: shape (n, 3), at ``stamps``.
+        delay: s, not negative.
+    """
+    if delay <= 0 or len(stamps) < 2:
+        return poses
+    onward = compose(poses[-1], between(poses[-2], poses[-1]))
+    times = np.append(stamps, 2 * stamps[-1] - stamps[-2])
+    return interpolate(times, np.vstack((poses, onward)), stamps + delay)
+
+
+def write_tum(
+    path: Path, stamps: Sequence[int] | NDArray[np.int64], poses: Array | Sequence[object], log: ScanLog
+) -> str:
+    """Write poses of a log's scans.
+
+    Args:
+        path: of the file.
+        stamps: shape (n,), ns, of the scans' first beams.
+        poses: shape (n, 3), base in map at ``stamps``.
+        log: where the scans are from.
+
+    Returns:
+        What was written, for people.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    first = log.scans[0]
+    delay = first.time_increment * len(first.ranges) / 2
+    seconds = np.asarray(stamps, np.int64) / SECOND
+    middle = mid_sweep(seconds, np.asarray(poses, np.float64).reshape(-1, 3), delay)
+    lines = [
+        f"{log.begin + second + delay:.6f} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}\n"
+        for second, (x, y, yaw) in zip(seconds.tolist(), middle.tolist(), strict=True)
+    ]
+    replace_file(path, "".join(lines))
+    return f"{path}, {len(lines)} poses, each {delay:g} s after its scan's stamp"

@@ -1,0 +1,49 @@
+"""``map build`` and ``map localise`` on an npz log: trajectory, geometry, and what is assumed of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from monstertruckd.tools.cli.main import app
+from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges, rounds
+
+TRUTH = rounds(60, laps=0.5)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("log") / "room.npz"
+    rng = np.random.default_rng(1)
+    rows = np.array([ranges(ROOM, pose, noise=0.01, rng=rng) for pose in TRUTH])
+    np.savez(file, t=500.0 + 0.1 * np.arange(60), ranges=rows, odom=TRUTH)
+    return file
+
+
+def test_a_trajectory_with_the_geometry_that_was_given(log: Path, tmp_path: Path):
+    geometry = ["--start-angle", np.degrees(LIDAR.start_angle), "--angle-increment", np.degrees(LIDAR.angle_increment)]
+    arguments = [log, "-o", tmp_path / "map", "--trajectory", tmp_path / "poses.txt", "--json", *geometry]
+    result = CliRunner().invoke(
+        app, ["map", "build", *map(str, arguments), "--range-max", "5.6", "--mount", "0", "0", "0"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "holds no range_min, time_increment" in result.stderr
+    facts = json.loads(result.stdout)
+    assert "60 poses" in facts["trajectory"]
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    assert rows[:, 0] == pytest.approx(500.0 + 0.1 * np.arange(60))
+    assert np.hypot(*(rows[:, 1:3] - TRUTH[:, :2]).T).max() < 0.05
+    found = CliRunner().invoke(app, ["map", "localise", str(log), str(tmp_path / "map"), "--json", *map(str, geometry)])
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout)["localised"] > 10
+
+
+def test_bad_arrays_are_one_sentence(log: Path, tmp_path: Path):
+    file = tmp_path / "bad.npz"
+    np.savez(file, t=np.arange(3.0), ranges=np.full((3, BEAMS), np.nan))
+    result = CliRunner().invoke(app, ["map", "build", str(file), "-o", str(tmp_path / "map")])
+    assert result.exit_code != 0
+    assert "bad.npz: ranges: expected metres" in result.output
+    assert "Traceback" not in result.output
