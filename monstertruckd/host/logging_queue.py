@@ -21,7 +21,7 @@ PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logg
 LONGEST: Final = 16_384
 """Characters of one record; what is beyond is cut off."""
 MARGIN: Final = 1024
-"""Characters beyond the cut that are looked at, so that no secret stands there half."""
+"""Characters beyond the cut that are searched as well, so that no secret is cut in half and missed."""
 
 _KEYS: Final = r"(?:password|passwd|passphrase|secret|token|authorization|(?<![a-z])psk|api[_-]?key)"
 _NAMES: Final = ("passw", "passphrase", "secret", "token", "authorization", "psk", "api")

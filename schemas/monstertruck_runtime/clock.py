@@ -33,12 +33,12 @@ MANY_TIMERS: Final = 100
 
 
 def processor_time() -> float:
-    """Processor time of the calling thread, s: what a computation has used, whatever else the computer does."""
+    """Processor time of the calling thread, s: what a computation has used, whatever the computer's other load."""
     return time.thread_time()
 
 
 class Clock(Protocol):
-    """What a service may know of time."""
+    """The clock that services are given."""
 
     def now(self) -> int:
         """Nanoseconds of the daemon's monotonic time."""
@@ -65,7 +65,7 @@ class Clock(Protocol):
 
 
 class _LoopClock(ABC):
-    """Shared part: sleeping rests on the running loop, whatever carries it."""
+    """Shared part: sleeping uses the timers of the running loop."""
 
     @abstractmethod
     def now(self) -> int: ...

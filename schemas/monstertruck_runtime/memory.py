@@ -1,4 +1,4 @@
-"""What a process tells the garbage collector, the C library and the kernel of its memory."""
+"""Settings of the garbage collector, the C library and the kernel for a process's memory."""
 
 import ctypes
 import gc

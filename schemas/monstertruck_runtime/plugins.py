@@ -1,6 +1,6 @@
 """Plug-ins: what a ``kind`` in the configuration stands for, from this repository or from another distribution.
 
-A catalog has one ``Plugin`` row per kind. The settings model is light: it is loaded to check a configuration. The
+A catalog has one ``Plugin`` per kind. The settings model is light: it is loaded to check a configuration. The
 implementation is loaded on use, so that listing kinds, ``--help`` and a check of a configuration stay cheap. Other
 distributions add rows through entry points, each of which names a ``Plugin``::
 

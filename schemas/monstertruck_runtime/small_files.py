@@ -1,4 +1,4 @@
-"""Small files: such of /proc and /sys, made up by the kernel and often not there, and such that are replaced whole."""
+"""Small files: those of /proc and /sys, which may be missing, and files that are replaced as a whole."""
 
 import errno
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def text_of(file: Path) -> str | None:
-    """Content without the white space around it; None if it is not there or the kernel refuses to tell."""
+    """Content without the white space around it; None if it is not there or cannot be read."""
     try:
         return file.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class ThreadHop(Generic[T]):
-    """Bounded queue from any thread to one loop, which takes one item per turn: a burst never holds up the others.
+    """Bounded queue from any thread to one loop, which takes one item per turn: a burst never delays other callbacks.
 
     Args:
         deliver: called on the loop for every item, in the order of ``put``.
@@ -34,7 +34,7 @@ class ThreadHop(Generic[T]):
         self._on_loss = on_loss
         self._rank = rank
         self._items: deque[T] = deque()
-        """Its ends are anybody's; what lies between, and with ranks also its left end, is the lock's owner's."""
+        """Any thread may use its ends; items between them, and with ranks the left end too, need the lock."""
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()
         self._scheduled = False
@@ -86,7 +86,7 @@ class ThreadHop(Generic[T]):
                 item = self._pop()
         if not items:
             self._scheduled = False
-        if items:  # perhaps just now, by somebody who still saw it scheduled
+        if items:  # perhaps put meanwhile by a thread that still saw it scheduled
             self._scheduled = True
             self._loop.call_soon(self._take)
         if self._lost:
@@ -99,7 +99,7 @@ class ThreadHop(Generic[T]):
     def _pop(self) -> T | None:
         try:
             return self._items.popleft()
-        except IndexError:  # somebody was quicker
+        except IndexError:  # another thread was quicker
             return None
 
 
@@ -120,7 +120,7 @@ async def in_daemon_thread(function: Callable[[], T]) -> T:
     def run() -> None:
         try:
             result = function()
-        except BaseException as error:  # noqa: BLE001 - it belongs to whoever waits
+        except BaseException as error:  # noqa: BLE001 - it is raised where the result is awaited
             outcome = partial(work.set_exception, error)
         else:
             outcome = partial(work.set_result, result)

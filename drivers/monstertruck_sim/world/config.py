@@ -25,7 +25,7 @@ class ServoModelConfig(Schema):
     channel: Annotated[int, Field(ge=0, le=5)]
     """Output of the servo controller."""
     centre_us: Positive = 1439.2
-    """Pulse at which the servo arm stands straight, us."""
+    """Pulse of the straight servo arm, us."""
     us_per_degree: float = -10.48
     """Pulse change per degree of servo angle, us."""
     rate: Positive = 6.0
@@ -285,7 +285,7 @@ class RoughPatch(Schema):
 
 
 class SinusoidTilt(Schema):
-    """The body rocks with time, whatever the ground."""
+    """The body rocks with time, on any ground."""
 
     kind: Literal["sinusoid"]
     pitch_deg: float = 15.0

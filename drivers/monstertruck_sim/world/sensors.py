@@ -123,7 +123,7 @@ class SimulatedLidar:
 
 
 class SimulatedView:
-    """``ViewSource``: what stands around the camera, which looks forward and stays level."""
+    """``ViewSource``: the scene around the camera, which looks forward and stays level."""
 
     def __init__(self, plant: TruckPlant, cast: Caster, config: CameraConfig) -> None:
         self._plant, self._cast, self._config = plant, cast, config

@@ -29,7 +29,7 @@ _ROOM = 0.05
 
 
 class World:
-    """Ties map, truck and sensors together; time stands still until somebody asks for a later instant.
+    """Map, truck and sensors in one simulation, which advances when a later instant is asked for.
 
     Everything is a function of configuration, seed, commands and their instants. The start of time is the first
     instant anybody names.
@@ -60,7 +60,7 @@ class World:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
         self._occupied = place.map.cells == OCCUPIED
         self._clear = clearance(self._occupied)
-        self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiled now rather than within somebody's deadline
+        self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiles outside of any deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
         self._lidar = SimulatedLidar(self._plant, self._cast, self._terrain, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
@@ -123,7 +123,7 @@ class World:
         self._plant.battery.connected = connected
 
     def supply_servos(self, time_ns: int, *, on: bool) -> None:
-        """Switch the steering servos' own 5 V: without it they stay where they are, whatever their pulses say."""
+        """Switch the steering servos' own 5 V: without it they stay where they are."""
         self._plant.advance(time_ns)
         self._plant.servo_supply = on
 

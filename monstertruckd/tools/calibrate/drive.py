@@ -93,7 +93,7 @@ class DriveWizard:
                 off = 100 * (value / middle - 1)
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
         tape = math.sqrt(2) * self.tape_error / self.metres
-        # A compass with iron tells no more of a bend than that there is one.
+        # A compass disturbed by iron shows that there is a bend, not how much.
         bend = 0.0 if "compass" in context.known else max(run.bend for run in runs)
         turns = mean_interval(values, middle * tape).widened(middle * (TAPE_SCALE + bend))
         radius = float(context.value("geometry.wheel_radius"))

@@ -105,7 +105,7 @@ class Mover:
 
     @asynccontextmanager
     async def _armed(self, run: "_Run") -> AsyncIterator[None]:
-        """Armed inside; stopped and disarmed afterwards, whatever happens."""
+        """Armed inside; stopped and disarmed afterwards, also after errors."""
         await run.free()
         try:
             await run.arm()

@@ -42,7 +42,7 @@ class Wizard:
 
 
 class WizardContext:
-    """The steps of one wizard, and what it knows of the truck.
+    """The steps of one wizard, and its data of the truck.
 
     Args:
         truck: link to it.

@@ -96,7 +96,7 @@ def use_delivery(clock: VirtualClock, delivery: ResultDelivery) -> None:
 
 
 class LoopActor:
-    """The step in the caller's own loop, which stands still meanwhile.
+    """The step in the caller's own loop, which is blocked meanwhile.
 
     On the virtual clock the result is delivered when a worker's would be.
 

@@ -97,7 +97,7 @@ class WorkerProcess:
         return self.receive()
 
     def kill(self) -> None:
-        """End the process at once, whatever it does, and leave no zombie.
+        """Kill the process, and leave no zombie.
 
         The connection ends with its last user: a thread may still wait for it.
         """

@@ -151,7 +151,7 @@ def _annotations(cls: type[Any]) -> list[Any]:
 
 
 class RemoteActor:
-    """One kind of steps, taken by whoever calls for them; the newest caller is the one that counts.
+    """One kind of steps, taken by a plan server that calls for them; the newest caller replaces the one before.
 
     Args:
         name: of the steps, for the caller.
@@ -313,7 +313,7 @@ class Caller(Protocol):
 
     @property
     def source(self) -> str:
-        """Who calls."""
+        """Name of the caller."""
         ...
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
