@@ -188,12 +188,10 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
     soft = np.linalg.inv(((iron.soft_x, iron.soft_xy), (iron.soft_xy, iron.soft_y)))
     soft /= math.sqrt(np.linalg.det(soft))
     steering: dict[str, Value] = {}
-    linkage = truck.chassis().linkage
-    assert linkage is not None
-    axles = (("front", truck.front_servo, linkage.front), ("rear", truck.rear_servo, linkage.rear))
-    for name, servo, polynomials in axles:
+    chassis = truck.chassis()
+    for axle, (name, servo) in enumerate((("front", truck.front_servo), ("rear", truck.rear_servo))):
         stops = math.radians(servo.left_stop_deg), -math.radians(servo.right_stop_deg)
-        left, right = (math.degrees(float(polynomials.axle_from_servo(stop))) for stop in stops)
+        left, right = (math.degrees(chassis.steering(*np.roll((stop, 0.0), axle).tolist())[axle]) for stop in stops)
         steering |= {
             f"{name}_centre": servo.centre_us,
             f"{name}_scale": abs(servo.us_per_degree),

@@ -37,6 +37,7 @@ STEP_DEADLINE: Final = 5.0
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
     if config.tracker is not None:
+        tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
         paths, requests = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
         drawn = None
@@ -51,7 +52,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
             bus.event_sink(),
             config.gate.max_request_age,
         )
-        yield _build_tracker(config, config.tracker, bus, clock, body, requests, actors)
+        yield _build_tracker(config, tracker, bus, clock, body, requests, actors)
         if config.planner is not None:
             yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
@@ -124,6 +125,7 @@ def build_goals(
     """Goals are in map where the robot localises itself, else in odom, which is then taken for the map's frame."""
     lidar, mapped = config.devices.lidar, config.slam is not None
     assert config.tracker is not None
+    planner = _within_reach(planner, chassis.reached_angle)
     planner = planner.model_copy(update={"map": None}) if mapped else planner
     mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
     setup = Setup(planner, chassis.bicycle, footprint, mount, timed=not isinstance(clock, VirtualClock))
@@ -154,6 +156,12 @@ def build_goals(
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),
     )
+
+
+def _within_reach(planner: PlannerConfig, angle: float) -> PlannerConfig:
+    """Axle angles at most as large as the servos reach, rad."""
+    escape = planner.escape.model_copy(update={"angle": min(planner.escape.angle, angle)})
+    return planner.model_copy(update={"angle": min(planner.angle, angle), "escape": escape})
 
 
 def _deformation(

@@ -1,6 +1,7 @@
 """The configuration of one robot or experiment: the root of the YAML file."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -132,9 +133,14 @@ class TruckConfig(Schema):
         Raises:
             KinematicsError: dimensions no robot can have.
         """
-        geometry = self.geometry
-        drivetrain = DriveTrain(geometry.drive_ratio, geometry.wheel_radius)
-        chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, geometry.wheelbase, geometry.track))
+        geometry, steering = self.geometry, self.devices.steering
+        dimensions = Dimensions(
+            DriveTrain(geometry.drive_ratio, geometry.wheel_radius), geometry.wheelbase, geometry.track
+        )
+        if steering is not None and isinstance(steering.driver, MaestroConfig):
+            ranges = steering.driver.front.reach, steering.driver.rear.reach
+            dimensions = replace(dimensions, servo_ranges=ranges)
+        chassis: Chassis = build_chassis(self.body, dimensions)
         return chassis
 
     @property

@@ -98,7 +98,7 @@ class GateConfig(Schema):
     reverse_speed: Positive = 0.15
     """Greatest wheel speed in reverse, where the lidar sees nothing, m/s."""
     angle: Annotated[float, Field(gt=0, lt=1.0)] = 0.436
-    """Greatest axle angle, rad."""
+    """Greatest axle angle, rad; less where the servos' pulses reach less."""
     acceleration: Positive = 0.5
     """Growth of the commanded speed, m/s^2."""
     deceleration: Positive = 1.0

@@ -17,7 +17,6 @@ from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import Value
 from monstertruck_runtime.requests import OPERATORS
 from monstertruck_runtime.stop_text import causes_text
@@ -99,9 +98,6 @@ class Gate:
         services: the services of the sensors, with the reason their loss gives.
         nonce: of this run; requests must carry it.
         latched: whether the emergency stop was latched when the daemon last ran.
-
-    Raises:
-        ConfigError: the steering linkage cannot reach ``config.angle``.
     """
 
     def __init__(
@@ -115,12 +111,6 @@ class Gate:
         nonce: str,
         latched: bool = False,
     ) -> None:
-        if config.angle > chassis.max_axle_angle:
-            msg = (
-                f"gate.angle {config.angle} rad: expected at most {chassis.max_axle_angle:.4f} rad, "
-                "which the steering linkage reaches"
-            )
-            raise ConfigError(msg)
         self._config = config
         self._chassis = chassis
         self._sources = Sources(nonce, config)

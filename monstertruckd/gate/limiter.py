@@ -122,6 +122,10 @@ class ObstacleGuard:
         return speed * delay + speed**2 / (2 * deceleration)
 
 
+SATURATED: Final = 1e-4
+"""Steering angle, rad, that a servo has to lack before the gate says so."""
+
+
 class Target(NamedTuple):
     """What a request asks of the body."""
 
@@ -131,6 +135,8 @@ class Target(NamedTuple):
     """Steering angles it needs."""
     clipped: bool
     """It is not what was asked, but the nearest that the body can do."""
+    saturated: bool
+    """The servos' range makes it so."""
 
 
 class Motion:
@@ -196,9 +202,10 @@ class Motion:
         clipped = max(abs(front), abs(rear)) > self._config.angle
         if clipped:
             front, rear = chassis.limited(front, rear, self._config.angle)
+        (front, rear), saturated = self._reached((front, rear))
         speed = min(max(request.speed, -MAX_SPEED), MAX_SPEED)
         twist = chassis.bicycle.body_twist(speed, front, rear)
-        return Target(twist, chassis.steering_for_axles(front, rear, self.angles), clipped)
+        return Target(twist, chassis.steering_for_axles(front, rear, self.angles), clipped or saturated, saturated)
 
     def _target_of_twist(self, request: RequestedTwist) -> Target:
         chassis = self._chassis
@@ -206,7 +213,13 @@ class Motion:
         asked = _scaled(asked, min(1.0, MAX_SPEED / max(*map(abs, asked), MAX_SPEED)))
         twist = chassis.possible(asked)
         angles, clipped = chassis.limited_steering(chassis.steering_for(twist, self.angles), self._config.angle)
-        return Target(twist, angles, clipped or not _same(twist, asked))
+        angles, saturated = self._reached(angles)
+        return Target(twist, angles, clipped or saturated or not _same(twist, asked), saturated)
+
+    def _reached(self, angles: Angles) -> tuple[Angles, bool]:
+        """Steering angles that the servos reach, and whether these are others."""
+        reached = self._chassis.reached(angles)
+        return reached, max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > SATURATED
 
     def along(self, twist: Twist[float], angles: Angles | None = None) -> Twist[float]:
         """The part of a twist that the body can do at steering angles, by default the commanded ones."""
@@ -299,6 +312,8 @@ class CommandLimiter:
             wanted = STILL  # a change of direction passes through standstill
         pace = motion.pace(wanted)
         max_pace = motion.max_pace(wanted if pace > 0 else motion.twist)
+        if target.saturated:
+            limits[Reason.SERVO_LIMIT] = max_pace
         if target.clipped or pace > max_pace * (1 + ROUNDING):
             limits[Reason.CLIPPED] = max_pace
         if pace > 0 or not motion.standing:

@@ -118,6 +118,13 @@ def smaller(a: Real, b: Real | float) -> Real:
     return min(a, b)
 
 
+def where_positive(x: Real, positive: float, other: float) -> Real:
+    """``positive`` where x is above 0, ``other`` elsewhere."""
+    if isinstance(x, np.ndarray):
+        return np.where(x > 0.0, positive, other)
+    return positive if x > 0.0 else other
+
+
 def sinc(x: Real) -> Real:
     """sin(x)/x, 1 at 0."""
     if isinstance(x, np.ndarray):
@@ -185,6 +192,13 @@ def nonzero(x: Real) -> Real:
     if isinstance(x, np.ndarray):
         return np.where(x == 0.0, 1.0, x)
     return x if x != 0.0 else 1.0
+
+
+def all_positive(x: Real) -> bool:
+    """Whether x, or every element of it, is above 0."""
+    if isinstance(x, np.ndarray):
+        return bool((x > 0.0).all())
+    return x > 0.0
 
 
 def any_zero(x: Real) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from monstertruck_kinematics.elementary import (
     KinematicsError,
     Real,
+    all_positive,
     asin,
     atan,
     atan2,
@@ -144,6 +145,25 @@ class SteeringLinkage:
         return self._side * servo
 
 
+def least_squares_motion(geometry: FourWheelSteering, angles: tuple[Real, Real, Real, Real]) -> tuple[Real, Real]:
+    """Tan(sideslip) and turning of ``common_motion``, for wheel angles known to be below 89 deg.
+
+    Raises:
+        KinematicsError: wheels that leave the motion undetermined.
+    """
+    zero = 0.0 * angles[0]
+    bb, bk, kk, bs, ks = zero, zero, zero, zero, zero
+    for (x, y), angle in zip(geometry.wheel_positions, angles, strict=True):
+        side, drive = cos(angle), sin(angle)
+        turn = y * drive + x * side
+        bb, bk, kk = bb + side * side, bk + side * turn, kk + turn * turn
+        bs, ks = bs + side * drive, ks + turn * drive
+    determinant = bb * kk - bk * bk
+    if not all_positive(determinant - 1e-12 * (bb * geometry.wheelbase) ** 2):
+        raise KinematicsError("angles: all wheels roll towards one point, the turning rate is undetermined")
+    return (bs * kk - ks * bk) / determinant, (bb * ks - bk * bs) / determinant
+
+
 def common_motion(
     geometry: FourWheelSteering, angles: tuple[Real, Real, Real, Real]
 ) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
@@ -164,21 +184,10 @@ def common_motion(
     """
     for name, angle in zip(("front left", "front right", "rear left", "rear right"), angles, strict=True):
         require_within(f"wheel {name}: angle", angle, -math.radians(89.0), math.radians(89.0))
-    places = geometry.wheel_positions
-    zero = 0.0 * angles[0]
-    bb, bk, kk, bs, ks = zero, zero, zero, zero, zero
-    for (x, y), angle in zip(places, angles, strict=True):
-        side, turn, drive = cos(angle), y * sin(angle) + x * cos(angle), sin(angle)
-        bb, bk, kk = bb + side * side, bk + side * turn, kk + turn * turn
-        bs, ks = bs + side * drive, ks + turn * drive
-    determinant = bb * kk - bk * bk
-    if np.any(determinant <= 1e-12 * (bb * geometry.wheelbase) ** 2):
-        raise KinematicsError("angles: all wheels roll towards one point, the turning rate is undetermined")
-    slide = (bs * kk - ks * bk) / determinant
-    turn_rate = (bb * ks - bk * bs) / determinant
+    slide, turn_rate = least_squares_motion(geometry, angles)
     errors = [
         angle - atan((slide + x * turn_rate) / (1.0 - y * turn_rate))
-        for (x, y), angle in zip(places, angles, strict=True)
+        for (x, y), angle in zip(geometry.wheel_positions, angles, strict=True)
     ]
     return slide, turn_rate, (errors[0], errors[1], errors[2], errors[3])
 

@@ -14,6 +14,7 @@ from monstertruck_schemas.base import Schema
 
 Metres = Annotated[float, Field(gt=0, le=10)]
 Gain = Annotated[float, Field(gt=0, le=10)]
+Coefficient = Annotated[float, Field(ge=-2, le=2)]
 
 
 class Mount(Schema):
@@ -44,10 +45,28 @@ class BodyConfig(Schema):
     kind: str
 
 
+class TurnDeficit(Schema):
+    """What the axles turn less than their linkage says; dimensionless, 0 = as it says.
+
+    The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and the side to which its
+    wheels are turned; where the axles oppose each other, the turn becomes turn (1 + c t_front t_rear), with a
+    coefficient for each side to which the body turns.
+    """
+
+    front_left: Coefficient = 0.0
+    front_right: Coefficient = 0.0
+    rear_left: Coefficient = 0.0
+    rear_right: Coefficient = 0.0
+    counter_left: Coefficient = 0.0
+    counter_right: Coefficient = 0.0
+
+
 class TruckBody(BodyConfig):
     """Two steered axles, one motor for all four wheels."""
 
     kind: Literal["truck"] = "truck"
+    turn_deficit: TurnDeficit = TurnDeficit()
+    """Found by `calibrate steering`"""
 
 
 class AckermannBody(BodyConfig):

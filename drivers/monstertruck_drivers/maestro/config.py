@@ -43,6 +43,13 @@ class ServoConfig(Schema):
         pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
         return round(4 * min(max(pulse, self.min_us), self.max_us))
 
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Servo angles, rad, to the right (negative) and to the left, that pulses within all limits give."""
+        ends = sorted(self.angle(round(4 * pulse)) for pulse in (self.min_us, self.max_us))
+        limit = math.radians(self.max_angle_deg)
+        return max(ends[0], -limit), min(ends[1], limit)
+
     def angle(self, quarters: int) -> float:
         """Servo angle (rad, left positive) of a pulse in quarter microseconds."""
         return math.radians((quarters / 4 - self.centre_us) * self.direction / self.scale_us_per_deg)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from monstertruck_kinematics.chassis import Chassis, Dimensions
+from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_schemas.base import Pose2D, Schema
@@ -72,6 +73,30 @@ class MotorConfig(Schema):
     """Standard deviation of the measured current, A."""
 
 
+class AxleConfig(Schema):
+    """Linkage polynomials of one axle, rad, highest power first."""
+
+    left_from_servo: tuple[float, ...]
+    right_from_left: tuple[float, ...]
+
+
+class LinkageConfig(Schema):
+    """Linkage of both axles."""
+
+    front: AxleConfig
+    rear: AxleConfig
+
+    @property
+    def polynomials(self) -> SteeringPolynomials:
+        """For the kinematics.
+
+        Raises:
+            KinematicsError: wheels that do not follow their servo.
+        """
+        front, rear = (AxlePolynomials(a.left_from_servo, a.right_from_left) for a in (self.front, self.rear))
+        return SteeringPolynomials(front, rear)
+
+
 class SimTruckConfig(Schema):
     """Body, wheels and tyres.
 
@@ -115,8 +140,8 @@ class SimTruckConfig(Schema):
     """Longitudinal slip ratio per N of pull."""
     slip_noise: NotNegative = 0.005
     """Standard deviation of the random part of the longitudinal slip ratio."""
-    steering: Literal["corrected", "as_published", "2016"] = "corrected"
-    """Set of linkage polynomials."""
+    steering: Literal["corrected", "as_published", "2016"] | LinkageConfig = "corrected"
+    """Linkage polynomials: a set of the sources', or a truck's own."""
     front_servo: ServoModelConfig = ServoModelConfig(channel=1)
     rear_servo: ServoModelConfig = ServoModelConfig(channel=0)
     front_right_servo: ServoModelConfig | None = None
@@ -133,7 +158,8 @@ class SimTruckConfig(Schema):
             KinematicsError: dimensions no robot can have.
         """
         drivetrain = DriveTrain(self.motor.ratio, self.wheel_radius)
-        chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, self.wheelbase, self.track, self.steering))
+        polynomials = self.steering.polynomials if isinstance(self.steering, LinkageConfig) else self.steering
+        chassis: Chassis = build_chassis(self.body, Dimensions(drivetrain, self.wheelbase, self.track, polynomials))
         return chassis
 
     @property

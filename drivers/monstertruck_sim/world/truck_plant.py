@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import PulseSource
+from monstertruck_kinematics.axles import LinkedAxles
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.dynamics import SingleTrack
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.linkage import dragged_speeds
 from monstertruck_kinematics.motion import integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
@@ -293,7 +295,8 @@ class TruckPlant:
 class _Steering:
     """Steering angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
 
-    The truck's one motor drives four wheels through open differentials: it turns with the mean of their speeds.
+    The truck's one motor drives four wheels through open differentials: it turns with the mean of the speeds at which
+    the body drags them, each along its own angle.
     """
 
     def __init__(self, chassis: Chassis) -> None:
@@ -307,8 +310,10 @@ class _Steering:
         self._servos = servos
         self.angles = self._chassis.steering(*servos)
         self.body_per_wheel = 1.0
-        if isinstance(self._chassis, TruckChassis):
-            self.body_per_wheel = 4.0 / sum(self._chassis.bicycle.wheel_speeds(1.0, *self.angles))
+        linkage = self._chassis.linkage
+        if isinstance(self._chassis, TruckChassis) and isinstance(linkage, LinkedAxles):
+            wheels = linkage.wheel_angles(*servos)
+            self.body_per_wheel = 4.0 / sum(dragged_speeds(linkage.geometry, 1.0, wheels))
 
 
 def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:

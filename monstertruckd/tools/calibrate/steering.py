@@ -239,7 +239,7 @@ class Reach:
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
-        angle = float(model.linkages[axle].axle_from_servo(servo))
+        angle = model.axle_angle(axle, servo)
         noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))

@@ -16,7 +16,7 @@ import numpy as np
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
-from monstertruck_kinematics.polynomials import AxlePolynomials
+from monstertruck_kinematics.polynomials import SERVO_LIMIT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
@@ -39,7 +39,7 @@ GAIN: Final = 0.15
 """Share by which a pulse map may differ from the configured one, where nothing else tells."""
 
 
-_ROUNDS: Final = 6
+_HALVINGS: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Maps:
     def servo(self, axle: int, pulses: Array) -> Array:
         """Servo angles, rad, that pulses mean, cut to what the linkage takes."""
         angles = np.radians((pulses - self.centres[axle]) / self.scales[axle])
-        return np.asarray(np.clip(angles, -math.pi / 4, math.pi / 4))
+        return np.asarray(np.clip(angles, -SERVO_LIMIT, SERVO_LIMIT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +128,15 @@ class SteeringModel:
     def __init__(self, chassis: TruckChassis) -> None:
         assert chassis.linkage is not None
         self.chassis = chassis
-        self.linkages: tuple[AxlePolynomials, AxlePolynomials] = (chassis.linkage.front, chassis.linkage.rear)
+        self.axles = chassis.linkage
 
     def angles(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array]:
         """Axle angles, rad, that the pulses of a leg mean; (n,) each."""
-        front, rear = (self.linkages[i].axle_from_servo(maps.servo(i, leg.pulses[i])) for i in (0, 1))
-        return front, rear
+        return self.axles.angles(maps.servo(0, leg.pulses[0]), maps.servo(1, leg.pulses[1]))
+
+    def axle_angle(self, axle: int, servo: float) -> float:
+        """Angle, rad, of an axle at its servo angle, the other one straight."""
+        return self.axles.angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
     def moves(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array, Array]:
         """Forward, sideways (m) and turn (rad) between readings of a leg, in the body's frame; (n,) each."""
@@ -184,16 +187,20 @@ class SteeringModel:
 
         The other axle is taken as the maps have it. Valid for a leg with steady steering.
         """
-        bicycle, linkage = self.chassis.bicycle, self.linkages[axle]
+        bicycle, sense = self.chassis.bicycle, 1.0 if axle == 0 else -1.0
         rolled = float(self.chassis.drivetrain.distance(leg.motor.sum()))
-        angles = [float(side.mean()) for side in self.angles(leg, maps)]
-        other = math.tan(angles[1 - axle])
-        for _ in range(_ROUNDS):  # how far the body gets per turn of the wheels depends on their angle a little
-            forward, _, _ = bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)
-            tangent = leg.turn * bicycle.wheelbase / forward
-            angle = math.atan(other + tangent if axle == 0 else other - tangent)
-            angles[axle] = min(max(angle, linkage.axle_limits[0]), linkage.axle_limits[1])
-        return float(linkage.servo_from_axle(angles[axle])), float(maps.servo(axle, leg.pulses[axle]).mean())
+        meant = [float(maps.servo(i, leg.pulses[i]).mean()) for i in (0, 1)]
+
+        def turned(servo: float) -> float:
+            angles = self.axles.angles(*((servo, meant[1]) if axle == 0 else (meant[0], servo)))
+            return bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)[2]
+
+        low, high = -SERVO_LIMIT, SERVO_LIMIT
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            more = sense * (leg.turn - turned(middle)) * math.copysign(1.0, rolled) > 0.0
+            low, high = (middle, high) if more else (low, middle)
+        return low, meant[axle]
 
 
 def half_widths(fit: FitResult, priors: int = 3) -> Array:

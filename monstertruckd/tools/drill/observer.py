@@ -17,8 +17,7 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
-from monstertruck_kinematics.polynomials import SteeringPolynomials
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_sim.world.config import ServoModelConfig
 from monstertruck_sim.world.truck_plant import TruthState
@@ -118,15 +117,14 @@ class Observer:
         self._steering = WireTap(ports["steering"], clock)
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
         self._truck = truck = config.sim.world.truck
-        self._linkage = SteeringPolynomials.named(truck.steering)
-        self._kinematics = FourWheelSteering(truck.wheelbase, truck.track)
+        self._chassis = truck.chassis()
         self._angle = config.gate.angle + ANGLE_MARGIN
         self._speed = config.gate.speed
         self._camera = config.sim.world.camera.x
         drivetrain = DriveTrain(truck.motor.ratio, truck.wheel_radius)
         self._rpm = drivetrain.motor_rate(config.gate.speed) * 30 / math.pi
         self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
-        """Axle angles that the newest pulses ask for, rad."""
+        """Servo angles that the newest pulses ask for, rad."""
         self._turn_errors: deque[tuple[int, float]] = deque()
         self._disarmed: int | None = None
         self._began = 0
@@ -241,18 +239,16 @@ class Observer:
                     self._pulse(now, command.data[0], command.value / 4)
 
     def _pulse(self, now: int, channel: int, pulse_us: float) -> None:
-        truck, linkage = self._truck, self._linkage
-        for servo, axle in ((truck.front_servo, linkage.front), (truck.rear_servo, linkage.rear)):
+        truck = self._truck
+        for servo in (truck.front_servo, truck.rear_servo):
             if servo.channel == channel:
-                arm = min(max(_arm(servo, pulse_us), -axle.servo_limit), axle.servo_limit)
-                angle = axle.axle_from_servo(arm)
-                self._pulses[channel] = angle
-                if abs(angle) > self._angle:
-                    self._violate(now, "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}")
+                self._pulses[channel] = _arm(servo, pulse_us)
+        if (angle := max(map(abs, self._chassis.steering(*self._pulses.values())))) > self._angle:
+            self._violate(now, "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}")
 
     def _check_steering(self, now: int, truth: TruthState) -> None:
         """The true rate of turn against the one that the pulses ask for, while the truck drives."""
-        commanded = self._kinematics.body_twist(truth.v, *self._pulses.values())[2]
+        commanded = self._chassis.bicycle.body_twist(truth.v, *self._chassis.steering(*self._pulses.values()))[2]
         self._turn_errors.append((now, (truth.wz - commanded) * SAMPLE / SECOND))
         while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
             self._turn_errors.popleft()

@@ -30,7 +30,7 @@ PATIENCE: Final = 15.0
 """Seconds after which a service that has not recovered is stuck."""
 RECOVERS_WITHIN: Final = 4.0
 """Seconds within which everything should be back: the goal of a lost hub."""
-QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.OBSTACLE_SLOW})
+QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.OBSTACLE_SLOW})
 """Reasons that explain nothing."""
 DEADMAN: Final[dict[str, Any]] = {
     "map": None,

@@ -31,8 +31,8 @@ class EscapeConfig(Schema):
     """A side is free if there is no obstacle within this distance of it, m."""
     distance: Positive = 0.5
     """Driven at most, m."""
-    angle: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    """Of the axles, away from a blocked side, rad."""
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.362
+    """Of the axles, away from a blocked side, rad; less where the servos reach less."""
     crab: bool = True
     """Both axles alike, where the vehicle can; else they turn the truck."""
     margin: Share = 0.03
@@ -65,8 +65,9 @@ class PlannerConfig(Schema):
     """Route planner; its margin has to exceed the gate's side clearance; backward the lidar sees nothing"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
     """Front axle alone, both opposite, or both in every way"""
-    angle: Annotated[float, Field(gt=0, lt=1)] = 0.36
-    """Greatest axle angle of routes, rad; what the truck has beyond is left to the tracker"""
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.33
+    """Greatest axle angle of routes, rad: circles of 0.47 m; the tracker has more. Less where the servos reach
+    less"""
     map: Path | None = None
     """map_server YAML file to plan on where there is no slam"""
     local_planner: AnyLocalPlanner | None = None

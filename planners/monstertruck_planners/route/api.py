@@ -196,7 +196,7 @@ class Vehicle:
         cls,
         steering: Literal["2ws", "counter", "4ws"] = "4ws",
         *,
-        angle: float = 0.4,
+        angle: float = 0.362,
         geometry: FourWheelSteering | None = None,
         footprint: Footprint | None = None,
     ) -> "Vehicle":

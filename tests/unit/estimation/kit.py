@@ -6,14 +6,12 @@ import numpy as np
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
-from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
 
 STEERING = FourWheelSteering()
 DRIVETRAIN = DriveTrain()
-LINKAGE = SteeringPolynomials()
 CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
 
 
@@ -22,7 +20,7 @@ def drive_feedback(now, position, velocity=0.0):
 
 
 def servo_feedback(now, front, rear):
-    servos = LINKAGE.servo_from_axles(front, rear)
+    servos = CHASSIS.servos(front, rear)
     return SteeringFeedback(stamp=now, received=now, seq=0, front=servos[0], rear=servos[1])
 
 

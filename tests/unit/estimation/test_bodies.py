@@ -89,6 +89,8 @@ def test_one_shaft_that_counts_from_a_new_origin_is_no_way():
 
 def test_a_cars_rear_servo_does_not_exist():
     robot = Robot("ackermann")
-    robot.reckoning.observe_steering(servo_feedback(robot.now, 0.3, -0.3))
+    front, _ = robot.chassis.servos(0.3, 0.0)
+    feedback = servo_feedback(robot.now, 0.0, 0.0).model_copy(update={"front": front, "rear": -0.5})
+    robot.reckoning.observe_steering(feedback)
     estimate, _ = robot.roll((0.2,), 1.0, (0.0, 0.0, 0.0))
     assert estimate.twist[2] / estimate.twist[0] == pytest.approx(math.tan(0.3) / 0.32)

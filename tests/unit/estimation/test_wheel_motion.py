@@ -19,7 +19,7 @@ def rolls(chassis, speeds, angle, count, cuts=1):
     """Ways of ``count`` readings, each cut into ``cuts``."""
     wheels, turns, made = WheelMotion(chassis, 2.0), np.zeros(len(chassis.shafts)), []
     front, rear = (angle, angle) if chassis.freedom == "parallel" else (angle, 0.0)
-    servos = (0.0, 0.0) if chassis.linkage is None else chassis.linkage.servo_from_axles(front, rear)
+    servos = chassis.servos(front, rear)
     for k in range(count * cuts + 1):
         now = SECOND + k * STEP // cuts
         feedback = servo_feedback(now, 0.0, 0.0).model_copy(update={"front": servos[0], "rear": servos[1]})

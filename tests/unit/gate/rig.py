@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
-from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
@@ -30,7 +29,6 @@ TICK = SECOND // 50
 NONCE = "run-1"
 SENSORS = ("scan", "attitude", "drive", "steering", "battery")
 DRIVETRAIN = DriveTrain()
-LINKAGE = SteeringPolynomials()
 STEERING = FourWheelSteering()
 SERVICES = {
     "lidar": Reason.SCAN_STALE,
@@ -105,8 +103,8 @@ def health(now, state=ServiceState.READY, name="planner", **more):
 class Rig:
     """A gate, the time, and a truck whose speed follows the commands as the drive controller's profile does."""
 
-    def __init__(self, latched=False, **config):
-        self.gate = make_gate(latched, **config)
+    def __init__(self, latched=False, chassis=CHASSIS, **config):
+        self.gate = make_gate(latched, chassis=chassis, **config)
         self.config = GateConfig(**config)
         self.now = SECOND
         self.speed = 0.0

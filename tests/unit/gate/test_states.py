@@ -1,20 +1,18 @@
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 
-from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
-from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_drivers.maestro.config import ServoConfig
+from monstertruck_kinematics.chassis import Dimensions, truck_chassis
+from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import ConfigError
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order, Role
+from monstertruck_schemas.req import Order, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.core import Gate
 from tests.unit.gate.rig import CHASSIS, DRIVETRAIN, STEERING, TICK, Rig
 
 
@@ -185,7 +183,8 @@ def test_clipping_keeps_the_curvature():
     assert len(rig.told(Reason.CLIPPED)) == 1
     rig.driver = {"speed": 0.1, "front": 9.0, "rear": -9.0}
     rig.tick(40)
-    assert (rig.out.front, rig.out.rear) == pytest.approx((0.436, -0.436))
+    assert (rig.out.front, rig.out.rear) == pytest.approx((0.4095, -0.4095), abs=1e-4)  # servos at 45 degrees
+    assert Reason.SERVO_LIMIT in rig.out.reasons
 
 
 def test_crab_goes_as_fast_as_straight_and_a_curve_as_fast_as_the_wheels_may():
@@ -201,9 +200,32 @@ def test_reversing_has_its_own_limit():
 
 def test_servo_angles_belong_to_the_axle_angles():
     rig = Rig().driving(front=0.2, rear=-0.1)
-    linkage = SteeringPolynomials()
-    axles = linkage.front.axle_from_servo(rig.out.servos[0]), linkage.rear.axle_from_servo(rig.out.servos[1])
-    assert axles == pytest.approx((0.2, -0.1))
+    assert CHASSIS.steering(*rig.out.servos) == pytest.approx((0.2, -0.1))
+
+
+@pytest.mark.parametrize("form", ["axles", "twist"])
+def test_a_servo_at_the_end_of_its_pulses_is_reported_and_the_curvature_is_what_it_reaches(form):
+    """Pulses of 1088 to 1840 us, centre 1439.2: 33.5 degrees of servo to the left, 38.2 to the right."""
+    reach = (ServoConfig(channel=0).reach,) * 2
+    chassis = truck_chassis(Dimensions(DriveTrain(), servo_ranges=reach))
+
+    def asked(front, rear):
+        if form == "axles":
+            return {"speed": 0.1, "front": front, "rear": rear}
+        vx, vy, wz = STEERING.body_twist(0.1, front, rear)
+        return {"speed": 0.0, "twist": RequestedTwist(vx=vx, vy=vy, wz=wz)}
+
+    for front, rear, curvature in ((0.4, -0.4, 2.305), (-0.42, 0.42, -2.472)):
+        rig = Rig(chassis=chassis).driving(ticks=80, **asked(front, rear))
+        assert Reason.SERVO_LIMIT in rig.out.reasons
+        assert Reason.CLIPPED in rig.out.reasons
+        assert len(rig.told(Reason.SERVO_LIMIT)) == 1
+        assert chassis.bicycle.curvature(rig.out.front, rig.out.rear) == pytest.approx(curvature, abs=2e-3)
+        for servo in rig.out.servos:
+            assert reach[0][0] - 1e-4 <= servo <= reach[0][1] + 1e-4
+    rig = Rig(chassis=chassis).driving(ticks=80, **asked(0.33, -0.33))
+    assert Reason.SERVO_LIMIT not in rig.out.reasons
+    assert (rig.out.front, rig.out.rear) == pytest.approx((0.33, -0.33))
 
 
 # Orders
@@ -374,19 +396,6 @@ def test_equal_events_are_counted_not_repeated():
     assert len(refusals) == 3
     assert refusals[1].values["repeated"] == 49
     assert refusals[0].values == {"role": "gamepad", "request": "drive", "by": "ann"}
-
-
-def test_the_linkage_must_reach_the_limit():
-    short = AxlePolynomials((0.5, 0.0), (1.0, 0.0))
-    with pytest.raises(ConfigError, match=r"gate\.angle .* 0\.3927 rad"):
-        Gate(
-            GateConfig(),
-            chassis=replace(CHASSIS, linkage=SteeringPolynomials(short, short)),
-            footprint=Footprint(),
-            points=ScanPoints((0.14, 0.0, 0.0)),
-            services={},
-            nonce="n",
-        )
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,7 +89,7 @@ def test_servos_and_axles_are_each_others_inverse(chassis):
 def test_the_truck_is_its_own_formulas():
     truck = BODIES["truck"]
     assert truck.shaft_speeds(0.2, 0.3, -0.2) == (truck.bicycle.drive_speed(0.2, 0.3, -0.2),)
-    assert truck.servos(0.3, -0.2) == truck.linkage.servo_from_axles(0.3, -0.2)
+    assert truck.servos(0.3, -0.2) == truck.linkage.servos(0.3, -0.2)
 
 
 def test_a_differential_drive_turns_by_different_wheels_and_about_its_axle():
@@ -119,12 +118,31 @@ def test_what_a_body_cannot_do_is_refused_with_the_reason(body, front, rear, why
     assert re.search(why, BODIES[body].refusal(front, rear) or "")
 
 
+PULSES = ((-0.667, 0.585), (-0.667, 0.585))
+"""Servo angles that pulses of 1088 to 1840 us reach about a centre of 1439.2 us, front and rear, rad."""
+
+
 def test_only_steered_axles_limit_the_reach():
-    ackermann = BODIES["ackermann"]
-    stiff = replace(ackermann.linkage, rear=replace(ackermann.linkage.rear, servo_limit=0.1))
-    assert replace(ackermann, linkage=stiff).max_axle_angle == ackermann.max_axle_angle
-    assert replace(BODIES["truck"], linkage=stiff).max_axle_angle < 0.1
-    assert BODIES["mecanum"].max_axle_angle == MAX_AXLE_ANGLE
+    truck, car = (build(Dimensions(DRIVETRAIN, servo_ranges=PULSES)) for build in (truck_chassis, ackermann_chassis))
+    assert truck.reached_angle == pytest.approx(0.3365, abs=1e-3)
+    assert car.reached_angle == pytest.approx(0.352, abs=1e-3)
+    assert car.reached((-0.6, 0.0))[0] == pytest.approx(car.steering(-0.667, 0.0)[0])  # further to the right
+    assert BODIES["mecanum"].reached_angle == pytest.approx(MAX_AXLE_ANGLE)
+
+
+def test_what_the_servos_do_not_reach_keeps_the_curvature_then_the_sideslip():
+    truck = truck_chassis(Dimensions(DRIVETRAIN, servo_ranges=PULSES))
+    bicycle, rng = truck.bicycle, np.random.default_rng(6)
+    for front, rear in rng.uniform(-0.6, 0.6, (200, 2)).tolist():
+        kept = truck.reached((front, rear))
+        assert all(-0.6671 < servo < 0.5851 for servo in truck.servos(*kept))
+        assert bicycle.curvature(*kept) == pytest.approx(
+            min(max(bicycle.curvature(front, rear), -2.47), 2.303), abs=3e-3
+        )
+        assert truck.reached(kept) == pytest.approx(kept, abs=1e-9)
+    assert truck.reached((0.33, -0.33)) == (0.33, -0.33)
+    front, rear = truck.reached((0.5, 0.5))
+    assert front == pytest.approx(rear)  # crab stays crab
 
 
 @pytest.mark.parametrize(

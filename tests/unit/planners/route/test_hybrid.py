@@ -106,7 +106,7 @@ def test_unknown_ground_by_policy():
 def test_steep_and_rough_ground_is_avoided():
     cells = room()
     hill = np.zeros(cells.shape)
-    hill[:44, 50:70] = 1.5
+    hill[:44, 50:70] = 2.0
     level = HybridPlanner(CAR, QUICK).plan(RouteMap.from_cells(cells, 0.05), START, GOAL)
     for layer in ("tilt", "roughness"):
         round_it = HybridPlanner(CAR, QUICK).plan(RouteMap.from_cells(cells, 0.05, **{layer: hill}), START, GOAL)
@@ -178,9 +178,9 @@ def test_a_detour_is_given_up_for_a_much_better_way():
 
 
 def test_the_truck_in_its_three_ways():
-    assert Vehicle.truck("2ws").radius == pytest.approx(0.757, abs=1e-3)
-    assert Vehicle.truck("counter").radius == pytest.approx(0.378, abs=1e-3)
-    assert (Vehicle.truck("counter").crab_angle, Vehicle.truck("4ws").crab_angle) == (0.0, 0.4)
+    assert Vehicle.truck("2ws").radius == pytest.approx(0.845, abs=1e-3)
+    assert Vehicle.truck("counter").radius == pytest.approx(0.423, abs=1e-3)
+    assert (Vehicle.truck("counter").crab_angle, Vehicle.truck("4ws").crab_angle) == (0.0, 0.362)
     rear = Vehicle.truck("2ws").reference_pose((1.0, 1.0, math.pi / 2))
     assert rear == pytest.approx([1.0, 0.84, math.pi / 2])
     with pytest.raises(InputError, match="shape"):
