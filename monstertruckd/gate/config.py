@@ -96,17 +96,18 @@ class GateConfig(Schema):
     speed: Positive = 0.21
     """Greatest wheel speed over ground, forward, m/s."""
     reverse_speed: Positive = 0.15
-    """Greatest wheel speed in reverse, where the lidar sees nothing, m/s."""
+    """The same in motions that are not mostly forward (reverse, sideways, on the spot): the lidar does not see all of their
+    way, m/s."""
     angle: Annotated[float, Field(gt=0, lt=1.0)] = 0.436
     """Greatest axle angle, rad; less where the servos' pulses reach less."""
     acceleration: Positive = 0.5
-    """Growth of the commanded speed, m/s^2."""
+    """Growth of the commanded speed of base and wheels, m/s^2."""
     deceleration: Positive = 1.0
     """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
     """Least deceleration of its quick stop, m/s^2."""
     steering_rate: Positive = 1.0
-    """Greatest change of an axle angle, rad/s."""
+    """Greatest change of a steering angle, rad/s."""
     reaction: Share = 0.08
     """Seconds from a command leaving the gate to the truck's response."""
     standstill: Positive = 0.01

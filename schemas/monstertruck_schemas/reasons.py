@@ -72,7 +72,7 @@ class Reason(StrEnum):
     BATTERY_LOW = "battery_low", 57, "battery low: speed limited"
     BATTERY_CRITICAL = "battery_critical", 58, "battery critical"
     BATTERY_STALE = "battery_stale", 59, "no fresh battery voltage"
-    CLIPPED = "clipped", 60, "request beyond the limits, clipped keeping its curvature"
+    CLIPPED = "clipped", 60, "request beyond the limits, clipped to the nearest possible motion"
     TICK_STALLED = "tick_stalled", 61, "the control tick came too late"
     DRIVE_FAULT = "drive_fault", 62, "drive controller is in fault"
     SERVICE_FAILED = "service_failed", 63, "a service failed"
