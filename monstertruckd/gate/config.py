@@ -96,8 +96,7 @@ class GateConfig(Schema):
     speed: Positive = 0.21
     """Greatest wheel speed over ground, forward, m/s."""
     reverse_speed: Positive = 0.15
-    """The same in motions that are not mostly forward (reverse, sideways, on the spot): the lidar does not see all of their
-    way, m/s."""
+    """Greatest wheel speed in other motions (reverse, sideways, on the spot): the lidar does not see it all, m/s."""
     angle: Annotated[float, Field(gt=0, lt=1.0)] = 0.436
     """Greatest axle angle, rad; less where the servos' pulses reach less."""
     acceleration: Positive = 0.5
