@@ -128,7 +128,15 @@ def build_goals(
     planner = _within_reach(planner, chassis.reached_angle)
     planner = planner.model_copy(update={"map": None}) if mapped else planner
     mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
-    setup = Setup(planner, chassis.bicycle, footprint, mount, timed=not isinstance(clock, VirtualClock))
+    obstacle = config.gate.obstacle
+    setup = Setup(
+        planner,
+        chassis.bicycle,
+        footprint,
+        mount,
+        cusp_clearance=obstacle.side_clearance + obstacle.ahead,
+        timed=not isinstance(clock, VirtualClock),
+    )
     return GoalService(
         setup,
         clock,

@@ -15,6 +15,8 @@ Steering = Literal["front", "rear", "counter", "crab", "hybrid"]
 
 MAX_POSES: Final = 5000
 """Poses of a path that is driven."""
+MAX_COORDINATE: Final = 10_000.0
+"""Size of x and y, m, and of yaw, rad, in paths and goals."""
 MAX_RUNS: Final = 64
 """Runs of a path that is driven: parts between two stops, where the direction changes, or crab begins or ends."""
 

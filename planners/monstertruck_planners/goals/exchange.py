@@ -26,6 +26,8 @@ class Setup:
     footprint: Footprint
     lidar: Pose = (0.0, 0.0, 0.0)
     """In base."""
+    cusp_clearance: float = 0.0
+    """That the gate asks for where the truck stops before it drives the other way, m."""
     timed: bool = False
     """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
 
@@ -76,6 +78,8 @@ class PlanAnswer:
     """It is the rest of the route before."""
     drivable: bool = True
     """Its poses follow from motions of the truck; else they only show where to go."""
+    complete: bool = True
+    """It leads to the goal; else it is the beginning of a route too long for one path."""
 
 
 @dataclass(frozen=True, slots=True)

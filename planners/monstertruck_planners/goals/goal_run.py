@@ -130,6 +130,8 @@ class GoalRun:
     """Least that was left of any route, m..."""
     recovery_distance: float = math.inf
     """...and when the last recovery behaviour began."""
+    partial: bool = False
+    """The present route ends before the goal: it is too long for one path."""
     misses: int = 0
     next_recovery: int = 0
     """Index of the recovery behaviour to be tried next."""
@@ -207,8 +209,8 @@ def _planned(run: GoalRun, observed: Observations, answer: PlanAnswer, config: P
             return _end(run, answer.reason, answer.text)
         return _recover(run, answer.reason, answer.text, config)
     kind = "the rest of the route before" if answer.kept else "a new route"
-    text = f"goal {run.number}: {kind}, {answer.length:.2f} m"
-    run = replace(_set_off(run, GoalPhase.DRIVING), routes=run.routes + 1)
+    text = f"goal {run.number}: {kind}, {answer.text or f'{answer.length:.2f} m'}"
+    run = replace(_set_off(run, GoalPhase.DRIVING), routes=run.routes + 1, partial=not answer.complete)
     if math.isinf(run.recovery_distance):
         run = replace(run, nearest=answer.length, recovery_distance=answer.length)
     return run, (Follow(answer), Report(Reason.ROUTE_FOUND, Severity.INFO, text))
@@ -224,7 +226,7 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         report = Report(Reason.WAYPOINT_PASSED, Severity.INFO, f"goal {run.number}: waypoint passed, {left} left")
         return replace(run, via=run.via[1:]), (report,)
     if observed.outcome in ENDED and observed.at_rest:
-        return _plan(run, config) if backing else _arrived(run, observed, config)
+        return _plan(run, config) if backing or run.partial else _arrived(run, observed, config)
     if observed.outcome is not None and observed.outcome in LEFT:
         report = Report(observed.outcome, Severity.WARNING, f"goal {run.number}: plans anew")
         return _with(_plan(run, config), report)

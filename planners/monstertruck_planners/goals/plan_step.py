@@ -19,15 +19,16 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, placed, points_relative, rectangle_distance
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
-from monstertruck_planners.route.api import Clock, RouteMap, Vehicle, warm_up
+from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
+from monstertruck_planners.track.segments import stops
 from monstertruck_runtime.clock import processor_time
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
-from monstertruck_schemas.plan import Steering
+from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Grid, Ground
 
@@ -229,8 +230,11 @@ class PlanningStep:
         if self._map is None:
             return PlanAnswer(Reason.NO_MAP, "no map yet")
         places = [value for place in task.via for value in place if value is not None]
-        if not np.isfinite((*task.pose, *task.goal, *places)).all():
+        numbers = np.array((*task.pose, *task.goal, *places))
+        if not np.isfinite(numbers).all():
             return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
+        if np.abs(numbers).max() > MAX_COORDINATE:
+            return PlanAnswer(Reason.BAD_INPUT, f"expected a pose, goal and waypoints of at most {MAX_COORDINATE:g}")
         if task.clear or task.afresh:
             self._route = None
         self._observe(self._setup, self._map, task)
@@ -244,6 +248,8 @@ class PlanningStep:
         )
         self._planner = make_planner(self._vehicle, config.route)
         self._tight = make_planner(self._vehicle, config.route.model_copy(update={"margin": 0.0}))
+        wide = max(config.route.margin, setup.cusp_clearance)
+        self._wide = make_planner(self._vehicle, config.route.model_copy(update={"margin": wide}))
         if setup.timed:
             self._now = processor_time
         if config.map is not None:
@@ -284,17 +290,22 @@ class PlanningStep:
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
         via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
-        result = replan(self._planner, route_map, self._route, start, goal, self._now, via=via)
+
+        def plan(planner: RoutePlanner) -> RouteResult:
+            return replan(planner, route_map, self._route, start, goal, self._now, via=via)
+
+        result = plan(self._planner)
         if result.reason is Reason.START_BLOCKED:
-            result = replan(self._tight, route_map, self._route, start, goal, self._now, via=via)
+            result = plan(self._tight)
+        elif (room := self._cusp_clearance(route_map, result)) < self._setup.cusp_clearance:
+            wider = plan(self._wide)
+            result = wider if self._cusp_clearance(route_map, wider) > room else result
         if not result.ok:
             return PlanAnswer(result.reason, result.text)
         self._route = result.path
         if result.path is not None:
-            answer = answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"]))
-            assert answer.poses is not None
-            clearance = route_map.field.clearance(self._setup.footprint, answer.poses, CLEARANCE)
-            return replace(answer, clearance=clearance)
+            answer = shortened(answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"])))
+            return replace(answer, clearance=self._clearance(route_map, answer))
         if result.poses is None or self._setup.config.local_planner is None:
             return PlanAnswer(
                 Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.local_planner"
@@ -302,6 +313,18 @@ class PlanningStep:
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
+
+    def _clearance(self, route_map: RouteMap, answer: PlanAnswer) -> Array:
+        assert self._setup is not None
+        assert answer.poses is not None
+        return route_map.field.clearance(self._setup.footprint, answer.poses, CLEARANCE)
+
+    def _cusp_clearance(self, route_map: RouteMap, result: RouteResult) -> float:
+        """Least clearance of the cusps, m; +inf of a route without any, -inf without a route."""
+        if result.path is None:
+            return math.inf if result.ok else -math.inf
+        answer = answer_of(result.path, result.cost)
+        return float(np.min(self._clearance(route_map, answer)[stop_poses(answer)], initial=math.inf))
 
     def _escape(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         setup = self._setup
@@ -331,6 +354,33 @@ def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswe
     message = path.message(stamp=0, step=SAMPLE)
     poses, directions = np.array(message.poses).reshape(-1, 3), np.array(message.directions)
     return PlanAnswer(Reason.OK, "", poses, directions, message.steering, path.length, cost, kept=kept)
+
+
+def stop_poses(answer: PlanAnswer) -> NDArray[np.intp]:
+    """Indices of the poses at which a path that is driven comes to rest on its way."""
+    assert answer.directions is not None
+    return np.flatnonzero(stops(answer.directions[1:], answer.steering[1:])) + 1
+
+
+def shortened(answer: PlanAnswer) -> PlanAnswer:
+    """As much of a path as is driven in one piece: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
+    poses, directions = answer.poses, answer.directions
+    assert poses is not None
+    assert directions is not None
+    ends = [*stop_poses(answer)[:MAX_RUNS].tolist(), len(poses) - 1]
+    count = min(ends[min(MAX_RUNS, len(ends)) - 1] + 1, MAX_POSES)
+    if count == len(poses):
+        return answer
+    length = float(np.hypot(*np.diff(poses[:count, :2], axis=0).T).sum())
+    return replace(
+        answer,
+        text=f"the first {length:.2f} m of {answer.length:.2f}",
+        poses=poses[:count],
+        directions=directions[:count],
+        steering=answer.steering[:count],
+        length=length,
+        complete=False,
+    )
 
 
 class PlanningWorker(PlanningStep):

@@ -29,7 +29,7 @@ from monstertruck_runtime.ports import Ready, RpcRegistry
 from monstertruck_runtime.requests import Sequences, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.plan import MAX_COORDINATE, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.sensor import LaserScan
@@ -139,14 +139,18 @@ class GoalService:
         if self._actor is None or pose is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose, or the planner is not up yet")
         if request.frame not in (pose.frame, "map"):
-            raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {pose.frame!r}")
+            frames = " or ".join(map(repr, dict.fromkeys((pose.frame, "map"))))
+            raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {frames}")
         goal = (request.goal.x, request.goal.y, request.goal.yaw)
-        if not all(map(math.isfinite, goal)):
+        via = tuple((place.x, place.y, place.yaw) for place in request.waypoints)
+        numbers = [number for place in (goal, *via) for number in place if number is not None]
+        if not all(map(math.isfinite, numbers)):
             raise RequestRefusedError(Reason.NOT_FINITE, "goal: expected finite numbers")
+        if max(map(abs, numbers)) > MAX_COORDINATE:
+            raise RequestRefusedError(Reason.BAD_INPUT, f"goal: expected at most {MAX_COORDINATE:g} m and rad")
         if self._goal is not None and self._goal.active:
             self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
         self._number += 1
-        via = tuple((place.x, place.y, place.yaw) for place in request.waypoints)
         self._do(goal_run.begin(self._number, goal, request.source, self._seconds(), via))
         return self._number
 

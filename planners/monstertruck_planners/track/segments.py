@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import MAX_POSES, MAX_RUNS, Path, Steering
+from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Path, Steering
 from monstertruck_schemas.reasons import Reason
 
 NEAREST: Final = 0.1
@@ -26,8 +26,6 @@ SAME_HEADING: Final = 0.3
 LEAST_STEP: Final = 1e-6
 """Shorter steps between two poses are left out, m."""
 
-MAX_COORDINATE: Final = 10_000.0
-"""Metres from the frame's origin."""
 MAX_STEP: Final = 100.0
 """Metres between two poses."""
 MAX_NAME: Final = 128
@@ -219,8 +217,8 @@ def check_path(path: Path) -> None:
         _refuse(path, f"{len(path.clearance)} clearances: expected a number for each of the {count} poses, or none")
     if np.count_nonzero(stops(path.directions[1:], path.steering[1:])) >= MAX_RUNS:
         _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
-    if not np.isfinite(poses).all() or np.abs(poses[:, :2]).max() > MAX_COORDINATE:
-        _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m from the origin")
+    if not np.isfinite(poses).all() or np.abs(poses).max() > MAX_COORDINATE:
+        _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m and rad")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
     length = np.hypot(step[:, 0], step[:, 1])
     if not LEAST_STEP < length.max() <= MAX_STEP:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ from monstertruck_planners.goals.escape import blocked_sides, escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import kept_poses, path_blocked, poses_ahead
-from monstertruck_planners.goals.plan_step import PlanningStep
+from monstertruck_planners.goals.plan_step import PlanningStep, shortened, stop_poses
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.plan import GoalPhase
+from monstertruck_schemas.plan import GoalPhase, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
 from monstertruck_schemas.state import Grid
@@ -420,3 +422,92 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
     lattice = Setup(PlannerConfig(route=LatticeConfig()), FourWheelSteering(), Footprint())
     by_lattice = step.step(PlanTask("route", at, goal, none, lattice, grid, via=((3.0, 3.0, None),)))
     assert nearest(by_lattice, 3.0, 3.0) < CONFIG.waypoint_radius
+
+
+def zigzag(runs: int, poses: int = 3) -> PlanAnswer:
+    """A drive to and fro, each run of so many poses."""
+    x = np.concatenate([[0.0], *(np.linspace(0, 0.1, poses)[1:] if i % 2 == 0 else np.linspace(0.1, 0, poses)[1:]
+                                 for i in range(runs))])  # fmt: skip
+    directions = np.concatenate(([1.0], np.repeat([1.0 if i % 2 == 0 else -1.0 for i in range(runs)], poses - 1)))
+    return PlanAnswer(
+        Reason.OK, poses=np.column_stack((x, 0 * x, 0 * x)), directions=directions, steering=("counter",) * len(x),
+        length=0.1 * runs,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answer", "length"), [(zigzag(64), 6.4), (zigzag(65), 6.4), (zigzag(200), 6.4), (zigzag(10, 1000), 0.5005)]
+)
+def test_a_route_too_long_for_one_path_is_driven_in_parts_that_the_tracker_takes(answer: PlanAnswer, length: float):
+    part = shortened(answer)
+    assert part.complete is (answer.length == pytest.approx(length))
+    assert part.length == pytest.approx(length, abs=1e-3)
+    assert part.poses is not None
+    assert part.directions is not None
+    check_path(
+        Path(
+            stamp=0,
+            received=0,
+            seq=0,
+            frame="map",
+            poses=part.poses.ravel(),
+            directions=part.directions,
+            steering=part.steering,
+        )
+    )
+
+
+@pytest.mark.parametrize("outcome", [Reason.GOAL_REACHED, Reason.GOAL_MISSED])
+def test_at_the_end_of_a_part_the_rest_is_planned(outcome: Reason):
+    story = Story()
+    story.tell(answer=replace(WAY, complete=False, text="the first 2.00 m of 9.00"))
+    assert Plan() in story.tell(outcome=outcome, pose=(2.0, 0.0, 0.0))
+    assert story.run.misses == 0
+
+
+def test_a_missed_cusp_is_planned_anew_from_there():
+    story = Story()
+    story.tell(answer=WAY)
+    actions = story.tell(outcome=Reason.CUSP_MISSED, pose=(1.0, 0.1, 0.0))
+    assert Plan() in actions
+    assert told(actions) == [Reason.CUSP_MISSED]
+
+
+def test_an_end_off_the_path_is_judged_by_the_goal():
+    story = Story()
+    story.tell(answer=WAY)
+    story.tell(outcome=Reason.GOAL_MISSED, pose=(1.97, 0.0, 0.0))
+    assert story.run.outcome is Reason.GOAL_REACHED
+
+
+@pytest.mark.parametrize("goal", [(1e308, 1.0, 0.0), (2.0, 1.5, 1e308), (-1e5, 1.0, 0.0)])
+def test_goals_beyond_all_bounds_are_refused(goal: Any):
+    step, none = PlanningStep(), np.empty((0, 2))
+    cells = np.zeros((60, 80), np.int8)
+    grid = Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=80, height=60, cells=cells.ravel(),
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
+    )  # fmt: skip
+    with np.errstate(all="raise"):
+        answer = step.step(PlanTask("route", (2.0, 1.5, 0.0), goal, none, Setup(PlannerConfig(), TRUCK, BODY), grid))
+        assert answer.reason is Reason.BAD_INPUT
+        over = PlanTask("route", (2.0, 1.5, 0.0), (1.0, 1.5, 0.0), none, via=(goal,))
+        assert step.step(over).reason is Reason.BAD_INPUT
+
+
+def test_cusps_keep_the_distance_that_the_gate_asks_for_where_they_can():
+    """Turning round in a corridor 1 m wide: the way with a cusp more keeps away from the walls."""
+    cells = np.full((48, 160), 100, np.int8)
+    cells[4:-4, 4:-4] = 0
+    grid = Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.025, width=160, height=48, cells=cells.ravel(),
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0),
+    )  # fmt: skip
+    least = {}
+    for asked in (0.0, 0.07):
+        setup = Setup(PlannerConfig(route=HybridConfig(effort=5000, margin=0.04)), TRUCK, BODY, cusp_clearance=asked)
+        task = PlanTask("route", (2.0, 0.6, 0.0), (2.0, 0.6, math.pi), np.empty((0, 2)), setup, grid)
+        answer = PlanningStep().step(task)
+        assert answer.clearance is not None
+        least[asked] = answer.clearance[stop_poses(answer)].min()
+    assert least[0.0] < 0.07 <= least[0.07] + 1e-9

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.track.paths import PathService, load_path
-from monstertruck_planners.track.segments import MAX_POSES
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.event import Event
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import MAX_POSES, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest, Role
 from monstertruck_schemas.state import GateMode, GateState
@@ -120,6 +119,9 @@ IMPOSSIBLE = {
     "too many": path(np.column_stack((np.arange(MAX_POSES + 1) * 0.01, np.zeros(MAX_POSES + 1)))),
     "wrong directions": path(straight(1.0), [1.0]),
     "odd directions": path([[0.0, 0.0], [1.0, 0.0]], [1.0, 0.5]),
+    "wound up": path(straight(1.0), yaws=1e308),
+    "too few clearances": ROUTE.model_copy(update={"clearance": np.zeros(2)}),
+    "unknown clearance": ROUTE.model_copy(update={"clearance": np.full(len(ROUTE.poses) // 3, np.nan)}),
     "zigzag": path(straight(10.0), [1.0 - 2.0 * (i % 2) for i in range(201)]),
     "long name": ROUTE.model_copy(update={"name": "x" * 129}),
     "odd count": ROUTE.model_copy(update={"poses": np.zeros(7)}),
