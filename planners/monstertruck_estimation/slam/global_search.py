@@ -43,9 +43,9 @@ MIN_SEPARATION: Final = 1.0
 """Distance at which places are different, m."""
 CONFIRM_TOLERANCE: Final = (0.3, 0.1)
 """Two looks found the same place if they differ by less, m and rad."""
-BASELINE: Final = (0.5, 3.0)
-"""Way between the first look and the last one that makes a place certain, m: where every look found it unique, and
-elsewhere."""
+BASELINE: Final = (0.8, 3.0)
+"""Way between the first look and the last one that makes a place certain, m: of looks that found it unique, and of
+all."""
 OUTSIDE_AFTER: Final = 10 * SECOND
 """Time after which a robot that no look has found on the map is outside it, ns."""
 
@@ -60,9 +60,8 @@ class Hypothesis:
     """Shape (3,): that keyframe in the saved map."""
     first: int
     """Keyframe of the first look."""
-    unique: bool
-    """Every look found no other place nearly as good."""
-    looks: int = 1
+    unique: int | None
+    """Keyframe of the first look that found no other place nearly as good; None before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,15 +151,15 @@ class GlobalLocaliser:
         newest = len(known) - 1
         same = next((h for h in self._hypotheses if self._agree(h, look.pose)), None)
         if same is None:
-            self._hypotheses.append(Hypothesis(newest, look.pose, newest, look.unique))
+            self._hypotheses.append(Hypothesis(newest, look.pose, newest, newest if look.unique else None))
             return None
         same.key, same.pose = newest, look.pose
-        same.unique &= look.unique
-        same.looks += 1
-        way = self._ways[newest] - self._ways[same.first]
-        if way < BASELINE[0 if same.unique else 1] or not self._foreseen(same):
-            return None
-        return look.pose
+        if look.unique and same.unique is None:
+            same.unique = newest
+        far = self._ways[newest] - self._ways[same.first] >= BASELINE[1]
+        if look.unique and same.unique is not None:
+            far |= self._ways[newest] - self._ways[same.unique] >= BASELINE[0]
+        return look.pose if far and self._foreseen(same) else None
 
     def _agree(self, hypothesis: Hypothesis, pose: Array) -> bool:
         poses = self._mapper.map.poses
