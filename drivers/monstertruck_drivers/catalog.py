@@ -192,6 +192,7 @@ RESERVED: Final = frozenset(
         "clock",
         "gate",
         "goals",
+        "ground",
         "health",
         "levelling",
         "map",
