@@ -39,6 +39,10 @@ class DriveCosts(GoalConfig):
     """Of a metre backward, m; above 1 for a truck whose sensors look ahead."""
     cusp_cost: NotNegative = 0.1
     """Of a change of direction, m."""
+    free_cusps: Annotated[int, Field(ge=0)] = 4
+    """Changes of direction that cost no more than that..."""
+    many_cusps_cost: NotNegative = 0.4
+    """...and what each of the others costs besides, m: at each the truck stops and its errors add up."""
     swing_cost: NotNegative = 0.01
     """Of a change of curvature, m: few long arcs instead of many short ones."""
     crab_cost: AtLeastOne = 1.0

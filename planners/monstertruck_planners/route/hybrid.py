@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision_kernels import FieldData
 from monstertruck_planners.route import heuristic, search
 from monstertruck_planners.route.api import (
     Budget,
@@ -34,22 +35,29 @@ from monstertruck_planners.route.hybrid_search import (
 )
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.smoothing import EditablePath, choose_headings, current_segments, editable, shortcut
+from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
 
 BATCH = 1000
 """Smoothing trials between two checks of the budget."""
 
+PROMISING = 1.1
+"""Up to this factor on the cost of the best route another one is looked at more closely."""
+
 MAX_IDLE_ROUNDS = 12
 """Rounds of improvement without gain after which the route is taken to be the best."""
 
-FINE_SHIFTS = (0.1, 0.03, 0.01)
+FINE_SHIFTS = (0.25, 0.1, 0.03, 0.01)
 """Shares of a stretch by which poses move in the final smoothing."""
 
 FINAL_SHARE = 0.1
 """Of the budget, for the final smoothing."""
 
-CRAB_SHARE = 0.4
-"""Of the budget, for smoothing with translations and for the final smoothing."""
+CRAB_SHARE = 0.2
+"""Of the budget, for the final smoothing without and with translations."""
+
+CUSPS_SHARE = 0.3
+"""Of the budget, kept when routes with fewer cusps are looked for."""
 
 ALTERNATIVE_DISTANCE = 2.5
 """Alternatives are this far from all known ways somewhere, turning radii."""
@@ -79,6 +87,8 @@ GAP_CORRIDOR = 0.15
 """Checked on both sides of a way on which there is a narrow gap, m."""
 
 NO_SEGMENTS = np.empty((0, 3))
+
+NO_COSTS = search.CostLayer(np.zeros((0, 0), np.float32), 0.0, 1.0, 0.0)
 
 MARGIN_STEP = 0.005
 """From one margin tried to the next, m."""
@@ -161,7 +171,7 @@ class HybridPlanner:
         """Cost of a path, m."""
         segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
         field, layer = route_map.field.data(), route_map.cost_layer(self.costs)
-        return float(search.segments_cost(field, layer, model, path.start, segments, len(segments), 0.0))
+        return route_cost(field, layer, model, path.start, segments)
 
     def motion_model(self, resolution: Resolution) -> search.VehicleMotions:
         """The vehicle's limits and costs, with motion primitives of a resolution."""
@@ -176,8 +186,17 @@ class HybridPlanner:
         return search.VehicleMotions(
             radius, crab, self.reeds_shepp.weights, self.config.swing_cost, np.array(primitives),
             np.array([16.0, 8.0, 4.0, 2.0]) * radius, search.CHECK_STEP,
-            self.config.margin + search.CHECK_MARGIN,
+            self.config.margin + search.CHECK_MARGIN, self.config.free_cusps, self.config.many_cusps_cost, MAX_RUNS - 1,
+            False,
         )  # fmt: skip
+
+
+def route_cost(
+    field: FieldData, layer: search.CostLayer, model: search.VehicleMotions, start: Array, segments: Array
+) -> float:
+    """Cost of a whole route, m."""
+    cost = search.segments_cost(field, layer, model, start, segments, len(segments), 0.0)
+    return float(cost + search.many_cusps_cost(model, 0, search.count_cusps(segments, len(segments), 0.0)))
 
 
 def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
@@ -214,13 +233,14 @@ class _PlanningRun:
 
     def route(self) -> RouteResult:
         segments = self._direct()
+        direct = segments is not None
         if segments is None:
             segments, reason, text = self._search(self._cost_to_go())
             if segments is None:
                 return RouteResult(reason, text=text, statistics=self._final_statistics())
         self.statistics["first_s"] = self.budget.elapsed
         self.statistics["first_length"] = float(np.abs(segments[:, 0]).sum())
-        if self.config.improve:
+        if self.config.improve and not (direct and self._is_cheapest(segments)):
             segments = self._improve(segments)
         path = MotionPath(self.start, segments, self.vehicle.steering, self.vehicle.reference)
         return RouteResult(Reason.OK, path, cost=self._cost(segments), statistics=self._final_statistics())
@@ -250,6 +270,15 @@ class _PlanningRun:
         free = search.segments_free(self.field, self.footprint, self.model, self.start, segments, len(segments))
         return np.array(segments) if free else None
 
+    def _is_cheapest(self, segments: Array) -> bool:
+        """Whether nothing could make the best motion without obstacles cheaper: they and the ground cost nothing.
+
+        Backward metres that cost more may be avoided by longer arcs than such motions have.
+        """
+        free = search.segments_cost(self.field, NO_COSTS, self.model, self.start, segments, len(segments), 0.0)
+        shortest = self.config.reverse_cost == 1.0 or segments[:, 0].min(initial=0.0) >= 0.0
+        return shortest and self._cost(segments) <= free
+
     def _search(self, to_go: heuristic.CostToGo) -> tuple[Array | None, Reason, str]:
         """First route: a short coarse search, then gaps are measured, and a fine and the coarse one take turns."""
         too_narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
@@ -264,24 +293,38 @@ class _PlanningRun:
             if not self._reachable(to_go):
                 return too_narrow
             coarse = self._search_run(to_go, RESOLUTIONS[0])
-        fine = self._search_run(to_go, RESOLUTIONS[1])
-        segments = self._run_in_turns(fine, coarse)
+        fine = self._search_run(to_go, RESOLUTIONS[1], strokes=True)
+        segments = self._run_in_turns(fine, coarse, self.attempt.reserve)
         if segments is None and fine.exhausted:
             fine = self._search_run(self._cost_to_go(overrun=math.inf), RESOLUTIONS[2])
             segments = fine.run(MAX_NODES, self.attempt.reserve)
         if segments is not None:
             return segments, Reason.OK, ""
-        return None, Reason.GOAL_UNREACHABLE if fine.exhausted else Reason.ROUTE_TIMEOUT, "no drivable way found"
+        # A search that is exhausted proves nothing: between its cells and headings there may be a way.
+        return (
+            None,
+            Reason.ROUTE_TIMEOUT,
+            "no drivable way found" + (", all searches exhausted" if fine.exhausted else ""),
+        )
 
-    def _search_run(self, to_go: heuristic.CostToGo, resolution: Resolution, goal_range: float = np.inf) -> SearchRun:
+    def _search_run(
+        self,
+        to_go: heuristic.CostToGo,
+        resolution: Resolution,
+        goal_range: float = np.inf,
+        max_cusps: int = MAX_RUNS - 1,
+        *,
+        strokes: bool = False,
+    ) -> SearchRun:
         resolution = resolution.fitted(self.field, self.vehicle.radius)
-        return SearchRun(self.problem, self.planner.motion_model(resolution), to_go, resolution, goal_range)
+        model = self.planner.motion_model(resolution)._replace(max_cusps=max_cusps, strokes=strokes)
+        return SearchRun(self.problem, model, to_go, resolution, goal_range)
 
-    def _run_in_turns(self, fine: SearchRun, coarse: SearchRun) -> Array | None:
+    def _run_in_turns(self, fine: SearchRun, coarse: SearchRun, reserve: float) -> Array | None:
         count = FIRST_NODES
-        while self.budget.remaining() > self.attempt.reserve and not fine.exhausted:
+        while self.budget.remaining() > reserve and not fine.exhausted:
             for run in (fine, coarse):
-                segments = run.run(count, self.attempt.reserve)
+                segments = run.run(count, reserve)
                 if segments is not None:
                     return segments
             count *= GROWTH
@@ -312,40 +355,80 @@ class _PlanningRun:
         return any_closed
 
     def _improve(self, segments: Array) -> Array:
-        model = self.model
-        # Motions without translations are found in half the time: only the middle part allows for these.
-        without_crab = self.model = model._replace(crab=0.0)
-        share = CRAB_SHARE if model.crab > 0.0 else FINAL_SHARE
-        segments = self._improve_in_rounds(segments, self._alternatives(), MAX_IDLE_ROUNDS, share)
-        if model.crab > 0.0:
-            self.model = model
-            segments = self._improve_in_rounds(segments, iter(()), 4, FINAL_SHARE)
-            self.model = without_crab
-        best = editable(self.start, segments)
-        for shift in FINE_SHIFTS:
-            self._shortcut(best, 1e-4, shift)
-        self.model = model
-        return current_segments(best).copy()
+        """The best route found in the budget that is left.
 
-    def _improve_in_rounds(self, segments: Array, others: Iterator[Array], max_idle: int, reserve: float) -> Array:
-        """Smooth the best route and the others in turn until nothing gains or only the reserve is left."""
-        best, cost = self._smoothed(segments, np.inf)
+        Motions without translations are found in half the time: they come first, and what they give is kept unless
+        translations make it shorter.
+        """
+        model = self.model
+        self.model = model._replace(crab=0.0)
+        segments = self._with_fewer_cusps(segments)
+        segments = self._improve_in_rounds(segments, CRAB_SHARE if model.crab > 0.0 else FINAL_SHARE)
+        segments = self._polished(segments)
+        self.model = model
+        if model.crab > 0.0:
+            segments = min(self._polished(segments), segments, key=self._detours)
+        return segments
+
+    def _detours(self, segments: Array) -> tuple[float, float]:
+        """Extra cost of many cusps; weighted metres."""
+        backward, _, crab = self.model.weights
+        metres = np.abs(segments[:, 0]) * np.where(segments[:, 0] < 0.0, backward, 1.0)
+        metres *= np.where(segments[:, 2] != 0.0, crab, 1.0)
+        cusps = search.count_cusps(segments, len(segments), 0.0)
+        return search.many_cusps_cost(self.model, 0, cusps), float(metres.sum())
+
+    def _with_fewer_cusps(self, segments: Array) -> Array:
+        """The route, or one with fewer cusps if there are so many that each costs extra."""
+        while (cusps := search.count_cusps(segments, len(segments), 0.0)) > self.config.free_cusps:
+            to_go = self._cost_to_go()
+            fine, coarse = (self._search_run(to_go, RESOLUTIONS[k], max_cusps=cusps - 1, strokes=True) for k in (1, 0))
+            other = self._run_in_turns(fine, coarse, CUSPS_SHARE)
+            if other is None:
+                break
+            segments = other
+        return segments
+
+    def _improve_in_rounds(self, segments: Array, reserve: float) -> Array:
+        """Smooth the best route and others in turn until nothing gains or only the reserve is left."""
+        others = self._starts(segments)
+        best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
-        while self.budget.remaining() > reserve and idle < max_idle:
-            segments = next(others, NO_SEGMENTS)
-            segments, other = self._smoothed(segments if len(segments) else best, 1.05 * cost)
+        while self.budget.remaining() > reserve and idle < MAX_IDLE_ROUNDS:
+            segments = next(others)
+            mate = best if len(segments) else NO_SEGMENTS
+            segments, other = self._smoothed(segments if len(segments) else best, mate, PROMISING * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
                 best, cost = segments, other
         return best
 
-    def _smoothed(self, segments: Array, promising: float) -> tuple[Array, float]:
-        """Shortcuts, better headings, shortcuts again; only the first unless the cost gets below ``promising``."""
+    def _starts(self, first: Array) -> Iterator[Array]:
+        """Where smoothing begins: alternatives; then by turns the best route (none here) and each of these again."""
+        found = [first]
+        for segments in self._alternatives():
+            if len(segments):
+                found.append(segments)
+            yield segments
+        while True:
+            for segments in found:
+                yield NO_SEGMENTS
+                yield segments
+
+    def _polished(self, segments: Array) -> Array:
+        """Smoothed in ever smaller steps."""
+        path = editable(self.start, segments)
+        for shift in FINE_SHIFTS:
+            self._shortcut(path, 1e-4, shift)
+        return current_segments(path).copy()
+
+    def _smoothed(self, segments: Array, mate: Array, promising: float) -> tuple[Array, float]:
+        """Shortcuts, the best of it and its mate, shortcuts again; only the first unless the cost is ``promising``."""
         path = editable(self.start, segments)
         self._shortcut(path)
         cost = self._cost(current_segments(path))
         if cost < promising and self.budget.remaining() > 0.0:
-            other = editable(self.start, self._with_best_headings(path))
+            other = editable(self.start, self._best_chain([current_segments(path), mate]))
             if other.used[0]:
                 self._shortcut(other)
                 if self._cost(current_segments(other)) < cost:
@@ -364,14 +447,24 @@ class _PlanningRun:
             self.statistics["kept"] += kept
 
     def _cost(self, segments: Array) -> float:
-        return float(search.segments_cost(self.field, self.layer, self.model, self.start, segments, len(segments), 0.0))
+        return route_cost(self.field, self.layer, self.model, self.start, segments)
 
-    def _with_best_headings(self, path: EditablePath) -> Array:
-        whole = MotionPath(self.start, current_segments(path))
-        spacing = max(1.5 * self.vehicle.radius, whole.length / 60) * self.random.uniform(0.7, 1.3)
-        samples, reach = whole.sample(spacing), 16.0 * self.vehicle.radius
+    def _best_chain(self, routes: list[Array]) -> Array:
+        """Motions over places of some routes, ordered by their share of the way, with the best heading at each."""
+        paths = [MotionPath(self.start, route) for route in routes if len(route)]
+        length = paths[0].length
+        spacing = max(1.5 * self.vehicle.radius, length / 60) * self.random.uniform(0.7, 1.3)
+        samples = [path.sample(spacing) for path in paths]
+        poses = np.vstack([sample.poses for sample in samples])
+        travelled = np.concatenate([length / path.length * s.travelled for path, s in zip(paths, samples, strict=True)])
+        # The first route's start and end are those of the chain.
+        last = len(samples[0].poses) - 1
+        by_travelled = np.argsort(travelled, kind="stable")
+        inner = by_travelled[(travelled[by_travelled] > 1e-6) & (travelled[by_travelled] < length - 1e-6)]
+        order = np.concatenate(([0], inner, [last]))
+        reach = 16.0 * self.vehicle.radius
         return choose_headings(
-            self.field, self.footprint, self.layer, self.model, samples.poses, samples.travelled, reach
+            self.field, self.footprint, self.layer, self.model, poses[order], travelled[order], reach
         )
 
     def _alternatives(self) -> Iterator[Array]:

@@ -28,14 +28,21 @@ from monstertruck_planners.route.search import (
     CostLayer,
     IntArray,
     VehicleMotions,
+    count_cusps,
     drop,
+    free_length,
+    many_cusps_cost,
     push,
     segments_cost,
     segments_free,
 )
 
 EXPANSION = -1
-"""Action of a node reached by an analytic expansion; others are numbers of primitives."""
+"""Action of a node reached by an analytic expansion; others are numbers of primitives, and after these of the arcs of
+least radius among them, driven as far as they are free."""
+
+LONGEST_STROKE = 1.0
+"""See ``VehicleMotions.strokes``, turning radii."""
 
 MAX_NODES = 400_000
 """In one search."""
@@ -54,6 +61,8 @@ class Nodes(NamedTuple):
     action: IntArray
     direction: Array
     """+1 or -1: direction at the end; 0 at the start."""
+    cusps: IntArray
+    """From the start on."""
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
@@ -72,9 +81,10 @@ USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
 def _open_node(
     field: FieldData, to_go: CostToGo, table: NDArray[np.float32], model: VehicleMotions, goal: Array, nodes: Nodes,
     heuristic_weight: float, x: float, y: float, yaw: float, cost: float, parent: int, action: int, direction: float,
+    cusps: int,
 ) -> None:  # fmt: skip
     """Put a pose on the open list if it is the cheapest in its cell and the goal can be reached from there."""
-    if nodes.counts[USED] >= len(nodes.cost):
+    if nodes.counts[USED] >= len(nodes.cost) or cusps > model.max_cusps:
         return
     left = heuristic_cost(field, to_go, table, model.radius, goal, x, y, yaw)
     if left == np.inf:
@@ -92,7 +102,7 @@ def _open_node(
     k = nodes.counts[USED]
     nodes.pose[k, 0], nodes.pose[k, 1], nodes.pose[k, 2] = x, y, yaw
     nodes.cost[k], nodes.parent[k], nodes.action[k] = cost, parent, action
-    nodes.direction[k], nodes.closed[k] = direction, False
+    nodes.direction[k], nodes.cusps[k], nodes.closed[k] = direction, cusps, False
     nodes.table[row, column, heading] = k + 1
     nodes.counts[USED] = k + 1
     nodes.counts[OPEN] = push(nodes.keys, nodes.items, nodes.counts[OPEN], cost + heuristic_weight * left, k)
@@ -149,11 +159,12 @@ def expand(
             continue
         nodes.closed[n] = True
         nodes.counts[EXPANDED] += 1
-        pose, cost, direction = nodes.pose[n], nodes.cost[n], nodes.direction[n]
+        pose, cost, direction, cusps = nodes.pose[n], nodes.cost[n], nodes.direction[n], nodes.cusps[n]
         away = sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2)
         if away < goal_range and (away < 6.0 * model.radius or nodes.counts[EXPANDED] % 4 == 1):
             many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
-            if segments_free(field, footprint, model, pose, segments, many):
+            few = cusps + count_cusps(segments, many, direction) <= model.max_cusps
+            if few and segments_free(field, footprint, model, pose, segments, many):
                 nodes.counts[LAST] = n
                 return FOUND
         for i in range(len(model.expansion_lengths)):
@@ -164,25 +175,47 @@ def expand(
             if best[COST] * model.radius < 2.0 * distance + 6.0 * model.radius and segments_free(
                 field, footprint, model, pose, segments, many
             ):
+                more = count_cusps(segments, many, direction)
                 step_cost = segments_cost(field, layer, model, pose, segments, many, direction)
+                step_cost += many_cusps_cost(model, cusps, more)
                 end = 1.0 if segments[many - 1, 0] > 0.0 else -1.0
-                _open_node(field, to_go, table, model, goal, nodes, heuristic_weight,
-                           target[0], target[1], target[2], cost + step_cost, n, EXPANSION, end)  # fmt: skip
+                _open_node(field, to_go, table, model, goal, nodes, heuristic_weight, target[0], target[1], target[2],
+                           cost + step_cost, n, EXPANSION, end, cusps + more)  # fmt: skip
                 break
-        for i in range(len(model.primitives)):
-            for k in range(3):
-                primitive[0, k] = model.primitives[i, k]
-            if segments_free(field, footprint, model, pose, primitive, 1):
+        for i in range((2 if model.strokes else 1) * len(model.primitives)):
+            _write_primitive(field, footprint, model, pose, i, primitive[0])
+            if i >= len(model.primitives):
+                free = primitive[0, 0] != 0.0
+            else:
+                free = segments_free(field, footprint, model, pose, primitive, 1)
+            if free:
                 x, y, yaw = advance(pose[0], pose[1], pose[2], primitive[0, 0], primitive[0, 1], primitive[0, 2])
+                more = count_cusps(primitive, 1, direction)
                 step_cost = segments_cost(field, layer, model, pose, primitive, 1, direction)
+                step_cost += many_cusps_cost(model, cusps, more)
                 end = 1.0 if primitive[0, 0] > 0.0 else -1.0
                 _open_node(field, to_go, table, model, goal, nodes, heuristic_weight,
-                           x, y, yaw, cost + step_cost, n, i, end)  # fmt: skip
+                           x, y, yaw, cost + step_cost, n, i, end, cusps + more)  # fmt: skip
     return RUNNING
 
 
 @njit(cache=True)
-def _trace(model: VehicleMotions, goal: Array, nodes: Nodes) -> Array:
+def _write_primitive(
+    field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, action: int, out: Array
+) -> None:
+    """Segment of an action from a pose: a primitive, or an arc driven as far as it is free (length 0: none)."""
+    count = len(model.primitives)
+    for k in range(3):
+        out[k] = model.primitives[action % count, k]
+    if action >= count:
+        length = 0.0
+        if abs(out[1]) * model.radius > 0.99:
+            length = free_length(field, footprint, model, pose, out, LONGEST_STROKE * model.radius)
+        out[0] = length if out[0] > 0.0 else -length
+
+
+@njit(cache=True)
+def _trace(field: FieldData, footprint: FootprintData, model: VehicleMotions, goal: Array, nodes: Nodes) -> Array:
     """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, nodes.counts[LAST]
@@ -200,9 +233,7 @@ def _trace(model: VehicleMotions, goal: Array, nodes: Nodes) -> Array:
         n = chain[i]
         last = i == depth - 1
         if not last and nodes.action[chain[i + 1]] >= 0:
-            primitive = nodes.action[chain[i + 1]]
-            for k in range(3):
-                result[used, k] = model.primitives[primitive, k]
+            _write_primitive(field, footprint, model, nodes.pose[n], nodes.action[chain[i + 1]], result[used])
             used += 1
             continue
         target = goal if last else nodes.pose[chain[i + 1]]
@@ -281,7 +312,7 @@ class SearchRun:
         x, y, yaw = problem.start
         _open_node(
             problem.field, to_go, problem.table, model, problem.goal, self._nodes, problem.heuristic_weight,
-            x, y, yaw, 0.0, -1, EXPANSION, 0.0,
+            x, y, yaw, 0.0, -1, EXPANSION, 0.0, 0,
         )  # fmt: skip
 
     def run(self, count: int, reserve: float = 0.0) -> Array | None:
@@ -305,7 +336,7 @@ class SearchRun:
             problem.budget.work += expanded
             problem.statistics["expanded"] += expanded
         self.exhausted = status == EXHAUSTED
-        return _trace(self._model, problem.goal, nodes) if status == FOUND else None
+        return _trace(problem.field, problem.footprint, self._model, problem.goal, nodes) if status == FOUND else None
 
 
 def _allocate(field: FieldData, cell: float, headings: int) -> Nodes:
@@ -313,7 +344,7 @@ def _allocate(field: FieldData, cell: float, headings: int) -> Nodes:
     n = MAX_NODES
     rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
     return Nodes(
-        np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n),
+        np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64),
         np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
         np.zeros((rows, columns, headings), np.int32), cell, np.zeros(4, np.int64),
     )  # fmt: skip

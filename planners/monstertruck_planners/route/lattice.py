@@ -55,6 +55,7 @@ from monstertruck_planners.route.search import (
     segments_cost,
     segments_free,
 )
+from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
 
 VECTORS = (
@@ -355,7 +356,7 @@ class LatticePlanner:
         self._reeds_shepp = vehicle.reeds_shepp(self.config)
         self._model = VehicleMotions(
             vehicle.radius, vehicle.crab_angle, self._reeds_shepp.weights, 0.0, np.empty((0, 3)), np.empty(0),
-            CHECK_STEP, self.config.margin + CHECK_MARGIN,
+            CHECK_STEP, self.config.margin + CHECK_MARGIN, 0, 0.0, MAX_RUNS - 1, False,
         )  # fmt: skip
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
@@ -410,7 +411,7 @@ class LatticePlanner:
             budget.work += int(states.counts[EXPANDED]) - before
             statistics["expanded"] += int(states.counts[EXPANDED]) - before
         if status != FOUND:
-            return None, bound, Reason.GOAL_UNREACHABLE if status == EXHAUSTED else Reason.ROUTE_TIMEOUT
+            return None, bound, Reason.ROUTE_TIMEOUT
         last, pose = int(states.counts[LAST]), np.empty(3)
         _pose_of(lattice, states.place[last], pose)
         cost = float(states.cost[last]) + float(self._reeds_shepp.distance(pose, ends.goal)[0])

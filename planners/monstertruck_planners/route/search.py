@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import FieldData, FootprintData, segment_free
+from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance, segment_free
 from monstertruck_planners.route.motion import advance
 
 IntArray = NDArray[np.int64]
@@ -135,6 +135,32 @@ class VehicleMotions(NamedTuple):
     """Of the collision check, m."""
     margin: float
     """Kept on all sides of the footprint, m."""
+    free_cusps: int
+    """Cusps of a route without extra cost."""
+    many_cusps_cost: float
+    """Extra cost of each other one, m."""
+    max_cusps: int
+    """More than that a route may not have."""
+    strokes: bool
+    """Whether a search also drives arcs as far as they are free: few cusps where there is little room."""
+
+
+@njit(cache=True)
+def count_cusps(segments: Array, count: int, direction: float) -> int:
+    """Changes of direction in ``count`` segments driven after one of this direction (sign; 0: none)."""
+    cusps = 0
+    for i in range(count):
+        if segments[i, 0] * direction < 0.0:
+            cusps += 1
+        direction = segments[i, 0]
+    return cusps
+
+
+@njit(cache=True)
+def many_cusps_cost(model: VehicleMotions, before: int, more: int) -> float:
+    """Extra cost of ``more`` cusps in a route that has had some before, m."""
+    free = model.free_cusps
+    return model.many_cusps_cost * (max(before + more - free, 0) - max(before - free, 0))
 
 
 @njit(cache=True)
@@ -147,7 +173,10 @@ def segments_cost(
     count: int,
     direction: float,
 ) -> float:
-    """Cost of ``count`` segments driven from a pose after a segment of this direction (sign; 0: none), m."""
+    """Cost of ``count`` segments driven from a pose after a segment of this direction (sign; 0: none), m.
+
+    That of many cusps is not in it, see ``many_cusps_cost``.
+    """
     total = 0.0
     x, y, yaw = pose[0], pose[1], pose[2]
     for i in range(count):
@@ -162,6 +191,25 @@ def segments_cost(
         total += layer_cost(field, layer, x, y, yaw, length, segments[i, 1], segments[i, 2])
         x, y, yaw = advance(x, y, yaw, length, segments[i, 1], segments[i, 2])
     return total
+
+
+@njit(cache=True)
+def free_length(
+    field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, segment: Array, longest: float
+) -> float:
+    """Length (m, not signed) up to which a segment driven on and on is free of collisions; 0 beyond ``longest``."""
+    sign = 1.0 if segment[0] > 0.0 else -1.0
+    pace = 1.0 + abs(segment[1]) * footprint.reach
+    step = model.check_step if segment[2] == 0.0 else 0.25 * model.check_step
+    free, travelled = 0.0, 0.0
+    while travelled <= longest:
+        x, y, yaw = advance(pose[0], pose[1], pose[2], sign * travelled, segment[1], segment[2])
+        safe = safe_distance(field, footprint, model.margin, x, y, yaw)
+        if safe < 0.0:
+            break
+        free = travelled
+        travelled += max(step, safe / pace)
+    return free if travelled <= longest else 0.0
 
 
 @njit(cache=True)

@@ -20,7 +20,15 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData
 from monstertruck_planners.route.motion import advance
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
-from monstertruck_planners.route.search import CostLayer, IntArray, VehicleMotions, segments_cost, segments_free
+from monstertruck_planners.route.search import (
+    CostLayer,
+    IntArray,
+    VehicleMotions,
+    count_cusps,
+    many_cusps_cost,
+    segments_cost,
+    segments_free,
+)
 
 MIN_SEGMENT = 1e-9
 """Shorter segments are dropped, m."""
@@ -155,6 +163,14 @@ def _stretch_segments(path: EditablePath, begin: float, i: int, end: float, j: i
 
 
 @njit(cache=True)
+def _cusps_with_ends(segments: Array, count: int, before: float, after: float) -> int:
+    """Cusps of a stretch between segments of these directions (sign; 0: none)."""
+    cusps = count_cusps(segments, count, before)
+    last = segments[count - 1, 0] if count > 0 else before
+    return cusps + (1 if last * after < 0.0 else 0)
+
+
+@njit(cache=True)
 def shortcut(
     field: FieldData,
     footprint: FootprintData,
@@ -183,7 +199,7 @@ def shortcut(
     old, new, word = np.empty((len(path.segments), 3)), np.empty((2 * MAX_SEGMENTS, 3)), np.empty((MAX_SEGMENTS, 3))
     spare, best, scratch = np.empty((len(path.segments) + 12, 3)), np.empty(8), np.empty((4, 3))
     a, b, q = np.empty(3), np.empty(3), np.empty(3)
-    kept = 0
+    kept, cusps = 0, count_cusps(path.segments, path.used[0], 0.0)
     for n in range(len(random)):
         total = path.travelled[path.used[0]]
         if total < 1e-6:
@@ -210,6 +226,8 @@ def shortcut(
         present = segments_cost(field, layer, model, a, old, count, before)
         if after * old[count - 1, 0] < 0.0:
             present += model.weights[1] * model.radius
+        others = cusps - _cusps_with_ends(old, count, before, after)
+        present += many_cusps_cost(model, others, cusps - others)
         many = 0
         if random[n, 2] < 0.35:
             many = connect(a, b, model.radius, model.crab, model.weights, new, best, scratch)
@@ -235,9 +253,12 @@ def shortcut(
         cost = segments_cost(field, layer, model, a, new, many, before)
         if many > 0 and after * new[many - 1, 0] < 0.0:
             cost += model.weights[1] * model.radius
+        new_cusps = _cusps_with_ends(new, many, before, after)
+        cost += many_cusps_cost(model, others, new_cusps)
         if cost >= present - 1e-6 or not segments_free(field, footprint, model, a, new, many):
             continue
         _splice(path, begin, i, end, j, new, many, spare)
+        cusps = count_cusps(path.segments, path.used[0], 0.0)
         kept += 1
     return kept
 
@@ -267,7 +288,7 @@ def choose_headings(
         Motion segments, shape (k, 3); none if no chain is free.
     """
     n = len(places)
-    cost, direction = np.full((n, 2), inf), np.zeros((n, 2))
+    cost, direction, cusps = np.full((n, 2), inf), np.zeros((n, 2)), np.zeros((n, 2), np.int64)
     before = np.full((n, 2), -1, np.int64)
     poses = np.empty((n, 2, 3))
     for i in range(n):
@@ -289,10 +310,13 @@ def choose_headings(
                 many = connect(a, b, model.radius, model.crab, model.weights, segments, best, scratch)
                 if best[COST] * model.radius >= limit:
                     continue
+                more = count_cusps(segments, many, direction[i, k & 1])
                 total = segments_cost(field, layer, model, a, segments, many, direction[i, k & 1])
+                total += many_cusps_cost(model, cusps[i, k & 1], more)
                 if total < limit and segments_free(field, footprint, model, a, segments, many):
                     cost[j, k >> 1], before[j, k >> 1] = cost[i, k & 1] + total, 2 * i + (k & 1)
                     direction[j, k >> 1] = segments[many - 1, 0] if many > 0 else direction[i, k & 1]
+                    cusps[j, k >> 1] = cusps[i, k & 1] + more
     return _chain_segments(model, poses, before)
 
 
