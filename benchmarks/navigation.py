@@ -29,7 +29,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer runs, for a look")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
-    options = Options(arguments.data, OUT, arguments.quick, arguments.segments)
+    options = Options(arguments.data, OUT, arguments.quick, arguments.runs)
     whole = Part()
     for name in arguments.only:
         part = importlib.import_module(f"navigation_parts.{name}").run(options)

@@ -26,7 +26,7 @@ from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
 from navigation_parts import Options, Part, strict
 
-RADIUS_4WS, CRAB = 0.378, 0.4
+TRUCK = Vehicle.truck("4ws")
 WALL = 0.9
 """Radius of a ring of wall round a goal, m."""
 RUNS = 7
@@ -56,7 +56,7 @@ def run(options: Options) -> Part:
     begin = time.thread_time()
     planners = {
         "2ws": HybridPlanner(Vehicle(footprint, radius, 0.0, "front")),
-        "4ws": HybridPlanner(Vehicle(footprint, RADIUS_4WS, CRAB, "counter")),
+        "4ws": HybridPlanner(Vehicle(footprint, TRUCK.radius, TRUCK.crab_angle, "counter")),
     }
     rows = []
     for name, queries in setting["queries"].items():

@@ -1,0 +1,74 @@
+"""Routes on maps drawn by seed: both axles against front steering, turning round in corridors, exhausted lattices."""
+
+import math
+import time
+
+import numpy as np
+
+from monstertruck_planners.collision import DiscFootprint
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
+from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.lattice import LatticePlanner
+from monstertruck_schemas.reasons import Reason
+from navigation_parts import Options, Part
+from navigation_parts.unseen_maps import free_pose, unseen_map
+
+FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)
+RADIUS_2WS = 0.4385
+CUSPS = 8
+"""Goal where 0.8 m are free."""
+
+
+def run(options: Options) -> Part:
+    part = Part()
+    both = Vehicle.truck("4ws")
+    planners = {
+        "2ws": HybridPlanner(Vehicle(FOOTPRINT, RADIUS_2WS, 0.0, "front")),
+        "4ws": HybridPlanner(Vehicle(FOOTPRINT, min(both.radius, RADIUS_2WS), both.crab_angle, "counter")),
+        "lattice": LatticePlanner(Vehicle(FOOTPRINT, RADIUS_2WS, 0.0, "front")),
+    }
+    for planner in planners.values():
+        warm_up(planner)
+    ratios, refused, invalid, missed = [], 0, 0, 0
+    for kind in ("rooms", "maze", "boxes"):
+        for seed in range(101, 103 if options.quick else 107):
+            route_map, rng = unseen_map(kind, seed).route_map(), np.random.default_rng(seed)
+            for _ in range(2):
+                start, goal = (free_pose(route_map, planners["2ws"].vehicle, rng) for _ in range(2))
+                found = {
+                    name: planner.plan(route_map, start, goal, time.thread_time) for name, planner in planners.items()
+                }
+                two, four, lattice = found.values()
+                refused += lattice.reason is Reason.GOAL_UNREACHABLE and two.ok
+                for name in ("2ws", "4ws"):
+                    invalid += found[name].ok and not planners[name].free(route_map, found[name].path)
+                missed += two.ok and not four.ok
+                if two.ok and four.ok:
+                    ratios.append(four.path.length / two.path.length)
+                    print(f"{kind} {seed}: 2WS {two.path.length:.2f} m, 4WS {ratios[-1]:.4f} of it", flush=True)
+    part.add("queries", len(ratios))
+    part.add("invalid", invalid, 0)
+    part.add("4ws_missed", missed, 0)
+    part.add("4ws_over_2ws", max(ratios), 1.0)
+    part.add("4ws_over_2ws_median", float(np.median(ratios)))
+    part.add("lattice_said_unreachable_wrongly", refused, 0)
+    turn_round(part)
+    return part
+
+
+def turn_round(part: Part) -> None:
+    """Cusps of the daemon's own planner in corridors 0.80 m wide."""
+    config = PlannerConfig()
+    planner = HybridPlanner(Vehicle.truck(config.steering, angle=config.angle), config.route)
+    cells = np.zeros((34, 260), np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    route_map, y = RouteMap.from_cells(cells, 0.025), 0.425
+    worst = 0
+    for x in (2.0, 2.5, 3.0, 4.0):
+        result = planner.plan(route_map, (2.0, y, 0.0), (x, y, math.pi), time.thread_time)
+        cusps = result.path.cusps if result.path else 99
+        print(f"corridor, goal {x - 2.0:g} m ahead: {result.reason.value}, {cusps} cusps")
+        worst = max(worst, cusps)
+    part.add("corridor_cusps", worst, CUSPS)

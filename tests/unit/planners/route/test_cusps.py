@@ -1,0 +1,90 @@
+"""Few changes of direction, translations only where they help, and what an exhausted search may say."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.route.api import RouteMap, RouteResult, Vehicle, limited
+from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.lattice import LatticePlanner
+from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.replan import ViaPoint, plan_through
+from monstertruck_schemas.plan import MAX_RUNS
+from monstertruck_schemas.reasons import Reason
+from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
+
+
+def corridor(width, length=6.5, resolution=0.025):
+    cells = np.full((round(width / resolution) + 2, round(length / resolution)), 0, np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    return RouteMap.from_cells(cells, resolution)
+
+
+@pytest.mark.parametrize("radius", [1.0, 1.1])
+def test_a_truck_turns_round_in_a_narrow_corridor_with_few_cusps(radius):
+    config = PlannerConfig()
+    vehicle = Vehicle.truck(config.steering, angle=config.angle)
+    vehicle = replace(vehicle, radius=radius * vehicle.radius)
+    where, y = corridor(0.8), 0.425
+    start, goal = np.array([2.0, y, 0.0]), np.array([2.5, y, math.pi])
+    result = HybridPlanner(vehicle, config.route).plan(where, start, goal)
+    assert result.ok
+    assert_drivable(result.path, where, vehicle, start, goal)
+    assert result.path.cusps <= 8
+
+
+def zigzag(cusps):
+    signs = np.where(np.arange(cusps + 1) % 2, -1.0, 1.0)
+    return MotionPath(np.zeros(3), np.column_stack((0.3 * signs, np.zeros((cusps + 1, 2)))))
+
+
+def test_cusps_beyond_a_few_cost_extra():
+    config = HybridConfig(cusp_cost=0.1, free_cusps=4, many_cusps_cost=0.4, swing_cost=0.0, clearance_cost=0.0)
+    planner, where = HybridPlanner(TRUCK, config), ground()
+    costs = [planner.cost(where, zigzag(n)) - 0.3 * (n + 1) for n in (0, 4, 5, 8)]
+    assert costs == pytest.approx([0.0, 0.4, 0.9, 2.4])
+
+
+def test_translations_never_make_a_route_longer():
+    where = ground((2.0, 0.0, 2.3, 2.6), (3.8, 1.4, 4.1, 4.0))
+    config = HybridConfig(effort=30_000)
+    for goal in ((5.2, 1.0, 0.0), (5.0, 3.0, math.pi), (3.0, 2.0, math.pi / 2)):
+        without = replace(TRUCK, crab_angle=0.0)
+        lengths = [HybridPlanner(v, config).plan(where, (1.0, 1.0, 0.0), goal).path.length for v in (TRUCK, without)]
+        assert lengths[0] <= 1.001 * lengths[1]
+
+
+def test_an_exhausted_search_is_no_proof():
+    # A pocket just longer than the truck: no primitive of the lattice is free, and yet there is a way.
+    where = ground((0.8, 1.5, 1.75, 1.8), (0.8, 2.2, 1.75, 2.5), (0.5, 1.5, 0.75, 2.5))
+    start, goal = np.array([1.2, 2.0, 0.35]), np.array([5.0, 3.0, 0.0])
+    where = ground(*[(0.9, 1.55, 1.5, 1.75), (0.9, 2.25, 1.5, 2.45), (0.75, 1.55, 0.9, 2.45), (1.75, 1.2, 1.9, 2.45)])
+    start = np.array([1.2, 2.0, 0.0])
+    result = LatticePlanner(CAR, LatticeConfig(effort=3000)).plan(where, CAR.reference_pose(start), goal)
+    assert result.reason is Reason.ROUTE_TIMEOUT
+    closed = ground((2.9, 0.0, 3.1, 4.0))
+    for planner in (LatticePlanner(TRUCK), HybridPlanner(TRUCK, HybridConfig())):
+        assert planner.plan(closed, (1.0, 1.0, 0.0), goal).reason is Reason.GOAL_UNREACHABLE
+
+
+def test_no_route_has_more_runs_than_trackers_take():
+    taken, refused = (limited(RouteResult(Reason.OK, zigzag(n))) for n in (MAX_RUNS - 1, MAX_RUNS))
+    assert taken.ok
+    assert taken.path.runs == MAX_RUNS
+    assert refused.reason is Reason.ROUTE_TIMEOUT
+    assert str(MAX_RUNS) in refused.text
+    # Forward and back again between two places, time after time
+    places = [ViaPoint(3.0 if n % 2 else 2.0, 2.0, 0.0) for n in range(MAX_RUNS + 2)]
+    planner = HybridPlanner(TRUCK, HybridConfig(effort=70_000))
+    assert plan_through(planner, ground(), (2.0, 2.0, 0.0), places).reason is Reason.ROUTE_TIMEOUT
+
+
+def test_crab_and_arcs_are_runs_of_their_own():
+    segments = np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 0.4], [0.5, 2.0, 0.0], [-0.5, 0.0, 0.0]])
+    assert MotionPath(np.zeros(3), segments).runs == 4
+    assert MotionPath(np.zeros(3), segments[:1]).runs == 1
