@@ -15,7 +15,7 @@ from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_kinematics.chassis import Chassis, Dimensions
+from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.catalog import AnyLevelling
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
@@ -204,6 +204,14 @@ class TruckConfig(Schema):
             raise ValueError(
                 f"body {self.body.kind} has {wanted} servos: expected front_right and rear_right of devices.steering"
                 f" {'given' if wanted > len(driver.servos) else 'null'}"
+            )
+        if (
+            wanted > len(AXLES)
+            and (reach := min(abs(end) for servo in driver.servos for end in servo.reach)) < WHEEL_REACH - 1e-3
+        ):
+            raise ValueError(
+                f"devices.steering: pulses reach {math.degrees(reach):.0f} degrees to one side: expected "
+                f"{math.degrees(WHEEL_REACH):.0f} of wheels that are steered one by one"
             )
 
     def _check_planner(self) -> None:

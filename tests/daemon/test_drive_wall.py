@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Role
+from monstertruck_schemas.req import DriveForm, Role
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from tests.daemon.wall_kit import ROOT, Robot, command, end, robot
 
@@ -113,6 +113,39 @@ async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path
             await _orders(made.endpoint)
 
 
+async def test_the_keyboard_and_a_client_turn_a_robot_on_the_spot_by_twist(tmp_path: Path):
+    overlay = {"robot": "truck", "tracker": None, "path": None}
+    async with robot(tmp_path, overlay, base=ROOT / "configs/robots/differential.yaml") as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        async with made.client() as client:
+            gate = client.subscribe(topics.GATE, latest())
+            odometry = client.subscribe(topics.ODOMETRY, latest())
+            async with driving(made) as terminal:
+                os.write(terminal.user, b"6")
+                await terminal.hold(b"\r", lambda: _mode(gate) is GateMode.DRIVING)
+                await terminal.hold(b"d", lambda: _turning(odometry) < -0.2)
+                assert gate.latest is not None
+                assert (gate.latest.role, gate.latest.form) == (Role.KEYBOARD, DriveForm.TWIST)
+                assert abs(_speed(odometry)) < 0.05
+                await _stopped_and_disarmed(gate, odometry)
+            await client.arm()
+            async with asyncio.timeout(20):
+                while _turning(odometry) < 0.3:
+                    await client.drive_twist(0.0, wz=0.5)
+                    await asyncio.sleep(0.05)
+            await client.stop()
+            events = client.subscribe(topics.EVENT, fifo(100))
+            await client.drive_twist(0.0, vy=0.1)
+            async with asyncio.timeout(10):
+                while (event := await events.next()).reason is not Reason.IMPOSSIBLE_MOTION:
+                    pass
+            assert "cannot move sideways" in event.text
+        x, y, yaw = (await made.truth())[-1, 1:4]
+        assert abs(x - 1.0) + abs(y - 3.95) < 0.1
+        assert yaw != 0.0
+
+
 async def _orders(endpoint: str) -> None:
     """Every order answered by the gate; asked again where a busy machine made a sample stale."""
     for order, code, words in (
@@ -153,6 +186,10 @@ async def _stopped_and_disarmed(gate: Mailbox[GateState], odometry: Mailbox[Odom
 
 def _mode(gate: Mailbox[GateState]) -> GateMode | None:
     return None if gate.latest is None else gate.latest.mode
+
+
+def _turning(odometry: Mailbox[Odometry]) -> float:
+    return 0.0 if odometry.latest is None else odometry.latest.twist.wz
 
 
 def _speed(odometry: Mailbox[Odometry]) -> float:

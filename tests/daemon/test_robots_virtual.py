@@ -105,6 +105,15 @@ def test_a_robot_drives_its_bend(name: str):
             "icr_left is -0.3: expected more than icr_right",
         ),
         ("include: {0}/ackermann.yaml\nversion: 1\nbody: {{kind: hovercraft}}\n", "body: "),
+        (
+            "include: {0}/independent.yaml\nversion: 1\nbody: {{steering: axles}}\n",
+            "body independent has 2 servos: expected front_right and rear_right of devices.steering null",
+        ),
+        (
+            "include: {0}/independent.yaml\nversion: 1\n"
+            "devices: {{steering: {{driver: {{front: {{min_us: 1200}}}}}}}}\n",
+            "devices.steering: pulses reach 60 degrees to one side: expected 100",
+        ),
     ],
 )
 def test_what_does_not_fit_the_body_is_refused(text: str, said: str, tmp_path: Path):

@@ -86,6 +86,48 @@ def test_servos_and_axles_are_each_others_inverse(chassis):
     assert chassis.steering(2.0, 2.0) == chassis.steering(math.pi / 4, math.pi / 4)
 
 
+WHEELS = independent_chassis(Dimensions(DRIVETRAIN), steering="wheels")
+
+
+@pytest.mark.parametrize("chassis", [*BODIES.values(), WHEELS], ids=[*BODIES, "wheels"])
+def test_a_possible_twist_is_made_by_its_steering_angles_and_shafts(chassis):
+    rng = np.random.default_rng(6)
+    for _ in range(50):
+        speed, (front, rear) = float(rng.uniform(-0.3, 0.3)), angles_of(chassis, rng)
+        wanted = chassis.possible(chassis.bicycle.body_twist(speed, front, rear))
+        angles = chassis.steering_for(wanted, chassis.straight)
+        assert chassis.along(wanted, *angles) == pytest.approx(wanted, abs=1e-12)
+        shafts = chassis.shafts_along(wanted, *angles)
+        assert chassis.twist(chassis.input_speeds(shafts, *angles), *angles) == pytest.approx(wanted, abs=1e-12)
+        if len(angles) == 2 and chassis.steered:
+            assert angles == pytest.approx((front, rear))
+        assert chassis.axle_angles(wanted, angles) == pytest.approx((front, rear), abs=1e-9)
+        assert chassis.steering(*chassis.servos(*angles)) == pytest.approx(angles)
+
+
+@pytest.mark.parametrize("twist", [(0.0, 0.0, 0.7), (0.0, -0.1, 0.0), (-0.1, 0.05, 0.3), (0.0, 0.0, -0.2)])
+def test_wheels_steered_one_by_one_make_any_twist_within_their_reach(twist):
+    angles = WHEELS.steering_for(twist, WHEELS.straight)
+    assert max(map(abs, angles)) <= math.radians(100)
+    shafts = WHEELS.shafts_along(twist, *angles)
+    assert WHEELS.twist(shafts, *angles) == pytest.approx(twist, abs=1e-12)
+
+
+def test_wheels_that_stand_elsewhere_make_the_part_they_roll():
+    assert WHEELS.along((0.2, 0.0, 0.0), *[0.3] * 4)[0] == pytest.approx(0.2 * math.cos(0.3) ** 2)
+    assert WHEELS.aligned((0.0,) * 4, (0.3, -0.3, 0.3, 0.0))
+    assert not WHEELS.aligned((0.0,) * 4, (0.3, -0.4, 0.3, 0.0))
+
+
+@pytest.mark.parametrize("name", ["ackermann", "skid-steer"])
+def test_the_sideways_speed_that_follows_from_a_turn_need_not_be_asked_for(name):
+    chassis = BODIES[name]
+    vx, vy, wz = chassis.possible((0.2, 0.0, 0.1))
+    assert (vx, wz) == (0.2, 0.1)
+    assert vy == pytest.approx(0.1 * chassis.bicycle.l_r)
+    assert chassis.possible((vx, vy, wz)) == (vx, vy, wz)
+
+
 def test_the_truck_is_its_own_formulas():
     truck = BODIES["truck"]
     assert truck.shaft_speeds(0.2, 0.3, -0.2) == (truck.bicycle.drive_speed(0.2, 0.3, -0.2),)

@@ -1,15 +1,18 @@
 """Messages are strict and frozen, their arrays read-only, absent is None."""
 
+import json
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.base import Pose2D, Twist2D, servo_fields
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.req import DriveForm, DriveRequest, RequestedTwist, Role
+from monstertruck_schemas.sensor import LaserScan, SteeringFeedback
 from monstertruck_schemas.state import Grid, Odometry
 
 HEADER = {"stamp": 1, "received": 2, "seq": 3}
@@ -79,6 +82,55 @@ def test_a_drive_request_may_carry_nan_so_that_the_gate_can_name_it():
         **HEADER, source="me", role=Role.STATION, lease=0.3, nonce="n", speed=float("nan"), front=0.0
     )
     assert request.speed != request.speed
+
+
+ASKED = {**HEADER, "source": "me", "role": Role.STATION, "lease": 0.3, "nonce": "n"}
+
+
+def test_a_twist_is_standstill_to_a_reader_that_does_not_know_it():
+    request = DriveRequest(**ASKED, speed=0.0, front=0.0, twist=RequestedTwist(vx=0.1, wz=float("nan")))
+    wire = json.loads(request.model_dump_json())
+    assert (wire["speed"], wire["front"], wire["rear"]) == (0.0, 0.0, 0.0)
+    assert DriveRequest.model_validate_json(request.model_dump_json()).twist.vx == 0.1
+    assert (request.form, request.neutral) == (DriveForm.TWIST, False)
+
+
+def test_a_request_without_a_twist_is_read_as_before():
+    old = {**HEADER, "source": "me", "role": "station", "lease": 0.3, "nonce": "n", "speed": 0.1, "front": 0.2}
+    request = DriveRequest.model_validate_json(json.dumps(old))
+    assert (request.form, request.twist, request.pace) == (DriveForm.AXLES, None, 0.1)
+
+
+@pytest.mark.parametrize(
+    "more", [{"speed": 0.1, "front": 0.0}, {"speed": 0.0, "front": 0.1}, {"speed": 0.0, "front": float("nan")}]
+)
+def test_a_request_has_one_form(more):
+    with pytest.raises(ValidationError, match="a request has one form"):
+        DriveRequest(**ASKED, **more, twist=RequestedTwist(vx=0.1))
+
+
+@pytest.mark.parametrize(
+    ("twist", "pace", "neutral"),
+    [
+        ((0.1, 0.0, 0.0), 0.1, False),
+        ((-0.3, 0.4, 0.0), -0.5, False),
+        ((0.0, 0.0, 0.4), 0.0, False),
+        ((0.0, 0.0, 5e-4), 0.0, True),
+    ],
+)
+def test_the_pace_of_a_twist_is_that_of_the_base(twist, pace, neutral):
+    request = DriveRequest(
+        **ASKED, speed=0.0, front=0.0, twist=RequestedTwist(**dict(zip(("vx", "vy", "wz"), twist, strict=True)))
+    )
+    assert request.pace == pytest.approx(pace)
+    assert request.neutral is neutral
+
+
+@pytest.mark.parametrize("angles", [(0.1, -0.2), (0.1, 0.2, 0.3, 0.4)])
+def test_servos_are_two_or_four(angles):
+    command = SteeringCommand(**HEADER, front=0.0, rear=0.0, **servo_fields(angles, "_servo"))
+    assert command.servos == angles
+    assert SteeringFeedback(**HEADER, **servo_fields(angles)).servos == angles
 
 
 @pytest.mark.parametrize("shape", [8, 10])

@@ -21,6 +21,8 @@ class Gate:
     def __init__(self, clock: Clock, commands: Mailbox[SteeringCommand]) -> None:
         self.front = 0.0
         self.rear = 0.0
+        self.right: tuple[float, float] | None = None
+        """Servos of the right wheels, where every wheel has its own."""
         self.talking = True
         self.deadman = True
         self._clock = clock
@@ -39,6 +41,8 @@ class Gate:
                     rear=0.0,
                     front_servo=self.front,
                     rear_servo=self.rear,
+                    front_right_servo=None if self.right is None else self.right[0],
+                    rear_right_servo=None if self.right is None else self.right[1],
                     deadman=self.deadman,
                 )
                 self._commands.put(command)

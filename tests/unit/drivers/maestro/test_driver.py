@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (
     DeviceTimeoutError,
@@ -38,6 +38,26 @@ def test_commands_become_pulses_at_once_and_feedback_follows_the_ramp():
         assert rig.events.kept == []
 
     on_bench(test)
+
+
+WHEELS = MaestroConfig(front_right=ServoConfig(channel=2), rear_right=ServoConfig(channel=3))
+
+
+def test_every_wheel_may_have_its_own_servo():
+    async def test(rig: Rig) -> None:
+        rig.gate.front, rig.gate.rear, rig.gate.right = 0.2, -0.1, (-0.2, 0.3)
+        async with rig.driving():
+            await rig.settle(1.0)
+            pulses = {channel: rig.pulse(channel) for channel in (1, 2, 0, 3)}
+            for pulse, angle in zip(pulses.values(), (0.2, -0.2, -0.1, 0.3), strict=True):
+                assert pulse == pytest.approx(1439.2 - 10.48 * math.degrees(angle), abs=0.13)
+            feedback = rig.out.kept[-1]
+            assert feedback.servos == pytest.approx((0.2, -0.2, -0.1, 0.3), abs=0.001)
+            assert feedback.trusted
+            assert rig.battery.kept
+        assert rig.events.kept == []
+
+    on_bench(test, WHEELS)
 
 
 def test_a_command_reaches_the_device_without_waiting_for_the_poll():
