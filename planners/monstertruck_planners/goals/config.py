@@ -108,7 +108,8 @@ class PlannerConfig(Schema):
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
     """A scan tilted more than this says nothing about the way, rad: it looks over obstacles, or onto the ground"""
     scan_tolerance: Share = 0.08
-    """Returns this near to an obstacle of the map are taken for it, m."""
+    """Returns this near to an obstacle of the map are taken for it, m; up to twice as much where the pose is uncertain:
+    two standard deviations of its position are added"""
     escape: EscapeConfig = EscapeConfig()
     latency: Positive = 0.5
     """Seconds a route takes on the virtual clock"""

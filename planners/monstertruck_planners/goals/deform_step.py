@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, placed, poses_relative, scan_points
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
@@ -27,7 +27,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import LaserScan
 
 _NEWEST_DECIDES = (2, -2, 1)
 """Steps of a hit and of a pass, and the limit: one scan changes any cell to either."""
@@ -186,14 +185,14 @@ class DeformStep:
             raise InputError("deforming: expected a setup before anything else")
         if task.grid is not None:
             self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
-        points = self._observe(setup, task.scan, task.pose)
+        points, mapped = self._observe(setup, task)
         if task.way is not None:
             self._begin(task.way)
         if self._way is None:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
-        if self._way.drivable and self._free(setup, here, task.pose, points):
+        if self._way.drivable and self._free(setup, here, task.pose, points, mapped):
             self._rest, self._state = None, LocalPlannerState()
             return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
         if self._rest is None:
@@ -222,13 +221,19 @@ class DeformStep:
         self._travelled = self._guide.travelled
         self._rest, self._state = None, LocalPlannerState()
 
-    def _observe(self, setup: Setup, scan: LaserScan, pose: Pose) -> Array:
-        """Put a scan into the window; returns its points in base. Beams without a return say nothing."""
-        points = scan_points(scan, setup.lidar)
+    def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_]]:
+        """Put a scan into the window; its points in base, and which of them the map explains.
+
+        Beams without a return say nothing.
+        """
+        pose, points = task.pose, scan_points(task.scan, setup.lidar)
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
-        return points
+        if self._walls is None:
+            return points, np.zeros(len(points), np.bool_)
+        tolerance = explained_within(setup.config, task.deviation) + self._walls.resolution / 2
+        return points, np.asarray(self._walls.lookup(ends) <= tolerance)
 
     def _advance(self, here: Array) -> None:
         """Find the truck's place on the route: near the last one, not beyond a cusp that it has not reached."""
@@ -241,8 +246,12 @@ class DeformStep:
         directions[:1] = directions[1:2] if len(directions) > 1 else directions
         self._place = first + nearest_pose(PosePath(guide.poses[first : last + 1], directions), here)
 
-    def _free(self, setup: Setup, here: Array, pose: Pose, points: Array) -> bool:
-        """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked."""
+    def _free(self, setup: Setup, here: Array, pose: Pose, points: Array, mapped: NDArray[np.bool_]) -> bool:
+        """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked.
+
+        The route keeps its distance to the map's obstacles; where these seem nearer the pose is off, and only what the
+        truck would touch counts.
+        """
         local, guide, at = setup.config.local, self._guide, self._place
         deformed = self._rest is not None
         if deformed and pose_distance(guide.poses[at], here) > local.rejoin_distance:
@@ -251,7 +260,10 @@ class DeformStep:
         way = np.vstack((here, guide.poses[at + 1 : end]))
         margin = local.clearance + (local.rejoin_clearance if deformed else 0.0)
         relative = poses_relative(moved(way, -self._vehicle.reference), pose)
-        return first_contact(setup.footprint, relative, points, margin) is None
+        return (
+            first_contact(setup.footprint, relative, points[~mapped], margin) is None
+            and first_contact(setup.footprint, relative, points[mapped]) is None
+        )
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:
         assert self._way is not None

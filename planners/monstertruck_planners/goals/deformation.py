@@ -13,6 +13,7 @@ from monstertruck_planners.goals.exchange import (
     LocalRoute,
     PlanAnswer,
     Setup,
+    deviation_of,
     level,
     pose_of,
 )
@@ -184,6 +185,7 @@ class RouteDeformation:
             setup=self._setup if self._fresh else None,
             grid=grid if self._fresh or grid is not self._sent_grid else None,
             way=way,
+            deviation=deviation_of(odometry),
         )
         self._fresh, self._sent_grid = False, grid
         return task

@@ -1,5 +1,6 @@
 """Inputs and outputs of the planning step and the deforming step; light, as the daemon's loop imports them."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,6 +55,8 @@ class PlanTask:
     """Forget the route so far."""
     via: tuple[Place, ...] = ()
     """Places of the base to be passed before the goal."""
+    deviation: float = 0.0
+    """Standard deviation of the position, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +109,8 @@ class DeformTask:
     setup: Setup | None = None
     grid: Grid | None = None
     way: LocalRoute | None = None
+    deviation: float = 0.0
+    """Standard deviation of the position, m."""
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked"]
@@ -133,6 +138,17 @@ class DeformAnswer:
 def level(scan: LaserScan, config: PlannerConfig) -> bool:
     """Whether a scan lay flat enough to tell of the way, as far as it is known."""
     return scan.tilt is None or scan.tilt <= config.max_tilt
+
+
+def deviation_of(odometry: Odometry) -> float:
+    """Standard deviation of the position in the direction in which it is known worst, m."""
+    (xx, xy, _), (_, yy, _), _ = odometry.pose_covariance.reshape(3, 3).tolist()
+    return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))
+
+
+def explained_within(config: PlannerConfig, deviation: float) -> float:
+    """Distance from the map's obstacles at which returns are taken for those, m, at a deviation of the position."""
+    return config.scan_tolerance + min(2.0 * deviation, config.scan_tolerance)
 
 
 def pose_of(odometry: Odometry) -> Pose:

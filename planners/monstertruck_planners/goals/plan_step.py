@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, placed, points_relative, rectangle_distance
 from monstertruck_planners.goals.escape import escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
@@ -264,7 +264,7 @@ class PlanningStep:
             memory.forget(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
         memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
         memory.keep(task.points)
-        memory.forget(~static_map.unexplained(memory.places, setup.config.scan_tolerance))
+        memory.forget(~static_map.unexplained(memory.places, explained_within(setup.config, task.deviation)))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         assert self._setup is not None

@@ -11,7 +11,16 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import placed, scan_points
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
-from monstertruck_planners.goals.exchange import DeformAnswer, Finding, PlanAnswer, PlanTask, Setup, level, pose_of
+from monstertruck_planners.goals.exchange import (
+    DeformAnswer,
+    Finding,
+    PlanAnswer,
+    PlanTask,
+    Setup,
+    deviation_of,
+    level,
+    pose_of,
+)
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import (
     AT_REST,
@@ -294,6 +303,7 @@ class GoalService:
             clear=plan.clear,
             afresh=plan.afresh,
             via=run.via,
+            deviation=deviation_of(odometry),
         )
         self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
         self._planning = self._tasks.create_task(self._ask(task))

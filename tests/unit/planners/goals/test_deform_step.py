@@ -1,6 +1,7 @@
 """The deforming step: free routes stay as they are, what stands on them is passed, and what cannot be is said."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,22 @@ def test_a_free_route_stays_as_it_is():
     beside = (1.5, 0.25, 2.0, 0.5)
     answer = step.step(DeformTask(scan_of(at, beside), at))
     assert (answer.finding, answer.place) == ("free", 20)
+
+
+@pytest.mark.parametrize(
+    ("mapped", "deviation", "finding"), [(0.20, 0.0, "free"), (0.29, 0.0, "new"), (0.29, 0.03, "free")]
+)
+def test_a_wall_of_the_map_that_a_pose_off_brings_nearer_deforms_nothing(mapped, deviation, finding):
+    """The scan shows it at 0.185 m, 0.015 m beside the truck; how far the map may be off follows from the pose."""
+    step, first = begun()
+    grid = room()
+    cells = grid.cells.reshape(grid.height, grid.width).copy()
+    cells[round((mapped - grid.origin.y) / grid.resolution) :, 44:70] = 100
+    step.step(replace(first, grid=grid.model_copy(update={"cells": cells.ravel()})))
+    seen = scan_of(ORIGIN, (1.2, 0.185, 2.5, 0.5))
+    assert step.step(DeformTask(seen, ORIGIN, deviation=deviation)).finding == finding
+    touching = scan_of(ORIGIN, (1.2, 0.15, 2.5, 0.5))
+    assert step.step(DeformTask(touching, ORIGIN, deviation=deviation)).finding != "free"
 
 
 def test_what_stands_on_the_route_is_passed_and_then_the_route_is_driven_again():
