@@ -41,8 +41,8 @@ def run(options: Options) -> Part:
                 }
                 two, four, lattice = found.values()
                 refused += lattice.reason is Reason.GOAL_UNREACHABLE and two.ok
-                for name in ("2ws", "4ws"):
-                    invalid += found[name].ok and not planners[name].free(route_map, found[name].path)
+                for path in (found[name].path for name in ("2ws", "4ws") if found[name].ok):
+                    invalid += not route_map.field.free(FOOTPRINT, path.sample(0.01).poses).all()
                 missed += two.ok and not four.ok
                 if two.ok and four.ok:
                     ratios.append(four.path.length / two.path.length)

@@ -19,7 +19,7 @@ from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from monstertruck_planners.route.search import CostLayer
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import MAX_RUNS, Steering
+from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 
 Clock = Callable[[], float]
@@ -281,14 +281,6 @@ class RouteResult:
         if self.poses is None:
             raise ValueError("no route, no end")
         return np.asarray(self.poses[-1])
-
-
-def limited(result: RouteResult) -> RouteResult:
-    """The result, or the refusal of a path of more runs than trackers take."""
-    if result.path is None or result.path.runs <= MAX_RUNS:
-        return result
-    text = f"a route of {result.path.runs} runs: expected at most {MAX_RUNS}"
-    return RouteResult(Reason.ROUTE_TIMEOUT, text=text, statistics=result.statistics)
 
 
 class RoutePlanner(Protocol):

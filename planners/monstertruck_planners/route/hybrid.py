@@ -23,7 +23,6 @@ from monstertruck_planners.route.api import (
     RouteResult,
     Vehicle,
     check_endpoints,
-    limited,
 )
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.corridors import cheapest_unmarked, close_narrow_gaps, mark_corridor
@@ -140,7 +139,7 @@ class HybridPlanner:
             result = planner.plan_with_margin(budget, route_map, start, goal, attempt)
             if result.reason not in TRY_NARROWER:
                 break
-        return limited(replace(result, statistics={**result.statistics, "margin": planner.config.margin}))
+        return replace(result, statistics={**result.statistics, "margin": planner.config.margin})
 
     def plan_with_margin(
         self, budget: Budget, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: MarginAttempt

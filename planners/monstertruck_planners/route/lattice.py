@@ -27,7 +27,6 @@ from monstertruck_planners.route.api import (
     RouteResult,
     Vehicle,
     check_endpoints,
-    limited,
 )
 from monstertruck_planners.route.config import LatticeConfig
 from monstertruck_planners.route.heuristic import (
@@ -389,7 +388,7 @@ class LatticePlanner:
             return RouteResult(reason, text="no drivable way found", statistics=statistics)
         path = MotionPath(ends.start, best, self.vehicle.steering, self.vehicle.reference)
         statistics.setdefault("first_length", path.length)
-        return limited(RouteResult(Reason.OK, path, cost=cost, statistics=statistics))
+        return RouteResult(Reason.OK, path, cost=cost, statistics=statistics)
 
     def _search(
         self, field: FieldData, layer: CostLayer, to_go: CostToGo, ends: Endpoints, budget: Budget, weight: float,

@@ -15,7 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.track.segments import stops
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
 
@@ -146,11 +145,6 @@ class MotionPath:
     def cusps(self) -> int:
         """Changes between forward and backward."""
         return int(np.count_nonzero(np.diff(np.sign(self.segments[:, 0]))))
-
-    @property
-    def runs(self) -> int:
-        """Parts between two stops, as the trackers count them."""
-        return 1 + int(np.count_nonzero(stops(np.sign(self.segments[:, 0]), self.steering)))  # type: ignore[arg-type]
 
     @property
     def greatest_curvature(self) -> float:

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, limited
+from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult
 from monstertruck_planners.route.catalog import make_planner
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
 
 SAME_GOAL = 1e-3
@@ -66,7 +65,7 @@ def plan_through(
         legs.append(result)
         cost += result.cost
         here = result.end
-    return limited(replace(_joined(legs), cost=cost, statistics=statistics))
+    return replace(_joined(legs), cost=cost, statistics=statistics)
 
 
 def _joined(legs: Sequence[RouteResult]) -> RouteResult:
@@ -177,7 +176,7 @@ def remaining_route(
     reeds_shepp = planner.vehicle.reeds_shepp(planner.config)
     rests = [path.part(begin + ahead * planner.vehicle.radius, math.inf) for ahead in (0.0, 0.5, 1.0, 2.0, 4.0)]
     ways = [reeds_shepp.path(here, rest.start).then(rest) for rest in rests]
-    ways = [way for way in ways if way.runs <= MAX_RUNS and planner.free(route_map, way)]
+    ways = [way for way in ways if planner.free(route_map, way)]
     return min(ways, key=lambda way: planner.cost(route_map, way), default=None)
 
 
