@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from monstertruck_kinematics.chassis import Chassis, TruckChassis
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
@@ -119,12 +119,7 @@ class Gate:
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
-        # Other bodies do not steer by servos with a supply of their own.
-        self._steering_check = (
-            SteeringCheck(config.turning, chassis.bicycle)
-            if config.turning is not None and isinstance(chassis, TruckChassis)
-            else None
-        )
+        self._steering_check = SteeringCheck(config.turning) if config.turning is not None and chassis.steered else None
         self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check)
         self._events = EventLog(config.event_interval)
         self._stops = StopLog(self._outages)
@@ -159,7 +154,9 @@ class Gate:
             now = attitude.received
             trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._sensors.steering_fresh(now)
             heading = attitude.heading if trusted and self._states.active else None
-            self._steering_check.observe(attitude.stamp, heading, self._sensors.speed(now), *self._sensors.angles)
+            self._steering_check.observe(
+                attitude.stamp, heading, self._sensors.speed(now), self._sensors.turn_rate(now)
+            )
 
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""

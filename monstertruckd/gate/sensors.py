@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
-from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas import topics
@@ -192,6 +191,13 @@ class SensorMonitor:
         """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
         return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
+    def turn_rate(self, now: int) -> float:
+        """Yaw rate by the measured shaft speeds and the newest steering angles, rad/s; 0 without the former."""
+        rolling = self.shaft_speeds(now)
+        return (
+            self._chassis.twist(self._chassis.input_speeds(rolling, *self.angles), *self.angles)[2] if rolling else 0.0
+        )
+
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
         """Feedback of all shafts; empty unless all of it is fresh."""
         limit = self._config.drive
@@ -325,12 +331,10 @@ class SteeringCheck:
 
     Args:
         config: window and tolerance.
-        steering: the truck's geometry.
     """
 
-    def __init__(self, config: SteeringCheckConfig, steering: FourWheelSteering) -> None:
+    def __init__(self, config: SteeringCheckConfig) -> None:
         self._config = config
-        self._steering = steering
         self._window: deque[tuple[int, float, float]] = deque()
         """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
         self._heading = 0.0
@@ -345,15 +349,14 @@ class SteeringCheck:
         self.dead = False
         self.difference = 0.0
 
-    def observe(self, stamp: int, heading: float | None, speed: float | None, front: float, rear: float) -> None:
-        """Take a heading, and speed and steering at that time.
+    def observe(self, stamp: int, heading: float | None, speed: float | None, rate: float) -> None:
+        """Take a heading, and what wheels and steering say at that time.
 
         Args:
             stamp: of the measurement, ns.
             heading: clockwise, rad; None = the compass is disturbed.
             speed: of the wheels over ground, m/s; None = not known.
-            front: front axle angle, rad, left positive.
-            rear: rear axle angle, rad, left positive.
+            rate: yaw rate that follows from the wheels' speeds and the commanded steering angles, rad/s, left positive.
         """
         if heading is None or speed is None or abs(speed) < self._config.speed:
             self._window.clear()
@@ -367,8 +370,7 @@ class SteeringCheck:
         if abs(turned) > JUMP * dt:
             self._begin(stamp, heading)
             return
-        body_speed = speed / self._steering.drive_speed(1.0, front, rear)
-        commanded += self._steering.body_twist(body_speed, front, rear)[2] * dt
+        commanded += rate * dt
         self._window.append((stamp, commanded, measured + turned))
         self._heading = heading
         while self._window[-1][0] - self._window[0][0] > self._config.window * SECOND:

@@ -4,10 +4,21 @@ import math
 
 import numpy as np
 
-from monstertruck_kinematics.chassis import Dimensions, truck_chassis
+from monstertruck_kinematics.chassis import (
+    Dimensions,
+    ackermann_chassis,
+    differential_chassis,
+    independent_chassis,
+    mecanum_chassis,
+    omni_chassis,
+    skid_steer_chassis,
+    synchro_chassis,
+    truck_chassis,
+)
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import servo_fields
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
@@ -195,3 +206,49 @@ class Rig:
 
     def told(self, reason):
         return [event for event in self.events if event.reason is reason]
+
+
+SIZE = Dimensions(DRIVETRAIN)
+BODIES = {
+    "truck": truck_chassis(SIZE),
+    "ackermann": ackermann_chassis(SIZE),
+    "differential": differential_chassis(SIZE),
+    "skid_steer": skid_steer_chassis(SIZE, icr_left=0.2, icr_right=-0.21, icr_x=-0.03),
+    "synchro": synchro_chassis(SIZE),
+    "omni": omni_chassis(SIZE, circle=0.15),
+    "mecanum": mecanum_chassis(SIZE),
+    "wheels": independent_chassis(SIZE, steering="wheels"),
+}
+
+
+class Robot(Rig):
+    """Any body; its shafts and servos follow their commands."""
+
+    def __init__(self, kind, **config):
+        super().__init__(**config)
+        self.chassis = BODIES[kind]
+        self.gate = make_gate(chassis=self.chassis, **config)
+        self.shafts = [0.0] * len(self.chassis.shafts)
+        self.servos = self.chassis.servos(*self.chassis.straight)
+        self.turned = 0.0
+        self.turns = True
+        """The body does what its wheels say."""
+
+    def sense(self):
+        self.gate.observe_scan(scan(self.now, *self.obstacles))
+        heading = -self.turned % (2 * math.pi) if self.turns else 0.0
+        self.gate.observe_attitude(attitude(self.now).model_copy(update={"heading": heading}))
+        for shaft, speed in enumerate(self.shafts):
+            self.gate.observe_drive(feedback(self.now, speed), shaft)
+        if self.chassis.steered:
+            self.gate.observe_steering(SteeringFeedback(**header(self.now), **servo_fields(self.servos)))
+
+    def _obey(self):
+        self.shafts, self.servos = list(self.out.speeds), self.out.servos
+        self.turned += self.made[2] * 0.02
+
+    @property
+    def made(self):
+        """Twist that shafts and servos make."""
+        angles = self.chassis.steering(*self.servos)
+        return self.chassis.twist(self.chassis.input_speeds(tuple(self.shafts), *angles), *angles)

@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
@@ -12,21 +11,20 @@ from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import SteeringCheckConfig
 from monstertruckd.gate.sensors import SteeringCheck
-from tests.unit.gate.rig import Rig, header, servos
+from tests.unit.gate.rig import Rig, Robot, header, servos
 
-STEERING = FourWheelSteering()
 PERIOD = SECOND // 20
 SPEED = 0.18
-FRONT, REAR = 0.3, -0.3
-RATE = STEERING.body_twist(SPEED / STEERING.drive_speed(1.0, FRONT, REAR), FRONT, REAR)[2]
+RATE = 0.33
+"""Of a truck that steers both axles by 0.3 rad, rad/s."""
 
 
-def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, front=FRONT, rear=REAR, start=0):
+def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, rate=RATE, start=0):
     """Heading (clockwise) of a truck that turns by a share of what it is told; seconds until found dead."""
     for step in range(round(seconds * SECOND / PERIOD) + 1):
         at = step * PERIOD / SECOND
         measured = (heading - turning * RATE * at) % (2 * math.pi)
-        check.observe(start + step * PERIOD, measured, speed, front, rear)
+        check.observe(start + step * PERIOD, measured, speed, rate)
         if check.dead:
             return at
     return None
@@ -34,7 +32,7 @@ def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, front=FRONT,
 
 @pytest.fixture
 def check():
-    return SteeringCheck(SteeringCheckConfig(), STEERING)
+    return SteeringCheck(SteeringCheckConfig())
 
 
 @pytest.mark.parametrize("turning", [0.8, 1.0, 1.2])
@@ -51,7 +49,7 @@ def test_one_that_does_not_is_found_within_a_second_and_a_half(check, turning):
 
 
 def test_turning_without_being_told_to_is_found(check):
-    assert drive(check, 5.0, front=0.0, rear=0.0) is not None
+    assert drive(check, 5.0, rate=0.0) is not None
 
 
 def test_standing_still_proves_nothing(check):
@@ -74,13 +72,13 @@ def test_a_heading_that_jumps_is_the_compass(check):
 def test_what_is_not_known_is_not_judged(check, heading, speed):
     for step in range(200):
         unknown = step % 5 == 0
-        check.observe(step * PERIOD, heading if unknown else 0.0, speed if unknown else SPEED, FRONT, REAR)
+        check.observe(step * PERIOD, heading if unknown else 0.0, speed if unknown else SPEED, RATE)
     assert not check.dead
 
 
 def test_headings_far_apart_are_not_compared(check):
     for step in range(20):
-        check.observe(step * SECOND, 0.0, SPEED, FRONT, REAR)
+        check.observe(step * SECOND, 0.0, SPEED, RATE)
     assert not check.dead
 
 
@@ -120,3 +118,20 @@ def test_a_disarmed_truck_may_be_carried_about():
         rig.tick()
         rig.gate.observe_attitude(Attitude(**header(rig.now), heading=step * 0.02, roll=0.0, pitch=0.0))
     assert rig.order(Order.ARM) == "ok"
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "wheels"])
+def test_every_body_that_servos_steer_is_checked(kind):
+    robot = Robot(kind).armed()
+    robot.turns = False
+    robot.driver = {"vx": 0.15, "wz": 0.2}
+    robot.tick(200)
+    assert robot.told(Reason.STEERING_DEAD)
+
+
+def test_a_body_that_nothing_steers_is_not():
+    robot = Robot("differential").armed()
+    robot.turns = False
+    robot.driver = {"wz": 0.4}
+    robot.tick(200)
+    assert not robot.told(Reason.STEERING_DEAD)

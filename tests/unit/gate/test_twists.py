@@ -5,65 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.chassis import (
-    Dimensions,
-    ackermann_chassis,
-    differential_chassis,
-    independent_chassis,
-    mecanum_chassis,
-    omni_chassis,
-    skid_steer_chassis,
-    synchro_chassis,
-    truck_chassis,
-)
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, make_gate, scan, servos
-
-SIZE = Dimensions(DRIVETRAIN)
-BODIES = {
-    "truck": truck_chassis(SIZE),
-    "ackermann": ackermann_chassis(SIZE),
-    "differential": differential_chassis(SIZE),
-    "skid_steer": skid_steer_chassis(SIZE, icr_left=0.2, icr_right=-0.21, icr_x=-0.03),
-    "synchro": synchro_chassis(SIZE),
-    "omni": omni_chassis(SIZE, circle=0.15),
-    "mecanum": mecanum_chassis(SIZE),
-    "wheels": independent_chassis(SIZE, steering="wheels"),
-}
-
-
-class Robot(Rig):
-    """Any body; its shafts and servos follow their commands."""
-
-    def __init__(self, kind, **config):
-        super().__init__(**config)
-        self.chassis = BODIES[kind]
-        self.gate = make_gate(chassis=self.chassis, **config)
-        self.shafts = [0.0] * len(self.chassis.shafts)
-        self.servos = self.chassis.servos(*self.chassis.straight)
-
-    def sense(self):
-        self.gate.observe_scan(scan(self.now, *self.obstacles))
-        self.gate.observe_attitude(attitude(self.now))
-        for shaft, speed in enumerate(self.shafts):
-            self.gate.observe_drive(feedback(self.now, speed), shaft)
-        if self.chassis.steered:
-            front, *right, rear = self.servos[:1] + self.servos[1:2] * (len(self.servos) == 4) + self.servos[-2:][:1]
-            more = {"front_right": right[0], "rear_right": self.servos[3]} if right else {}
-            rear = rear if right else self.servos[1]
-            self.gate.observe_steering(servos(self.now, front, rear).model_copy(update=more))
-
-    def _obey(self):
-        self.shafts, self.servos = list(self.out.speeds), self.out.servos
-
-    @property
-    def made(self):
-        """Twist that shafts and servos make."""
-        angles = self.chassis.steering(*self.servos)
-        return self.chassis.twist(self.chassis.input_speeds(tuple(self.shafts), *angles), *angles)
-
+from tests.unit.gate.rig import Robot
 
 SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
 
@@ -129,7 +74,7 @@ def test_a_twist_steers_axles(kind):
 
 
 def test_a_turn_tighter_than_the_truck_can_is_clipped_to_its_tightest():
-    robot = Robot("truck", turning=None).driving(vx=0.1, wz=0.6, ticks=150)
+    robot = Robot("truck").driving(vx=0.1, wz=0.6, ticks=150)
     assert Reason.CLIPPED in robot.out.reasons
     assert (robot.out.front, robot.out.rear) == pytest.approx((0.4095, -0.4095), abs=1e-4)
     vx, _, wz = robot.out.twist
