@@ -54,6 +54,10 @@ MIN_SCORE: Final = 0.45
 """Mean likelihood of surroundings found again."""
 MIN_OVERLAP: Final = 0.55
 """Share of their points that must fit."""
+JOIN_OVERLAP: Final = 0.75
+"""The same for a submap searched for in the whole map,"""
+JOIN_BASELINE: Final = 2.0
+"""and the length of the trajectory between the matches that join it, m."""
 MIN_RATIO: Final = 0.02
 """Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
 MAX_CORRECTION: Final = 0.3
@@ -123,8 +127,7 @@ class LoopCloser:
     def close(self, keyframes: KeyframeMap) -> bool:
         """Search for loops from the newest keyframe; True if a closure has moved the poses."""
         newest = len(keyframes) - 1
-        own = keyframes.around(newest, QUERY_KEYS, QUERY_REACH)
-        query = _surroundings(keyframes, own, newest)
+        own, query = surroundings(keyframes, newest)
         while len(self._fingerprints) < newest:
             self._fingerprints.append(np.zeros_like(describe(query.points)))
         self._fingerprints.append(describe(query.points))
@@ -139,6 +142,18 @@ class LoopCloser:
             if hit is not None and self._accepted(keyframes, hit, sure=sure):
                 return True
         return False
+
+    def join(self, keyframes: KeyframeMap, at: int) -> bool | None:
+        """Verify keyframe ``at`` of the newest submap where it is in the map that the submap is apart from.
+
+        Like a match of a wide search it needs the support of others. True if the submap was joined, False if the match
+        waits for others, None if there is none.
+        """
+        numbers = np.flatnonzero(keyframes.joined())
+        candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
+        own, query = surroundings(keyframes, at)
+        hit = self._search(keyframes, query, own, at, candidate, MARGIN, least=JOIN_OVERLAP)
+        return None if hit is None else self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE)
 
     def review(self, keyframes: KeyframeMap) -> bool:
         """Search from all keyframes (seconds of work) for places of which only a part was seen before.
@@ -171,8 +186,7 @@ class LoopCloser:
         place, turn = _window(covariances[numbers[0]])
         if place > SMALL_WINDOW[0] or turn > SMALL_WINDOW[1]:
             return None
-        own = keyframes.around(at, QUERY_KEYS, QUERY_REACH)
-        query = _surroundings(keyframes, own, at)
+        own, query = surroundings(keyframes, at)
         tries = (
             self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True)
             for wider in PART_WIDER
@@ -197,7 +211,7 @@ class LoopCloser:
         off = between(keyframes.poses[at], keyframes.poses)
         distance = np.hypot(off[:, 0], off[:, 1])
         reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), MAX_WINDOW[0])
-        possible = (far > keyframes.config.local_spread**2) & (distance < VIEW + reach)
+        possible = np.isfinite(far) & (far > keyframes.config.local_spread**2) & (distance < VIEW + reach)
         possible[at:] = False
         for place in self._tried:
             possible &= _distance(keyframes, place) > VIEW
@@ -215,6 +229,7 @@ class LoopCloser:
         window: tuple[float, float],
         *,
         part: bool = False,
+        least: float = MIN_OVERLAP,
     ) -> LoopMatch | None:
         """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``."""
         self.searches += 1
@@ -229,8 +244,8 @@ class LoopCloser:
         submap = keyframes.submap(numbers)
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
         guess = keyframes.poses[at]
-        least = PART_SCORE if part else MIN_SCORE
-        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, least, MIN_SEPARATION)
+        score = PART_SCORE if part else MIN_SCORE
+        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, score, MIN_SEPARATION)
         if peak is None or peak.rival > MAX_RIVAL * peak.score:
             return None
         fit = register(query, submap.cloud, peak.pose)
@@ -241,7 +256,7 @@ class LoopCloser:
         off = keyframes.poses[numbers, :2] - fit.pose[:2]
         near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
         overlap = _overlap_in_view(keyframes, near, query, submap, fit.pose) if part else fit.overlap
-        if overlap < (PART_OVERLAP if part else MIN_OVERLAP):
+        if overlap < (PART_OVERLAP if part else least):
             return None
         if _contradiction(keyframes, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
             return None
@@ -252,12 +267,12 @@ class LoopCloser:
         covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
         return LoopMatch(origin, at, between(keyframes.poses[origin], fit.pose), np.linalg.inv(covariance))
 
-    def _accepted(self, keyframes: KeyframeMap, hit: LoopMatch, *, sure: bool) -> bool:
+    def _accepted(self, keyframes: KeyframeMap, hit: LoopMatch, *, sure: bool, baseline: float = BASELINE) -> bool:
         """Add ``hit`` and the matches that agree with it to the graph if they are enough and the graph accepts them."""
         agreeing, against = _split_by_consistency(keyframes, hit, self._hits)
         witnesses = [hit, *agreeing]
         self._hits.append(hit)
-        enough = len(witnesses) >= MIN_SUPPORT * (1 + len(against)) and _way(keyframes, witnesses) >= BASELINE
+        enough = len(witnesses) >= MIN_SUPPORT * (1 + len(against)) and _way(keyframes, witnesses) >= baseline
         if not sure and not enough:
             return False
         if not self._added(keyframes, witnesses):
@@ -350,10 +365,12 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
     return measure(query.chosen(seen), submap.cloud, pose).overlap
 
 
-def _surroundings(keyframes: KeyframeMap, numbers: NDArray[np.intp], centre: int) -> Scan:
-    """The numbered keyframes merged in the frame of ``centre``."""
+def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:
+    """Numbers of the keyframes around ``centre``, and their points merged in its frame."""
+    numbers = keyframes.around(centre, QUERY_KEYS, QUERY_REACH)
     poses = between(keyframes.poses[centre], keyframes.poses[numbers])
-    return merged([keyframes.frames[k].scan for k in numbers], poses).downsampled(QUERY_CELL, QUERY_POINTS)
+    scan = merged([keyframes.frames[k].scan for k in numbers], poses)
+    return numbers, scan.downsampled(QUERY_CELL, QUERY_POINTS)
 
 
 def _distance(keyframes: KeyframeMap, place: int) -> Array:

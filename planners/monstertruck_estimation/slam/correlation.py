@@ -30,7 +30,7 @@ SMEAR: Final = 0.08
 DOUBT: Final = 0.002
 """Penalty of a squared standard deviation from the guess, as share of the score."""
 WORK: Final = 400_000
-"""Blocks looked at before the search ends with what it has."""
+"""Blocks looked at, unless the caller says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +82,7 @@ def correlate(
     deviation: tuple[float, float],
     least: float,
     apart: float = 0.0,
+    work: int = WORK,
 ) -> Peak | None:
     """Best pose of ``points`` in the grid.
 
@@ -93,6 +94,7 @@ def correlate(
         deviation: standard deviation of the guess (m, rad), which breaks ties (``DOUBT``).
         least: poses scoring less are no result.
         apart: a rival is at least this far (m; or that arc at the typical range) from the best; 0: do not look.
+        work: blocks looked at before the search ends with what it has.
     """
     if not len(points):
         return None
@@ -105,13 +107,13 @@ def correlate(
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
     penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
     zone = (10**9, 10**9, 10**9, -1.0, -1.0)
-    score, k, ix, iy = _search(grid.levels, offsets, turns, cells, *penalty, least, *zone)
+    score, k, ix, iy = _search(grid.levels, offsets, turns, cells, *penalty, least, work, *zone)
     if k < 0:
         return None
     rival = 0.0
     if apart > 0:
         zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
-        rival = max(_search(grid.levels, offsets, turns, cells, *penalty, 0.8 * score, *zone)[0], 0.0)
+        rival = max(_search(grid.levels, offsets, turns, cells, *penalty, 0.8 * score, work, *zone)[0], 0.0)
     pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
     return Peak(pose, float(score), float(rival))
 
@@ -193,6 +195,7 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
     by_cell,  # noqa: ANN001
     by_turn,  # noqa: ANN001
     least,  # noqa: ANN001
+    most,  # noqa: ANN001
     shut_k,  # noqa: ANN001
     shut_x,  # noqa: ANN001
     shut_y,  # noqa: ANN001
@@ -201,6 +204,7 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
 ):
     """Depth-first branch and bound; (score, turn index, x cells, y cells), turn index -1 if nothing reached ``least``.
 
+    It ends when more than ``most`` blocks were looked at.
     Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
     """
     top = levels.shape[0] - 1
@@ -226,7 +230,7 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
     stack = np.empty((4 * (top + 1) + 4, 4), np.int32)
     stack_bound = np.empty(4 * (top + 1) + 4)
     for m in np.argsort(-bounds, kind="mergesort"):
-        if bounds[m] <= best or work > WORK:
+        if bounds[m] <= best or work > most:
             break
         stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = blocks[m, 0], blocks[m, 1], blocks[m, 2], top
         stack_bound[0] = bounds[m]

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
 from monstertruck_estimation.se2 import between, wrap
@@ -80,8 +80,15 @@ def robust_weights(squares: Array, loop: NDArray[np.bool_], switch: float = SWIT
     return np.where(loop, scale**2, 1.0)
 
 
-def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -> Array:
-    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; number ``fixed`` stays where it is.
+def parts(edges: Edges, count: int) -> Index:
+    """Number of the connected part of the graph that each of ``count`` poses belongs to, shape (count,)."""
+    graph = csr_matrix((np.ones(len(edges), np.int8), (edges.origin, edges.target)), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    return np.asarray(labels, dtype=np.int64)
+
+
+def optimise(poses: Array, edges: Edges, iterations: int = 30) -> Array:
+    """Poses, shape (n, 3), that fit the edges best, starting from ``poses``; the first of each connected part is fixed.
 
     Loop edges first count in full, however large their residual, then are down-weighted step by step (graduated
     non-convexity: Yang, Antonante, Tzoumas, Carlone 2020): a true closure of a long loop starts as far off as a
@@ -89,6 +96,7 @@ def optimise(poses: Array, edges: Edges, fixed: int = 0, iterations: int = 30) -
     """
     if not len(edges):
         return poses
+    _, fixed = np.unique(parts(edges, len(poses)), return_index=True)
     pattern = _Pattern(edges, len(poses), fixed)
     damping = 1e-6
     off, squares = residuals(poses, edges)
@@ -125,10 +133,10 @@ def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
 class _Pattern:
     """The sparse normal equations of one set of edges: ordered once for little fill, assembled anew for every step."""
 
-    def __init__(self, edges: Edges, count: int, fixed: int) -> None:
+    def __init__(self, edges: Edges, count: int, fixed: Index) -> None:
         self._count = count
         place = _ordering(edges, count)
-        self._place, self._fixed = place, int(place[fixed])
+        self._place, self._fixed = place, place[fixed]
         a, b = place[edges.origin], place[edges.target]
         own = np.arange(count)
         rows = np.concatenate((a, a, b, b, own))

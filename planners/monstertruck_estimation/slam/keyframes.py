@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse, wrap
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
-from monstertruck_estimation.slam.graph import Edges, drift, optimise
+from monstertruck_estimation.slam.graph import Edges, drift, optimise, parts
 from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equations, register
 from monstertruck_estimation.slam.scan_matcher import deviations
 from monstertruck_estimation.slam.scans import Scan
@@ -155,6 +155,13 @@ class Trajectory:
             for rows in (self._stamps, self._keys, self._relative):
                 rows.set(rows.view[::2])
 
+    def reattach(self, since: int, keys: Array, key: int) -> None:
+        """Attach scans from ``since`` on, ns, to keyframe ``key``, at their poses by ``keys``, shape (n, 3)."""
+        late = np.flatnonzero(self._stamps.view >= since)
+        poses = compose(keys[self._keys.view[late]], self._relative.view[late])
+        self._relative.view[late] = between(keys[key], poses)
+        self._keys.view[late] = key
+
     def move(self, stand_in: NDArray[np.int64], offset: Array) -> None:
         """Keyframe k is replaced by ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
         keys = self._keys.view
@@ -203,15 +210,29 @@ class KeyframeMap:
         self.frames: list[Keyframe] = []
         self.poses: Array = np.zeros((0, 3))
         self.edges = EdgeList()
+        self.begin = 0
+        """First keyframe of the newest submap that began apart; 0 if there is none."""
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def add(self, scan: Scan, stamp: int, pose: Array) -> None:
-        """Add a keyframe, without edges."""
+    def add(self, scan: Scan, stamp: int, pose: Array, *, apart: bool = False) -> None:
+        """Add a keyframe, without edges; ``apart``: it begins a submap that only loop closures may join to the rest."""
+        if apart:
+            self.begin = len(self)
         kept = scan.downsampled(self.config.key_cell, self.config.key_points)
         self.frames.append(Keyframe(stamp, kept, Cloud.of(kept)))
         self.poses = np.vstack((self.poses, pose))
+
+    def place(self, at: int, pose: Array) -> None:
+        """Move the newest submap, joined to nothing, so that its keyframe ``at`` is at ``pose``, shape (3,)."""
+        submap = slice(self.begin, None)
+        self.poses[submap] = compose(pose, between(self.poses[at], self.poses[submap]))
+
+    def joined(self) -> NDArray[np.bool_]:
+        """Which keyframes are related to the first one, shape (n,)."""
+        labels = parts(self.edges.edges(), len(self))
+        return np.asarray(labels == labels[0])
 
     def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
         """Add the edge from the last keyframe but one to the last."""
@@ -273,7 +294,8 @@ class KeyframeMap:
     def local(self) -> Numbers:
         """Numbers, rising, of the keyframes of the submap around the newest one."""
         newest = len(self) - 1
-        return np.union1d(self.around(newest, self.config.local_keys), np.arange(max(newest - 2, 0), newest + 1))
+        recent = np.arange(max(newest - 2, self.begin), newest + 1)
+        return np.union1d(self.around(newest, self.config.local_keys), recent)
 
     def submap(self, numbers: Numbers) -> Submap:
         """The numbered keyframes merged in map."""
@@ -304,6 +326,7 @@ class KeyframeMap:
         self.edges.replace(edges.renumbered(number), spread, odometry)
         self.frames = [key for key, left_out in zip(self.frames, gone.tolist(), strict=True) if not left_out]
         self.poses = self.poses[~gone]
+        self.begin = int(number[stand_in[self.begin]])
         return ~gone, number[stand_in], offset
 
     def _closeness(self, numbers: Numbers, pose: Array) -> Array:
@@ -466,6 +489,8 @@ def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, roun
         rounds: greatest number of rounds.
     """
     pairs = partners(poses)
+    part = parts(steady.joined(loops), len(poses))
+    pairs = pairs[part[pairs[:, 0]] == part[pairs[:, 1]]]
     for turn in range(rounds):
         reach = CELL if turn < rounds // 2 else CELL / 2
         pair_edges = _linearised(keys, poses, pairs, reach)

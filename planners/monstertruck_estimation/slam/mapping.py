@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
-from monstertruck_estimation.slam.closure import LoopCloser
+from monstertruck_estimation.slam.closure import PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import GridBuilder
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
+from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
     MIN_PAIRS,
@@ -35,8 +36,8 @@ from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 DESKEW_PERIOD: Final = (0.02, 0.5)
 """Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing)."""
-PATIENCE: Final = 3
-"""A scan of low overlap becomes a keyframe only if this many in a row are: one may have a wrong stamp or odometry."""
+UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
+"""Covariance of the pose of a robot that is lost."""
 
 
 class MappingEvent(StrEnum):
@@ -46,6 +47,10 @@ class MappingEvent(StrEnum):
     REJECTED = "rejected"
     CLOSED = "closed"
     PRUNED = "pruned"
+    APART = "apart"
+    """The robot is lost: a submap that is not joined to the map was begun."""
+    JOINED = "joined"
+    """The submap was joined to the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +62,9 @@ class Step:
     pose: Array
     """Shape (3,): base in map. It jumps at a loop closure; use odom and the next field where it must not."""
     map_from_odom: Array | None
-    """Shape (3,): pose of odom in map; None without odometry."""
+    """Shape (3,): pose of odom in map; None without odometry, and while lost."""
     covariance: Array
-    """Shape (3, 3): of ``pose`` against the map around it."""
+    """Shape (3, 3): of ``pose`` against the map around it; ``UNKNOWN`` while lost."""
     match: ScanMatch
     """Result of scan matching; its pose is that before a closure at this step."""
     scan: Scan
@@ -91,7 +96,13 @@ class Mapper:
         self._submap: Submap | None = None
         self._local: NDArray[np.intp] = np.zeros(0, np.intp)
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
-        self._doubts = 0
+        self._loss = LossDetector()
+        self._relocation = Relocation()
+
+    @property
+    def lost(self) -> bool:
+        """Whether scans have not fitted the map for a while, or fit only a submap that is not joined to it."""
+        return self.map.begin > 0 or self._loss.lost
 
     @property
     def twist(self) -> Vector:
@@ -120,18 +131,13 @@ class Mapper:
         if self._stamp is not None and stamp <= self._stamp:
             return None
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
-        delta, noise = self._motion.predict(dt, odom)
-        match = self._matched(scan, delta, noise)
-        other = self._motion.other
-        if not fits(match) and other is not None and self._submap is not None:
-            instead = self._matched(scan, *other)
-            if fits(instead):
-                (delta, noise), match = other, instead
+        (delta, noise), match = self._best_match(scan, self._motion.predict(dt, odom))
         if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
             scan = again(velocity(between(self._pose, match.pose), dt))
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
-        self._doubts = 0 if fits(match) else self._doubts + 1
+        if self._submap is not None:
+            self._loss.take(stamp, match)
         trusted = not self._motion.check.contradicted
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         if trusted and self._motion.check.contradicted:
@@ -139,27 +145,45 @@ class Mapper:
             self._since_key = self._since_key[0], self._since_key[1] * LOOSENED**2
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
         events: tuple[MappingEvent, ...] = () if match.accepted or not len(self.map) else (MappingEvent.REJECTED,)
-        if self._key_is_due(scan):
+        if self._is_elsewhere(scan):
+            events += (MappingEvent.APART,)
+            self._begin_submap(scan, stamp)
+        elif self._key_is_due(scan):
             if len(self.map):
                 self._append_to_trajectory(stamp)
             events += self._extend(scan, stamp, match)
         if len(self.map):
             self._append_to_trajectory(stamp)
+        if self.map.begin and self._searched():
+            events += (MappingEvent.JOINED,)
         odom_now = self._motion.odom
-        correction = None if odom_now is None else compose(self._pose, inverse(odom_now))
-        return Step(stamp, self._pose.copy(), correction, self._covariance.copy(), match, scan, events)
+        correction = None if odom_now is None or self.lost else compose(self._pose, inverse(odom_now))
+        covariance = UNKNOWN if self.lost else self._covariance
+        return Step(stamp, self._pose.copy(), correction, covariance.copy(), match, scan, events)
 
     @property
     def odometry(self) -> OdometryUse:
         """Whether the motion between scans is predicted by odometry."""
         return self._motion.use
 
+    def _best_match(self, scan: Scan, motion: tuple[Array, Array]) -> tuple[tuple[Array, Array], ScanMatch]:
+        """Match after the predicted ``motion``, or after the other prediction if that alone fits."""
+        match, other = self._matched(scan, *motion), self._motion.other
+        if fits(match) or other is None or self._submap is None:
+            return motion, match
+        instead = self._matched(scan, *other)
+        return (other, instead) if fits(instead) else (motion, match)
+
     def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
         """Match ``scan`` after a motion ``delta`` of covariance ``noise``."""
         guess, covariance = _moved(self._pose, self._covariance, delta, noise)
         if self._submap is None:
             return rejected(guess, covariance, MatchStatus.EMPTY)
-        return self._front.match(scan, delta, guess, covariance, self._submap)
+        match = self._front.match(scan, delta, guess, covariance, self._submap)
+        doubtful = self._loss.suspects(match, guess, covariance)
+        if doubtful and contradicts(self.map, scan, match.pose, PART_CONTRADICTION):
+            return rejected(guess, covariance, MatchStatus.CONTRADICTED)
+        return match
 
     def finish(self) -> None:
         """Search for remaining loop closures and register all keyframes jointly: seconds of work."""
@@ -179,15 +203,44 @@ class Mapper:
             return False
         if not len(self.map):
             return True
-        if 0 < self._doubts < PATIENCE:
+        if not self._loss.fits and not self._loss.lost:
             return False
         moved = between(self.map.poses[-1], self._pose)
         return math.hypot(moved[0], moved[1]) >= self.config.key_distance or abs(moved[2]) >= self.config.key_turn
+
+    def _is_elsewhere(self, scan: Scan) -> bool:
+        """Whether a lost robot is not where its motion since the last fit led it."""
+        if not len(self.map) or len(scan) < MIN_PAIRS or not self._loss.lost:
+            return False
+        alone = self._motion.use is not OdometryUse.USED
+        return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)
+
+    def _begin_submap(self, scan: Scan, stamp: int) -> None:
+        """Begin a submap of the scans since the first misfit."""
+        self.map.add(scan, stamp, self._pose, apart=True)
+        self._trajectory.reattach(self._loss.fitted + 1, self.map.poses, len(self.map) - 1)
+        self._since_key = (np.zeros(3), np.zeros((3, 3)))
+        self._covariance = np.zeros((3, 3))
+        self._loss.restart()
+        self._relocation = Relocation()
+        self._look_around()
+
+    def _searched(self) -> bool:
+        """Do a slice of the search for the submap's place; True if it was joined."""
+        place = between(self.map.poses[-1], self._pose)
+        joined = self._relocation.step(self.map, self._closer)
+        self._pose = compose(self.map.poses[-1], place)
+        if joined:
+            self.map.begin = 0
+        self._look_around()
+        return joined
 
     def _extend(self, scan: Scan, stamp: int, match: ScanMatch) -> tuple[MappingEvent, ...]:
         """Add the scan as a keyframe with its edges, search for a loop closure, prune the map."""
         events: tuple[MappingEvent, ...] = (MappingEvent.KEY,)
         self.map.add(scan, stamp, self._pose)
+        if not self._loss.fits:
+            self._loss.restart()
         if len(self.map) > 1:
             self.map.add_odometry_edge(*self._since_key)
             if match.accepted:
@@ -200,6 +253,7 @@ class Mapper:
             kept, stand_in, offset = self.map.prune()
             self._trajectory.move(stand_in, offset)
             self._closer.forget(kept)
+            self._relocation.forget()
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._look_around()
         return events
@@ -293,6 +347,7 @@ class MappingEstimator:
         self._moved = False
         self._redrawn = False
         self._misfits = 0
+        self._apart: list[tuple[Scan, int, Vector]] = []
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
 
@@ -318,20 +373,26 @@ class MappingEstimator:
             return None
         accepted = step.match.accepted or (MappingEvent.KEY in step.events and len(self.mapper.map) == 1)
         self._misfits = 0 if accepted else self._misfits + 1
+        lost, joined = self.mapper.lost, MappingEvent.JOINED in step.events
         self.counts["scans"] += 1
         self.counts["keys"] = len(self.mapper.map)
         self.counts["closures"] += MappingEvent.CLOSED in step.events
         self.counts["rejected"] += MappingEvent.REJECTED in step.events
-        self._moved |= MappingEvent.CLOSED in step.events
-        if accepted:
+        self._moved |= MappingEvent.CLOSED in step.events or joined
+        if lost or joined:
+            if MappingEvent.KEY in step.events or MappingEvent.APART in step.events:
+                self._apart.append((step.scan, step.stamp, inputs.mount))
+        elif accepted:
             self.builder.add(step.scan, step.stamp, step.pose, inputs.mount)
             if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
-        closed = MappingEvent.CLOSED in step.events
+        if joined:
+            self._draw_submap()
+        closed = MappingEvent.CLOSED in step.events or joined
         moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=alone, corrected=closed)
         status = (
             LocalisationStatus.LOST
-            if self._misfits >= LOST_AFTER
+            if lost or self._misfits >= LOST_AFTER
             else status_of(step.match, LocalisationStatus.MAPPING)
         )
         return estimate(
@@ -368,6 +429,13 @@ class MappingEstimator:
         """See ``Estimator``."""
         self.mapper.finish()
         self._moved = True
+
+    def _draw_submap(self) -> None:
+        """Add the keyframes of a submap to the grid, which waited until it was joined to the map."""
+        stamps, poses = self.mapper.trajectory()
+        for scan, stamp, mount in self._apart:
+            self.builder.add(scan, stamp, poses[np.searchsorted(stamps, stamp)], mount)
+        self._apart.clear()
 
     def _follow(self) -> None:
         if self._moved:

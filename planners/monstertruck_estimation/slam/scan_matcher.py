@@ -51,6 +51,8 @@ class MatchStatus(StrEnum):
     EMPTY = "empty"
     OVERLAP = "overlap"
     FAR = "far"
+    CONTRADICTED = "contradicted"
+    """Scan and map look through each other's walls there."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,17 +74,21 @@ def elements(points: Array, **known: Array) -> Scan:
 
 
 def saved_graph(known: KeyframeMap) -> SavedGraph:
-    """The graph as it is now, to be saved."""
+    """The graph as it is, to be saved, without submaps that are not joined to its first keyframe."""
+    kept = known.joined()
     edges = known.edges.edges()
+    inside = kept[edges.origin]
+    edges = edges.chosen(inside).renumbered(np.cumsum(kept) - 1)
+    frames = [key for key, one in zip(known.frames, kept.tolist(), strict=True) if one]
     return SavedGraph(
-        np.array([key.stamp for key in known.frames], np.int64),
-        known.poses.copy(),
-        tuple(key.scan for key in known.frames),
+        np.array([key.stamp for key in frames], np.int64),
+        known.poses[kept],
+        tuple(key.scan for key in frames),
         {
             "edge_ends": np.stack((edges.origin, edges.target), axis=-1),
             "edge_measured": np.array(edges.measured),
             "edge_information": np.array(edges.information),
-            "edge_spread": np.array(known.edges.spread),
+            "edge_spread": np.array(known.edges.spread[inside]),
             "edge_loop": np.array(edges.loop),
         },
     )

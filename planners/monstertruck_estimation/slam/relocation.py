@@ -1,0 +1,257 @@
+"""When scans stop fitting the map, and where the submap begun then belongs in the map before it.
+
+A robot that was carried fits nowhere near its predicted pose. Its scans begin a submap of their own, which no odometry
+joins to the map. The surroundings of its newest keyframe are searched for in the whole map (branch and bound, a slice
+of yaws per scan, so that no scan waits for all of them); a place found is verified as every loop closure is, and joins
+both only with the support of matches from other places.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, surroundings
+from monstertruck_estimation.slam.correlation import RESOLUTION, Peak, Submap, correlate
+from monstertruck_estimation.slam.keyframes import KeyframeMap
+from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
+from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+
+LOST_AFTER: Final = 1.5
+"""Seconds of misfits after which the robot is lost,"""
+LOST_SCANS: Final = 3
+"""and fewest scans."""
+GAP: Final = (5.0, 3.0)
+"""A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after it."""
+PERIOD_GAIN: Final = 0.1
+"""Weight of one period in the usual one."""
+
+
+class LossDetector:
+    """Whether scans fit the map.
+
+    After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
+    constrain all directions: a half fit, or one wall, is found in many places.
+    """
+
+    def __init__(self) -> None:
+        self._stamp: int | None = None
+        self.fitted = 0
+        """Stamp of the last scan that fitted, ns."""
+        self._period = 0.0
+        self._usual = 0.0
+        self._misfits = 0
+        self.after_gap = False
+        """No scan has fitted since a gap."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the newest scan fits."""
+        return not self._misfits and not self.after_gap
+
+    def suspects(self, match: ScanMatch, guess: Array, covariance: Array) -> bool:
+        """Whether an accepted ``match`` overlaps clearly less than usual, and is far from the predicted pose.
+
+        So it is at a place that only looks alike. ``guess``, shape (3,), has ``covariance``, shape (3, 3).
+        """
+        if not match.accepted or match.overlap >= self._usual - OVERLAP_DROP:
+            return False
+        off = match.pose - guess
+        off[2] = math.remainder(off[2], math.tau)
+        return float(off @ np.linalg.solve(covariance, off)) > GATE_LOW_OVERLAP**2
+
+    @property
+    def lost(self) -> bool:
+        """Whether scans have not fitted for ``LOST_AFTER``."""
+        since = (self._stamp or 0) - self.fitted
+        return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND
+
+    def take(self, stamp: int, match: ScanMatch) -> None:
+        """Take the match of a scan at ``stamp``, ns."""
+        if self._stamp is not None:
+            dt = (stamp - self._stamp) / SECOND
+            self.after_gap |= dt > max(GAP[0], GAP[1] * self._period)
+            self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
+        self._stamp = stamp
+        doubt = self._misfits or self.after_gap
+        least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
+        if not match.accepted or match.overlap < least or (self.after_gap and match.degenerate):
+            self._misfits += 1
+            return
+        self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
+        self.restart()
+
+    def restart(self) -> None:
+        """The newest scan fits, for it is part of the map."""
+        self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
+
+
+NEAR: Final = 6
+"""Keyframes that a scan is held against."""
+
+
+def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
+    """Whether ``scan`` at ``pose``, shape (3,), and the keyframes around it see through a share ``most`` of each other.
+
+    What no keyframe saw contradicts nothing: the robot drove on by odometry alone, where there was little to see.
+    """
+    begin = keyframes.begin
+    off = keyframes.poses[begin:, :2] - pose[:2]
+    far = np.hypot(off[:, 0], off[:, 1])
+    near = begin + np.argsort(far, kind="stable")[:NEAR]
+    near = near[far[near - begin] <= keyframes.config.local_reach]
+    if not len(near):
+        return False
+    scans = [keyframes.frames[k].scan for k in near]
+    return contradiction([scan], pose[None], scans, keyframes.poses[near]) > most
+
+
+LEVELS: Final = 7
+"""Levels of the pyramid of the whole map."""
+MAP_KEYS: Final = 300
+"""Keyframes of the whole map searched in, at most."""
+POINTS: Final = 160
+"""Points of the surroundings searched for, at most."""
+SLICE: Final = 6e6
+"""Look-ups of the first level in one slice of the search, about 10 ms,"""
+WORK: Final = 40_000
+"""and blocks looked at below it."""
+ANYWHERE: Final = (1e6, 1e6)
+"""Standard deviation of the predicted pose, m and rad: nothing is known of it."""
+MIN_SCORE: Final = 0.5
+"""Mean likelihood of a place found."""
+MAX_RIVAL: Final = 0.9
+"""It is ambiguous if another place scores more than this share of it."""
+APART: Final = (1.0, 0.5)
+"""Two places differ by more, m or rad."""
+RIVAL_TURN: Final = 0.1
+"""Half width of the search for a rival that looks the same way, rad."""
+CHECKS: Final = 10
+"""Keyframes verified at a place found, at most,"""
+CHECK_SPACING: Final = 2
+"""every second one,"""
+MOST_FAILED: Final = 3
+"""and failures after which it is given up."""
+FEWEST_KEYS: Final = 2
+"""Keyframes of a submap before it is searched for."""
+
+
+@dataclass
+class _Search:
+    """Search for the surroundings of keyframe ``at``."""
+
+    at: int
+    points: Array
+    """Shape (n, 2), in its frame, m."""
+    middle: Array
+    half: float
+    slices: int
+    done: int = 0
+    peaks: list[Peak] = field(default_factory=list)
+
+
+class Relocation:
+    """Joins the newest submap of a keyframe map to the part that begins at the first keyframe."""
+
+    def __init__(self) -> None:
+        self._whole: tuple[int, Submap] | None = None
+        self._search: _Search | None = None
+        self._last = -1
+        self._checks: list[int] = []
+        self._failed = 0
+
+    def step(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
+        """Do one slice of the search; True if the submap was joined, which moves poses."""
+        newest = len(keyframes) - 1
+        if self._search is None and not self._checks:
+            if newest - keyframes.begin + 1 < FEWEST_KEYS or newest == self._last:
+                return False
+            self._search = self._begin(keyframes, newest)
+            return False
+        if self._checks:
+            return self._check(keyframes, closer)
+        search, submap = self._search, self._submap(keyframes)
+        assert search is not None
+        turn = math.tau / search.slices
+        guess = search.middle + np.array((0.0, 0.0, (search.done + 0.5) * turn))
+        least = max(MIN_SCORE, MAX_RIVAL * max((peak.score for peak in search.peaks), default=0.0))
+        window = search.half, turn / 2
+        if search.done < search.slices:
+            peak = correlate(submap.grid(LEVELS), search.points, guess, window, ANYWHERE, least, work=WORK)
+            search.peaks += [] if peak is None else [peak]
+            search.done += 1
+            return False
+        self._search = None
+        best = _unique(search.peaks)
+        if best is None:
+            return False
+        # Once more round the best, for a place that looks alike from the same direction.
+        window = search.half, RIVAL_TURN
+        peak = correlate(submap.grid(LEVELS), search.points, best, window, ANYWHERE, MIN_SCORE, APART[0], WORK)
+        if peak is None or peak.rival > MAX_RIVAL * peak.score:
+            return False
+        keyframes.place(search.at, peak.pose)
+        self._checks = _checks(keyframes, search.at)
+        return False
+
+    def _check(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
+        """Verify the next keyframe where the place found puts it; give the place up when most do not fit."""
+        found = closer.join(keyframes, self._checks.pop(0))
+        self._failed += found is None
+        if self._failed > MOST_FAILED:
+            self._checks = []
+        if not self._checks:
+            self._failed = 0
+        return bool(found)
+
+    def forget(self) -> None:
+        """The keyframes have other numbers."""
+        self._whole, self._search, self._last, self._checks, self._failed = None, None, -1, [], 0
+
+    def _begin(self, keyframes: KeyframeMap, newest: int) -> _Search:
+        self._last = newest
+        cloud = self._submap(keyframes).cloud
+        low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+        half = float((high - low).max() / 2) + 1.0
+        _, query = surroundings(keyframes, newest)
+        points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
+        lever = float(np.clip(np.percentile(np.hypot(*points.T), 80), 1.0, 12.0))
+        blocks = (2 * half / RESOLUTION / (1 << (LEVELS - 1)) + 1) ** 2
+        work = math.tau * lever / RESOLUTION * blocks * len(points)
+        return _Search(newest, points, np.array((*((low + high) / 2), 0.0)), half, max(math.ceil(work / SLICE), 4))
+
+    def _submap(self, keyframes: KeyframeMap) -> Submap:
+        """The part that begins at the first keyframe."""
+        if self._whole is None or self._whole[0] != keyframes.begin:
+            numbers = np.flatnonzero(keyframes.joined())
+            numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), MAP_KEYS)).astype(np.intp)]
+            self._whole = keyframes.begin, keyframes.submap(numbers)
+        return self._whole[1]
+
+
+def _checks(keyframes: KeyframeMap, at: int) -> list[int]:
+    """Keyframes of the newest submap that have others of the map near, those before and after ``at`` first."""
+    known = keyframes.poses[keyframes.joined(), :2]
+    numbers = np.arange(keyframes.begin, len(keyframes))
+    off = keyframes.poses[numbers, None, :2] - known
+    near = numbers[np.hypot(off[..., 0], off[..., 1]).min(axis=1) < VIEW]
+    near = near[np.argsort(np.abs(near - at), kind="stable")][: CHECKS * CHECK_SPACING : CHECK_SPACING]
+    return [int(k) for k in near]
+
+
+def _unique(peaks: list[Peak]) -> Array | None:
+    """The best pose, if no other place is nearly as good."""
+    if not peaks:
+        return None
+    best = max(peaks, key=lambda peak: peak.score)
+    for peak in peaks:
+        off = between(best.pose, peak.pose)
+        elsewhere = math.hypot(off[0], off[1]) > APART[0] or abs(off[2]) > APART[1]
+        if elsewhere and peak.score > MAX_RIVAL * best.score:
+            return None
+    return best.pose
