@@ -37,8 +37,8 @@ class Gains:
     """Shape (m, 2 k): by the reference's slip and turn, period by period."""
     furthest: float
     """Greatest distance from the path that counts, m."""
-    cost: Array
-    """Shape (n, n): of an error, for all time."""
+    least: Array
+    """Shape (2, 2): cost of e and p for all time, with the axles where they are best."""
 
 
 class Lqr(PathTracker[LqrConfig]):
@@ -125,4 +125,5 @@ class GainTable:
             ahead = closed.T @ ahead
         single = m == 1 and steering != "crab"
         furthest = APPROACH * abs(feedback[0, 1] / feedback[0, 0]) if single else math.inf
-        return Gains(feedback, np.hstack(preview), furthest, cost)
+        least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
+        return Gains(feedback, np.hstack(preview), furthest, least)

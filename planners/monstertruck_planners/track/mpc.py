@@ -5,7 +5,8 @@ curved frame of the path; dead time is bridged by prediction, lag is in the mode
 are eliminated (condensed form), so the programme has one or two unknowns per period. One linearisation per step, about
 the last plan moved on (real-time iteration: Diehl, Bock and Schloeder, SIAM J. Control Optim. 43, 2005).
 
-The solver is OSQP, with settings that do not depend on measured time: equal inputs give equal outputs.
+Where the best plan without limits keeps them all it is the solution, exactly; only else OSQP looks for it, with
+settings that do not depend on measured time: equal inputs give equal outputs.
 """
 
 import math
@@ -33,6 +34,24 @@ APPROACH: Final = 0.3
 """Distance from the path that counts, as a share of the way to be driven."""
 GENTLE: Final = 1e-6
 """Weight that keeps inputs without effect where they are."""
+
+
+MOST_LAYOUTS: Final = 64
+"""Sequences of ways of steering kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What depends on the ways of steering of all periods alone."""
+
+    bases: Array
+    """Axle angles of each period's inputs, shape (k, 2, m); an input without effect has zeros."""
+    onto: Array
+    """Inputs of the first period by its axle angles, shape (m, 2)."""
+    effect: Array
+    """Axle angles in the middle of each fine step by the plan, shape (f, 2, k m)."""
+    weights: Array
+    """Of the squared errors, shape (2 f,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +88,7 @@ class Mpc(PathTracker[MpcConfig]):
         self._times = (np.arange(self._periods, dtype=np.float64) + 0.5) * self.period
         self._middles = (np.arange(self._fine, dtype=np.float64) + 0.5) * self._h
         self._lag, self._fading = self._responses()
+        self._layouts: dict[tuple[Steering, ...], Layout] = {}
         self._gains = GainTable(config, geometry, 1)
         self._solvers: dict[int, Solver] = {}
         self._plan: Array | None = None
@@ -84,28 +104,34 @@ class Mpc(PathTracker[MpcConfig]):
         """See the base class."""
         super().respond(response)
         self._lag, self._fading = self._responses()
+        self._layouts.clear()
 
     def steer(self, state: TrackingState) -> Angles:
         """Axle angles for the coming period."""
         modes = tuple(state.reference.steerings(state.distances(self._times)))
         modes = (state.steering, *modes[1:])
-        bases = self._bases(modes)
-        last = np.linalg.pinv(bases[0]) @ np.array(self.axles.requested)
+        layout = self._layout(modes)
+        last = layout.onto @ np.array(self.axles.requested)
         fine = state.reference.at(state.distances(self._middles))
-        nominal = self._nominal(state, modes, bases)
-        rollout = self._roll(state, fine, bases, nominal)
-        weights = self._weights(modes)
+        nominal = self._nominal(state, modes, layout.bases)
+        rollout = self._roll(state, fine, layout, nominal)
         end = self._end(state, modes[-1], rollout)
-        wanted = self._solve(rollout, weights, end, nominal, last)
+        wanted = self._solve(rollout, layout.weights, end, nominal, last)
         self._plan, self._planned = wanted, modes
-        front, rear = bases[0] @ wanted[0]
+        front, rear = layout.bases[0] @ wanted[0]
         return float(front), float(rear)
 
-    def _bases(self, modes: tuple[Steering, ...]) -> Array:
-        """Axle angles of each period's inputs, shape (k, 2, m); an input without effect has zeros."""
-        m = max(BASES[mode].shape[1] for mode in modes)
-        padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
-        return np.array([padded[mode] for mode in modes])
+    def _layout(self, modes: tuple[Steering, ...]) -> Layout:
+        known = self._layouts.get(modes)
+        if known is None:
+            if len(self._layouts) >= MOST_LAYOUTS:
+                self._layouts.clear()
+            m = max(BASES[mode].shape[1] for mode in modes)
+            padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
+            bases = np.array([padded[mode] for mode in modes])
+            effect = np.einsum("fk,kij->fikj", self._lag, bases).reshape(self._fine, 2, -1)
+            known = self._layouts[modes] = Layout(bases, np.linalg.pinv(bases[0]), effect, self._weights(modes))
+        return known
 
     def _nominal(self, state: TrackingState, modes: tuple[Steering, ...], bases: Array) -> Array:
         """Plan to linearise about, shape (k, m): the last one, one period on; else what the path asks for."""
@@ -125,9 +151,8 @@ class Mpc(PathTracker[MpcConfig]):
         risen = [1.0 - np.exp(-np.maximum(middle[:, None] - b, 0.0) / lag) for b in (begin, begin + self.period)]
         return risen[0] - risen[1], np.asarray(np.exp(-middle / lag))
 
-    def _roll(self, state: TrackingState, reference: ReferenceStates, bases: Array, plan: Array) -> Rollout:
-        asked = np.einsum("kij,kj->ki", bases, plan)
-        angles = self._fading[:, None] * np.array(state.angles) + self._lag @ asked
+    def _roll(self, state: TrackingState, reference: ReferenceStates, layout: Layout, plan: Array) -> Rollout:
+        angles = self._fading[:, None] * np.array(state.angles) + layout.effect @ plan.ravel()
         tangents = np.tan(np.clip(angles, -1.4, 1.4))
         slopes = 1.0 + tangents**2
         c, base = self.geometry.cg_split, self.geometry.wheelbase
@@ -136,7 +161,7 @@ class Mpc(PathTracker[MpcConfig]):
         turn = cosine * (tangents[:, 0] - tangents[:, 1]) / base
         errors = self._integrate(state, reference, turn, np.arctan(slip_tangent))
         # One column of axle angles per input, then sums along the way.
-        effect = np.einsum("fk,kij->fikj", self._lag, bases).reshape(self._fine, 2, -1) * slopes[:, :, None]
+        effect = layout.effect * slopes[:, :, None]
         ahead = (self._h * state.speeds(self._middles))[:, None]
         by_turn = np.cumsum(ahead * (cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
         halfway = by_turn - 0.5 * np.diff(by_turn, axis=0, prepend=0.0)
@@ -172,10 +197,9 @@ class Mpc(PathTracker[MpcConfig]):
         """What remains to be paid after the last period with the axles where they are best; None for crab."""
         if mode == "crab":
             return None
-        cost = self._gains.at(mode, float(state.speeds(self._times[-1:])[0]), self.response.lag).cost
-        least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
-        rows = [self._fine - 1, 2 * self._fine - 1]
-        return Terminal(rollout.errors[rows], rollout.by_plan[rows], least)
+        least = self._gains.at(mode, float(state.speeds(self._times[-1:])[0]), self.response.lag).least
+        ends = slice(self._fine - 1, None, self._fine)
+        return Terminal(rollout.errors[ends], rollout.by_plan[ends], least)
 
     def _solve(self, rollout: Rollout, weights: Array, end: Terminal | None, nominal: Array, last: Array) -> Array:
         """The best plan, shape (k, m)."""
@@ -208,6 +232,7 @@ class Solver:
         n = count * m
         change = np.eye(n) - np.eye(n, k=-m)
         weight = 1.0 / (period * config.rate_scale**2)
+        self._change = change
         self._smooth = weight * change.T @ change + GENTLE * np.eye(n)
         self._pull = weight
         self._m = m
@@ -235,6 +260,11 @@ class Solver:
         q = linear.copy()
         q[: self._m] -= self._pull * last
         p = quadratic + self._smooth
+        free = np.linalg.solve(p, -q)
+        changes = self._change @ free
+        changes[: self._m] -= last
+        if (np.abs(np.concatenate((free, changes))) <= -self._low).all():
+            return np.asarray(free)
         scale = 1.0 / max(float(np.abs(p).max()), 1e-12)
         low, high = self._low.copy(), -self._low
         first = slice(len(q), len(q) + self._m)
