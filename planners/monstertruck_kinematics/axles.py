@@ -4,7 +4,7 @@ An axle angle is everywhere that of an equivalent bicycle: its two wheels at the
 sideslip exactly (``FourWheelSteering``). ``IdealAxles`` have wheels that share one ICR, so each axle's angle is its
 own. The wheels of ``LinkedAxles`` share none: the body makes their least-squares motion (``linkage.common_motion``),
 which turns less than the mean of the wheels' tangents says (4WS at full lock by a tenth), and each axle's angle depends
-on the other a little. Calibration refines that by ``TurnDeficit``.
+on the other a little. ``TurnDeficit`` refines that.
 """
 
 from abc import ABC, abstractmethod
@@ -42,7 +42,7 @@ _MISS: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TurnDeficit:
-    """What calibration found the axles to turn less than the linkage says: dimensionless, 0 = as it says.
+    """What the axles turn less than the linkage says: dimensionless, 0 = as it says.
 
     The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and side; where the axles
     oppose each other, the turn becomes turn (1 + c t_f t_r), with a coefficient for each side to which the body turns.
@@ -123,7 +123,7 @@ class LinkedAxles(Axles):
         front: servo to wheels.
         rear: servo to wheels; None = its wheels are fixed straight ahead, and the rear axle angle is 0: the front one
             gives the turn, the sideslip of the rear axle's middle (0.5 deg at full lock) is neglected.
-        deficit: found by calibration.
+        deficit: what the axles turn less.
     """
 
     geometry: FourWheelSteering

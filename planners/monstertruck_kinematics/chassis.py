@@ -498,7 +498,7 @@ def truck_chassis(size: Dimensions, turn_deficit: Mapping[str, float] | None = N
 
     Args:
         size: the robot's.
-        turn_deficit: fields of ``TurnDeficit``, by calibration.
+        turn_deficit: fields of ``TurnDeficit``.
     """
     deficit = TurnDeficit(**turn_deficit) if turn_deficit and any(turn_deficit.values()) else None
     axles = LinkedAxles(size.centred, size.linkage.front, size.linkage.rear, deficit, ranges=size.servo_ranges)

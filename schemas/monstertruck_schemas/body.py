@@ -66,7 +66,7 @@ class TruckBody(BodyConfig):
 
     kind: Literal["truck"] = "truck"
     turn_deficit: TurnDeficit = TurnDeficit()
-    """Found by `calibrate steering`"""
+    """By circles to both sides, with each axle alone and with both"""
 
 
 class AckermannBody(BodyConfig):

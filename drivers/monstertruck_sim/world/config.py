@@ -76,8 +76,8 @@ class MotorConfig(Schema):
 class AxleConfig(Schema):
     """Linkage polynomials of one axle, rad, highest power first."""
 
-    left_from_servo: tuple[float, ...]
-    right_from_left: tuple[float, ...]
+    left_from_servo: Annotated[tuple[float, ...], Field(strict=False, min_length=2)]
+    right_from_left: Annotated[tuple[float, ...], Field(strict=False, min_length=2)]
 
 
 class LinkageConfig(Schema):

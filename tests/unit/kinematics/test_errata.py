@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.axles import LinkedAxles
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
 from monstertruck_kinematics.motion import twist_at
@@ -236,6 +237,13 @@ def test_2_52_has_the_wrong_sign_and_2_54_2_55_square_the_wrong_thing(front, rea
 # Skid-steer paper
 
 ROBOT = SkidSteer(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK - 0.01, -PUBLISHED_HALF_TRACK - 0.01, icr_x=-0.004)
+
+
+def test_2_35_wheels_of_the_linkage_share_no_centre():
+    linkage, bicycle = SteeringPolynomials(), FourWheelSteering()
+    axles = LinkedAxles(bicycle, linkage.front, linkage.rear)
+    assert bicycle.minimum_radius("counter", 0.4) == pytest.approx(0.378, abs=1e-3)
+    assert 1 / bicycle.curvature(*axles.angles(*linkage.servo_from_axles(0.4, -0.4))) == pytest.approx(0.422, abs=1e-3)
 
 
 def test_k5_turning_centre_has_both_signs_turned():
