@@ -22,6 +22,8 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 STOPPED: Final = 0.2
 """Chance that something stops a servo on its way to one side."""
+CHAIN: Final = 0.012
+"""From a command of the gate to the servo, s: the serial line, and half a frame of pulses."""
 START_UP: Final = 3.0
 """Seconds in which every device of the emulated truck is up."""
 
@@ -162,7 +164,9 @@ def hidden(
         truck["wheel_radius"] = 0.075 * rng.uniform(0.95, 1.05)
         truck["motor"] = {"ratio": rng.uniform(500, 680), "inverted": bool(rng.integers(2))}
     if "steering" in parts:
-        truck["front_servo"], truck["rear_servo"] = _servo(1, rng), _servo(0, rng)
+        own = np.random.default_rng([seed, 7])
+        answer = {"dead_time": own.uniform(0.0, 0.12), "lag": own.uniform(0.0, 0.06)}
+        truck["front_servo"], truck["rear_servo"] = _servo(1, rng) | answer, _servo(0, rng) | answer
     return with_overlay(config, {"sim": {"seed": seed, "world": world}})
 
 
@@ -199,6 +203,12 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
             f"{name}_left_travel": left,
             f"{name}_right_travel": right,
         }
+    servo = truck.front_servo
+    steering |= {
+        "dead_time": servo.dead_time + CHAIN,
+        "lag": servo.lag,
+        "delay": servo.dead_time + servo.lag + CHAIN,
+    }
     drive = config.devices.drive
     assert drive is not None
     return {

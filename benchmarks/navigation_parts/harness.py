@@ -146,7 +146,7 @@ def run(options: Options) -> Part:
     if options.data is not None:
         files += sorted((options.data / "maps").glob("*.yaml"))
     places = [place(file) for file in files]
-    count = min(options.segments, 2 * len(places)) if options.quick else options.segments
+    count = min(options.runs, 2 * len(places)) if options.quick else options.runs
     begin = time.process_time()
     rows = [trip(places[i % len(places)], np.random.default_rng([1, i])) for i in range(count)]
     possible = [row for row in rows if row["reason"] is not Reason.GOAL_UNREACHABLE or "away" in row]

@@ -83,6 +83,7 @@ class Result:
     longest_ms: float
     track: np.ndarray
     width: float = 0.0
+    lost: bool = False
 
 
 KINDS = {
@@ -94,6 +95,14 @@ KINDS = {
     "mpc": {"kind": "mpc"},
 }
 """Every kind with its defaults; pure pursuit looks ahead by its speed, as one distance cannot suit them all."""
+RESPONSES = {
+    "ideal": (0.0, 0.0, 50.0),
+    "lag": (0.05, 0.10, 5.0),
+    "dead_50": (0.05, 0.0, 50.0),
+    "dead_150": (0.15, 0.0, 50.0),
+    "lag_150": (0.0, 0.15, 5.0),
+}
+"""Dead time (s), lag (s) and greatest turning rate (rad/s) of the axles."""
 SPEEDS, AXLES, VERSIONS = (0.2, 0.5, 1.0), ("ideal", "lag"), ("forward", "backward", "cusps")
 TURNS = (0.0, 0.4, 0.25, 0.75, 0.6, 1.0)
 """Of the version with cusps: shares of the course between which it goes forward and backward."""
@@ -162,7 +171,7 @@ def drive(
     **more: object,
 ) -> Result:
     """One run from 5 cm to the left of the beginning."""
-    dead_time, lag, rate = (0.0, 0.0, 50.0) if axles == "ideal" else (0.05, 0.10, 5.0)
+    dead_time, lag, rate = RESPONSES[axles]
     config = ADAPTER.validate_python(
         {
             "rate": 1 / PERIOD,
@@ -209,6 +218,7 @@ def drive(
         rms=float(np.sqrt(np.mean(error**2))),
         worst=float(error.max()),
         ended=outcome is Reason.GOAL_REACHED,
+        lost=outcome is Reason.PATH_LOST,
         work_ms=1000 * float(np.median(work)),
         longest_ms=1000 * float(np.quantile(work, 0.99)),
         track=poses,

@@ -40,10 +40,14 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     ),
     "compass": tuple(f"{COMPASS}.{name}" for name in ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")),
     "drive": ("geometry.drive_ratio", "devices.drive.driver.inverted"),
-    "steering": tuple(
-        f"{STEERING}.{axle}.{name}"
-        for axle in ("front", "rear")
-        for name in ("centre_us", "scale_us_per_deg", "direction", "min_us", "max_us")
+    "steering": (
+        *(
+            f"{STEERING}.{axle}.{name}"
+            for axle in ("front", "rear")
+            for name in ("centre_us", "scale_us_per_deg", "direction", "min_us", "max_us")
+        ),
+        f"{STEERING}.dead_time",
+        f"{STEERING}.lag",
     ),
 }
 """Values of the configuration that each wizard may set; a calibration never touches any other."""

@@ -11,6 +11,7 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, Truc
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
@@ -75,8 +76,9 @@ class Mover:
             self._truck.subscribe(topics.STEERING, fifo(DEPTH)) as steering,
             self._truck.subscribe(topics.COMPASS, fifo(DEPTH)) as attitude,
             self._truck.subscribe(topics.GATE, fifo(DEPTH)) as gate,
+            self._truck.subscribe(topics.CMD_STEERING, fifo(DEPTH)) as commands,
         ):
-            run = _Run(self._truck, self._clock, (drive, steering, attitude, gate))
+            run = _Run(self._truck, self._clock, (drive, steering, attitude, gate, commands))
             async with self._armed(run):
                 if move.approach:
                     await run.hold(0.0, move.approach, move.approach, STEERING)
@@ -92,7 +94,10 @@ class Mover:
         run.track.left = self._clock.now()
         way, since = 0.0, self._clock.now()
         while True:
-            await run.hold(move.speed, move.front, move.rear, PERIOD)
+            side = 1
+            if move.weave:
+                side = -1 if (self._clock.now() - run.track.left) // round(move.weave * SECOND) % 2 else 1
+            await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
             new = abs(run.track.way(self._drivetrain))
             report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
@@ -123,7 +128,13 @@ class _Run:
         self,
         truck: Truck,
         clock: Clock,
-        feeds: tuple[Mailbox[DriveFeedback], Mailbox[SteeringFeedback], Mailbox[Attitude], Mailbox[GateState]],
+        feeds: tuple[
+            Mailbox[DriveFeedback],
+            Mailbox[SteeringFeedback],
+            Mailbox[Attitude],
+            Mailbox[GateState],
+            Mailbox[SteeringCommand],
+        ],
     ) -> None:
         self.track = MoveRecord()
         self.state: GateState | None = None
@@ -225,7 +236,8 @@ class _Run:
         self.track.arrived = still
 
     def _take(self) -> None:
-        drive, steering, attitude, gate = self._feeds
+        drive, steering, attitude, gate, commands = self._feeds
+        self.track.commands += commands.drain()
         self.track.drive += drive.drain()
         self.track.steering += [reading for reading in steering.drain() if reading.trusted]
         self.track.attitude += [reading for reading in attitude.drain() if not reading.heading_disturbed]

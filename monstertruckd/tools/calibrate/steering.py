@@ -15,6 +15,7 @@ from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
+from monstertruckd.tools.calibrate.response import estimates, response, weaves
 from monstertruckd.tools.calibrate.statistics import NORMAL
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
@@ -72,6 +73,8 @@ class SteeringWizard:
     """Straight runs along a string; 0 = there is none"""
     string_error: float = 0.0035
     """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
+    weaves: int = 3
+    """Times the truck weaves ahead and back, for dead time and lag"""
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
@@ -92,7 +95,10 @@ class SteeringWizard:
         travel = await self._travel(context, maps, model, first)
         legs += await self._straights(context, maps)
         legs += await self._circles(context, maps, travel)
-        return context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
+        weaving = [await context.move(move) for move in weaves(self.weaves)]
+        answer = context.fit("dead time and lag", lambda: response(weaving, chassis))
+        result = context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
+        return result.model_copy(update={"estimates": (*result.estimates, *estimates(answer))})
 
     # Driving
 

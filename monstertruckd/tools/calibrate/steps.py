@@ -12,6 +12,7 @@ from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.topics import Topic
 
@@ -26,6 +27,8 @@ class MoveRecord:
 
     drive: list[DriveFeedback] = field(default_factory=list)
     steering: list[SteeringFeedback] = field(default_factory=list)
+    commands: list[SteeringCommand] = field(default_factory=list)
+    """What the gate sent to the servos"""
     attitude: list[Attitude] = field(default_factory=list)
     left: int = 0
     """When the command to set off was given, ns"""
@@ -114,7 +117,7 @@ class Confirm:
 
 @dataclass(frozen=True, slots=True)
 class MoveStep:
-    """The truck drives with fixed steering, from rest to rest; it is disarmed before and after.
+    """The truck drives with fixed or weaving steering, from rest to rest; it is disarmed before and after.
 
     The wheels are turned while it stands, and it rests for a moment at both ends so that what is measured there can be
     averaged.
@@ -133,6 +136,8 @@ class MoveStep:
     """Seconds of standing still at each end"""
     approach: float = 0.0
     """Axle angle from which straight wheels are turned to where they shall be, rad: servos stop short of their goal"""
+    weave: float = 0.0
+    """Seconds after which the axle angles change their sign, again and again, while it drives; 0 = never"""
     done: Callable[[MoveRecord], bool] | None = None
     """Ends the way earlier"""
 

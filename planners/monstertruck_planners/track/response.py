@@ -43,7 +43,7 @@ CORRELATED: Final = 3.0
 TELLING: Final = 0.001
 """Turns whose predictions differ by less than this say nothing, rad."""
 MEMORY: Final = 150.0
-"""Telling turns after which the older ones count for a third."""
+"""Telling turns that are remembered while driving."""
 
 
 class Response(NamedTuple):
@@ -79,16 +79,19 @@ class ResponseEstimator:
     Args:
         geometry: the truck's.
         rate: greatest turning rate of the axles, rad/s.
+        lags: candidates, s.
+        memory: telling turns after which the older ones count for a third.
     """
 
-    def __init__(self, geometry: FourWheelSteering, rate: float) -> None:
+    def __init__(self, geometry: FourWheelSteering, rate: float, lags: Array = LAGS, memory: float = MEMORY) -> None:
         self._geometry = geometry
+        self._fade = 1.0 - 1.0 / memory
         self._rate = rate
         dead_times = CELL * np.arange(DEAD_TIMES)
-        self._dead_times, self._lags = np.broadcast_arrays(dead_times, LAGS[:, None])
+        self._dead_times, self._lags = np.broadcast_arrays(dead_times, lags[:, None])
         self._totals = self._dead_times + self._lags
         self._prior = 0.5 * ((self._totals - EXPECTED[0]) / EXPECTED[1]) ** 2
-        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
+        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in lags.tolist()]
         shape = self._totals.shape
         self._xx: Array = np.zeros(shape)
         self._xy: Array = np.zeros(shape)
@@ -107,9 +110,9 @@ class ResponseEstimator:
         """Turn per metre that is requested, rad/m."""
         self._most = math.inf
         """By which it can change in one cell, rad/m."""
-        self._curvatures = [0.0] * len(LAGS)
-        self._turns = [0.0] * len(LAGS)
-        self._history = np.zeros((len(LAGS), 4 * KEPT))
+        self._curvatures = [0.0] * len(self._keep)
+        self._turns = [0.0] * len(self._keep)
+        self._history = np.zeros((len(self._keep), 4 * KEPT))
         """Turn per metre, summed up over time, at the end of each cell, rad s/m."""
         self._end = 1
         """Cells written."""
@@ -181,7 +184,7 @@ class ResponseEstimator:
         return low + (cells - i) * (high - low)
 
     def _learn(self, x: Array, y: float, way: float) -> None:
-        fade = 1.0 - 1.0 / MEMORY
+        fade = self._fade
         self._xx = fade * self._xx + x * x
         self._xy = fade * self._xy + x * y
         self._xd = fade * self._xd + x * way
