@@ -69,9 +69,15 @@ class Trip:
         ]
 
 
-def travel(story: Callable[[Trip], Awaitable[None]], **overlay: Any) -> VirtualRig:
-    base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
-    config = with_overlay(with_overlay(base, QUICK), {"planner": {"local_planner": {"kind": "rsband"}}} | overlay)
+def travel(story: Callable[[Trip], Awaitable[None]], base: str | None = None, **overlay: Any) -> VirtualRig:
+    """Tell ``story`` by the truck of ``configs/goals.yaml`` with a small budget, or of the configuration ``base``."""
+    config = load_config(CONFIGS / (base or "goals.yaml"), SimulatedTruckConfig)[0]
+    if base is None:
+        overlay = {"planner": {"local_planner": {"kind": "rsband"}}} | overlay
+        config = with_overlay(config, QUICK)
+    else:
+        overlay = {name: QUICK[name] for name in ("recorder", "blackbox", "placement")} | overlay
+    config = with_overlay(config, overlay)
 
     async def main(clock: VirtualClock) -> VirtualRig:
         rig = VirtualRig(config, clock)

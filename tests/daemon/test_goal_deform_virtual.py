@@ -87,3 +87,17 @@ def test_where_all_ways_are_blocked_the_ladder_is_climbed_to_its_end():
         assert told[-1].severity is Severity.WARNING
 
     assert not travel(story).truth.array()[:, 5].any(), "collided"
+
+
+def test_the_published_set_up_comes_near_its_goal_and_touches_nothing():
+    """The yardstick keeps its published faults: at the goal it drives to and fro."""
+
+    async def story(trip: Trip) -> None:
+        await trip.goal(5.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(40.0)
+        assert trip.reasons()[:2] == [Reason.GOAL_ACCEPTED, Reason.ROUTE_FOUND]
+
+    truth = travel(story, base="as-published.yaml").truth.array()
+    assert not truth[:, 5].any(), "collided"
+    assert np.hypot(truth[:, 1] - 5.0, truth[:, 2] - 3.9).min() < 0.25
