@@ -1,6 +1,7 @@
-"""Where each of three methods says the robot was: wheels, kiss-icp seeded by them, and ours, in one configuration."""
+"""Where each method says the robot was: wheels, kiss-icp seeded by them, ours, ours with kiss-icp as scan matcher."""
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -11,7 +12,9 @@ import numpy as np
 from monstertruck_estimation.se2 import between, compose, transform
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
+from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
+from monstertruck_estimation.slam.scan_matcher import PlanarMatcher, ScanMatcher
 from monstertruck_estimation.slam.scans import prepare
 from slam_parts.kiss_alone import KissOdometry
 from slam_parts.logs import Log, load, scored
@@ -70,12 +73,12 @@ def kiss(log: Log) -> Run:
     return Run(log.name, "kiss-icp", log.stamps, np.array(poses[1:]), sum(times), 1e3 * float(np.median(times)))
 
 
-def ours(log: Log) -> Run:
+def ours(log: Log, front: Callable[[], ScanMatcher] = PlanarMatcher, method: str = "ours") -> Run:
     """Our mapper with its defaults, scan by scan, then the joint registration at the end."""
     warm = Mapper()
     for k in range(3):
         warm.step(prepare(log.ranges[0], log.geometry), k, np.zeros(3))
-    mapper, times, events = Mapper(), [], []
+    mapper, times, events = Mapper(front=front()), [], []
     longest = mapper.config.longest
     for stamp, ranges, odom in zip(log.stamps.tolist(), log.ranges, log.odom, strict=True):
         begin = time.thread_time()
@@ -107,7 +110,7 @@ def ours(log: Log) -> Run:
     ]
     return Run(
         log.name,
-        "ours",
+        method,
         stamps,
         poses,
         sum(times) + polish,
@@ -133,7 +136,13 @@ def graph_ms(mapper: Mapper) -> float | None:
     return 1e3 * float(np.median(times))
 
 
-METHODS = {"wheels": wheels, "kiss-icp": kiss, "ours": ours, "again": ours}
+def ours_by_kiss(log: Log) -> Run:
+    """Our mapper with kiss-icp as scan matcher (``front: kiss``)."""
+    return ours(log, KissMatcher, "front: kiss")
+
+
+COMPARED = {"wheels": wheels, "kiss-icp": kiss, "front: kiss": ours_by_kiss, "ours": ours}
+METHODS = COMPARED | {"again": ours}
 
 
 def job(folder: Path, name: str, method: str) -> Run:
@@ -143,7 +152,7 @@ def job(folder: Path, name: str, method: str) -> Run:
 
 def run(folder: Path, out: Path, names: tuple[str, ...]) -> tuple[dict[str, float], dict[str, float], bool]:
     """Print a table and draw plots; figures, goals, and whether all are met."""
-    methods = [(name, method) for name in names for method in ("wheels", "kiss-icp", "ours")]
+    methods = [(name, method) for name in names for method in COMPARED]
     again = "aces" if "aces" in names else names[0]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         tasks = {
@@ -154,12 +163,12 @@ def run(folder: Path, out: Path, names: tuple[str, ...]) -> tuple[dict[str, floa
     print(f"one configuration: {MapperConfig()}")
     for name in names:
         log = load(folder, name)
-        for method in ("wheels", "kiss-icp", "ours"):
+        for method in COMPARED:
             done = runs[name, method]
             score = scored(log, done.stamps, done.poses)
             _tell(log, done, score)
             figures |= _named(name, method, score | done.notes | {"scan_ms": done.scan_ms, "cpu_s": done.seconds})
-        draw(log, [runs[name, method] for method in ("wheels", "kiss-icp", "ours")], out / f"{name}.png")
+        draw(log, [runs[name, method] for method in COMPARED], out / f"{name}.png")
     first, second = runs[again, "ours"], runs[again, "again"]
     figures["differing_runs"] = float(first.poses.tobytes() != second.poses.tobytes())
     graphs = [done.notes["graph_ms"] for done in runs.values() if "graph_ms" in done.notes]
@@ -173,7 +182,7 @@ def run(folder: Path, out: Path, names: tuple[str, ...]) -> tuple[dict[str, floa
 
 
 def _named(name: str, method: str, score: dict[str, float]) -> dict[str, float]:
-    prefix = name if method == "ours" else f"{name}.{method}"
+    prefix = name if method == "ours" else f"{name}.{method.replace(': ', '_')}"
     return {f"{prefix}.{key}": round(value, 5) for key, value in score.items()}
 
 

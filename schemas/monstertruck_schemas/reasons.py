@@ -102,6 +102,7 @@ class Reason(StrEnum):
     SCAN_LEFT_OUT = "scan_left_out", 93, "a scan cannot be used"
     WHEEL_SLIP = "wheel_slip", 94, "the wheels do not hold the ground: scans or compass tell another motion"
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
+    WITNESS_DISAGREES = "witness_disagrees", 98, "another scan odometry measures another motion than the map's"
     OUTSIDE_MAP = "outside_map", 97, "what the scans see is nowhere on the saved map"
     WHEEL_GRIP = "wheel_grip", 0, "the wheels hold the ground again"
     HEADING_RETURNED = "heading_returned", 0, "the headings of the compass count again"

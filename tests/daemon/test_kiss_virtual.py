@@ -1,4 +1,4 @@
-"""Mapping with kiss-icp as scan matcher through the whole daemon: the pose stays true, health says that scans match."""
+"""Mapping with kiss-icp as scan matcher, and as witness, through the whole daemon: the pose is true, scans match."""
 
 from pathlib import Path
 
@@ -9,6 +9,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -22,11 +23,12 @@ CONFIG = Path(__file__).resolve().parents[2] / "configs" / "kiss.yaml"
 def test_the_demos_lap_is_mapped_by_kiss_icp():
     config, _ = load_config(CONFIG, SimulatedTruckConfig)
     assert config.slam.front == "kiss"
-    config = config.model_copy(update={"recorder": None, "map": None})
+    slam = config.slam.model_copy(update={"witness": "kiss"})
+    config = config.model_copy(update={"recorder": None, "map": None, "slam": slam})
 
     async def main(clock: VirtualClock) -> dict:
         rig = VirtualRig(config, clock)
-        boxes = {topic.name: rig.bus.subscribe(topic, fifo(20_000)) for topic in (topics.POSE, topics.SLAM)}
+        boxes = {topic.name: rig.bus.subscribe(topic, fifo(20_000)) for topic in (topics.POSE, topics.SLAM, topics.EVENT)}
         operator = LocalOperator(rig.daemon, clock)
         async with rig.running():
             await clock.sleep(1.5)
@@ -43,3 +45,4 @@ def test_the_demos_lap_is_mapped_by_kiss_icp():
     assert {message.standing for message in health} <= {LocalisationStatus.MAPPING, LocalisationStatus.DEGENERATE}
     assert np.mean([message.accepted for message in health[5:]]) > 0.95
     assert health[-1].keys > 5
+    assert Reason.WITNESS_DISAGREES not in {event.reason for event in drive[topics.EVENT.name]}

@@ -89,6 +89,8 @@ class SlamConfig(Schema):
     save_period: Positive = 60.0
     front: Literal["planar", "kiss"] = "planar"
     """Scan matcher"""
+    witness: Literal["kiss"] | None = None
+    """Scan odometry that the estimate is compared with; a difference of more than 0.2 m over 5 s is an event"""
     mapper: MapperConfig = MapperConfig()
     grid: GridConfig = GridConfig()
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1

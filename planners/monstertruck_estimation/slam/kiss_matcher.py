@@ -45,11 +45,11 @@ class KissMatcher:
         if submap is not self._submap:
             self._submap = submap
             self._map.clear()
-            self._map.add_points(_spatial(submap.cloud.points))
+            self._map.add_points(spatial(submap.cloud.points))
         found = self._registration.align_points_to_map(
-            points=_spatial(scan.points),
+            points=spatial(scan.points),
             voxel_map=self._map,
-            initial_guess=_matrix(guess),
+            initial_guess=matrix(guess),
             max_correspondance_distance=REACH,
             kernel=KERNEL,
         )
@@ -59,11 +59,13 @@ class KissMatcher:
         return gated(measure(scan, submap.cloud, pose), guess, covariance)
 
 
-def _spatial(points: Array) -> Array:
+def spatial(points: Array) -> Array:
+    """Points (n, 2) as points (n, 3) at height 0, m."""
     return np.column_stack((points, np.zeros(len(points))))
 
 
-def _matrix(pose: Array) -> Array:
+def matrix(pose: Array) -> Array:
+    """A planar pose (3,), m and rad, as a homogeneous matrix (4, 4)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     result = np.eye(4)
     result[:2, :2] = (c, -s), (s, c)

@@ -302,6 +302,9 @@ class SlamService:
                 estimate, outputs.counts, (self._left_out, self._scan.drops), self._clock.now(), self._health.next_seq()
             )
         )
+        if estimate.disagreement is not None:
+            text = f"by {estimate.disagreement:.2f} m over the last seconds"
+            self._events(Reason.WITNESS_DISAGREES, Severity.WARNING, self.name, text, distance=estimate.disagreement)
         if "closed" in estimate.events:
             self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, f"closure {outputs.counts['closures']}")
         if estimate.offset is not None and not self._offset_reported:

@@ -4,6 +4,7 @@ A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 from monstertruck_schemas.health import OdometryUse
 
+if TYPE_CHECKING:
+    from monstertruck_estimation.slam.kiss_witness import KissWitness
+
 MIN_POINTS = 3
 """A scan with fewer points is left out."""
 
@@ -27,6 +31,7 @@ class SlamWorker:
 
     def __init__(self) -> None:
         self._estimator: Estimator | None = None
+        self._witness: KissWitness | None = None
         self._longest = np.inf
         self._geometry: tuple[float, ...] | None = None
         self._newest: int | None = None
@@ -55,6 +60,8 @@ class SlamWorker:
                     refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
                 else:
                     made = estimator.step(scan, inputs.scan)
+                    if made is not None and self._witness is not None:
+                        made = replace(made, disagreement=self._witness.compare(scan, made))
                     if made is not None and MappingEvent.PRUNED in made.events:
                         give_back()
         if inputs.finish:
@@ -70,6 +77,7 @@ class SlamWorker:
         config = start.config
         settings = config.mapper
         self._longest = settings.longest
+        self._witness = _witness() if config.witness == "kiss" else None
         if config.mode == "localisation":
             assert config.map is not None
             self._estimator = LocalisationEstimator(storage.load(config.map), settings)
@@ -106,6 +114,12 @@ def matcher_of(kind: str) -> ScanMatcher | None:
     from monstertruck_estimation.slam.kiss_matcher import KissMatcher  # noqa: PLC0415  # its library is for this kind only
 
     return KissMatcher()
+
+
+def _witness() -> "KissWitness":
+    from monstertruck_estimation.slam.kiss_witness import KissWitness  # noqa: PLC0415  # its library is for this only
+
+    return KissWitness()
 
 
 def _warm_up() -> None:

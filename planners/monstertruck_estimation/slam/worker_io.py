@@ -132,6 +132,8 @@ class SlamEstimate:
     """Seconds by which odometry runs ahead of the scans; None = none found."""
     moved: ScanIncrement | None = None
     """None for the first scan, and after rejected matches."""
+    disagreement: float | None = None
+    """How far the witness's motion over the last seconds is off, m; None = not more than it may be, or no witness."""
     odometry: OdometryUse = OdometryUse.NONE
 
 

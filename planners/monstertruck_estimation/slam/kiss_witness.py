@@ -1,0 +1,76 @@
+"""A second opinion on the motion: scan odometry by kiss-icp on a map of its own, compared with the estimate.
+
+It shares nothing with the estimate but the points of the scans: no wheels, no submaps, no pose graph. Each guess is the
+motion before (Vizzo et al. 2023). It drifts, so only motions over some seconds are compared.
+"""
+
+import math
+from collections import deque
+from typing import Final
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.mapping import VoxelHashMap
+from kiss_icp.registration import get_registration
+
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.kiss_matcher import KERNEL, MAX_CORRECTION, PER_VOXEL, REACH, VOXEL, matrix, spatial
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.worker_io import SlamEstimate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.health import LocalisationStatus
+
+COMPARED: Final = 5 * SECOND
+"""Time over which motions are compared, ns."""
+MAX_DISAGREEMENT: Final = 0.2
+"""Difference of those that is reported, m."""
+JUMPS: Final = frozenset({"closed", "found", "refuted"})
+"""Events after which the estimate's next motion does not follow its last pose."""
+COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
+"""Elsewhere the estimate says itself that it is in doubt, or in a corridor, where scans do not constrain the motion."""
+
+
+class KissWitness:
+    """Compares the estimate's motion with that by kiss-icp alone."""
+
+    def __init__(self) -> None:
+        config = KISSConfig()
+        config.registration.max_num_threads = 1
+        self._registration = get_registration(config)
+        self._map = VoxelHashMap(VOXEL, MAX_CORRECTION, PER_VOXEL)
+        self._pose, self._motion = np.zeros(3), np.zeros(3)
+        self._poses: deque[tuple[int, Array, Array]] = deque()
+        """Stamp, pose by kiss-icp, pose of the estimate."""
+
+    def compare(self, scan: Scan, estimate: SlamEstimate) -> float | None:
+        """Take a scan with the estimate of its pose; how far both motions are apart, m, if that is too much."""
+        points = spatial(scan.points)
+        guess = compose(self._pose, self._motion)
+        found = matrix(guess)
+        if not self._map.empty():
+            found = self._registration.align_points_to_map(
+                points=points,
+                voxel_map=self._map,
+                initial_guess=matrix(guess),
+                max_correspondance_distance=REACH,
+                kernel=KERNEL,
+            )
+        if not np.isfinite(found).all():
+            found = matrix(guess)
+        self._map.update(points, found)
+        pose = np.array((found[0, 3], found[1, 3], math.atan2(found[1, 0], found[0, 0])))
+        self._motion, self._pose = between(self._pose, pose), pose
+        if estimate.status not in COMPARABLE or JUMPS.intersection(estimate.events):
+            self._poses.clear()
+            return None
+        self._poses.append((estimate.stamp, pose, np.array(estimate.pose)))
+        while estimate.stamp - self._poses[0][0] > COMPARED:
+            self._poses.popleft()
+        _, by_kiss, by_estimate = self._poses[0]
+        off = between(between(by_kiss, pose), between(by_estimate, np.array(estimate.pose)))
+        distance = math.hypot(off[0], off[1])
+        if distance <= MAX_DISAGREEMENT:
+            return None
+        self._poses.clear()
+        return distance
