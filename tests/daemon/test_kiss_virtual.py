@@ -28,7 +28,7 @@ def test_the_demos_lap_is_mapped_by_kiss_icp():
 
     async def main(clock: VirtualClock) -> dict:
         rig = VirtualRig(config, clock)
-        boxes = {topic.name: rig.bus.subscribe(topic, fifo(20_000)) for topic in (topics.POSE, topics.SLAM, topics.EVENT)}
+        boxes = {t.name: rig.bus.subscribe(t, fifo(20_000)) for t in (topics.POSE, topics.SLAM, topics.EVENT)}
         operator = LocalOperator(rig.daemon, clock)
         async with rig.running():
             await clock.sleep(1.5)
