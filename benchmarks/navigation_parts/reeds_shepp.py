@@ -6,10 +6,13 @@ import time
 import numpy as np
 from ompl import base as ob
 
+from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from navigation_parts import Options, Part
 
-PAIRS, PATHS, RADIUS = 10_000, 400, 0.757
+PAIRS, PATHS = 10_000, 400
+TWO, FOUR = Vehicle.truck("2ws"), Vehicle.truck("4ws")
+RADIUS = TWO.radius
 
 
 def run(options: Options) -> Part:
@@ -19,7 +22,7 @@ def run(options: Options) -> Part:
         np.column_stack((rng.uniform(-5, 5, (PAIRS, 2)), rng.uniform(-math.pi, math.pi, PAIRS))) for _ in range(2)
     )
     begin = time.perf_counter()
-    ours, truck = ReedsShepp(RADIUS), ReedsShepp(0.378, crab_angle=0.4)
+    ours, truck = ReedsShepp(RADIUS), ReedsShepp(FOUR.radius, FOUR.crab_angle)
     ours.path(starts[0], goals[0]).sample(0.1)
     ours.distance(starts, goals)
     truck.distance(starts, goals)

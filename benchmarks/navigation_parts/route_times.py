@@ -22,7 +22,8 @@ from navigation_parts.unseen_maps import free_pose
 
 MAP = "nav2_100by100_10"
 FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)
-RADIUS = 0.4385
+RADIUS = Vehicle.truck("4ws").radius
+"""The least circle of the truck, m."""
 LIMIT = 10.0
 """Of BIT*, s."""
 CLI_STARTS = 3

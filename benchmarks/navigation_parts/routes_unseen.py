@@ -1,4 +1,7 @@
-"""Routes on maps drawn by seed: both axles against front steering, turning round in corridors, exhausted lattices."""
+"""Routes on maps drawn by seed: both axles against front steering, turning round in corridors, exhausted lattices.
+
+Both vehicles turn on the truck's least circle, so only translations tell them apart.
+"""
 
 import math
 import time
@@ -15,18 +18,18 @@ from navigation_parts import Options, Part
 from navigation_parts.unseen_maps import free_pose, unseen_map
 
 FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)
-RADIUS_2WS = 0.4385
+TRUCK = Vehicle.truck("4ws")
 CUSPS = 8
 """Goal where 0.8 m are free."""
 
 
 def run(options: Options) -> Part:
     part = Part()
-    both = Vehicle.truck("4ws")
+    front = Vehicle(FOOTPRINT, TRUCK.radius, 0.0, "front")
     planners = {
-        "2ws": HybridPlanner(Vehicle(FOOTPRINT, RADIUS_2WS, 0.0, "front")),
-        "4ws": HybridPlanner(Vehicle(FOOTPRINT, min(both.radius, RADIUS_2WS), both.crab_angle, "counter")),
-        "lattice": LatticePlanner(Vehicle(FOOTPRINT, RADIUS_2WS, 0.0, "front")),
+        "2ws": HybridPlanner(front),
+        "4ws": HybridPlanner(Vehicle(FOOTPRINT, TRUCK.radius, TRUCK.crab_angle, "counter")),
+        "lattice": LatticePlanner(front),
     }
     for planner in planners.values():
         warm_up(planner)

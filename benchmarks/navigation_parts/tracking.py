@@ -4,6 +4,9 @@ The plant is a kinematic bicycle about the rear axle, wheelbase 0.30 m, steering
 started 5 cm to the left. "ideal" steers at once; "lag" has 50 ms dead time, 0.10 s lag and 5 rad/s. The error is the
 rear axle's distance from the course, the first 5 % of the way left out. Forward and backward the speed is held; with
 cusps it follows what the tracker asks for with at most 1 m/s^2.
+
+A run has arrived if the tracker ended it and the rear axle came within ``ARRIVED`` of the course's end: where it stands
+with cusps, where it passes by at held speed (which the tracker cannot bring to rest, so it says ``goal_missed``).
 """
 
 import math
@@ -37,6 +40,11 @@ PEERS = {
 """Best RMS and best worst error of PythonRobotics, mm."""
 MUST_ARRIVE = {"pure_pursuit", "stanley", "fuzzy", "lqr", "mpc"}
 """The published fuzzy rules are here for comparison only."""
+ARRIVED = 0.05
+"""Distance from the course's end, m: as far as every run begins from the course."""
+ENDED = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
+TAIL = 50
+"""Steps before the end of a run at held speed in which it passes the course's end."""
 
 
 @dataclass
@@ -78,12 +86,18 @@ class Result:
 
     rms: float
     worst: float
-    ended: bool
+    end: float
+    """Distance from the course's end; infinite where the tracker did not end the run."""
     work_ms: float
     longest_ms: float
     track: np.ndarray
     width: float = 0.0
     lost: bool = False
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the end was met."""
+        return self.end <= 1000 * ARRIVED
 
 
 KINDS = {
@@ -211,13 +225,15 @@ def drive(
             plant.step(command.front, command.rear)
             track.append(plant.pose)
     poses = np.array(track)
+    met = poses[-1:, :2] if version == "cusps" else poses[-TAIL:, :2]
+    end = float(distance(points[-1:], met)[0]) if len(met) > 1 else math.dist(points[-1], met[0])
     past = (poses[:, :2] - points[-1]) @ (points[-1] - points[-2]) > 0  # held speed runs over the end
     poses = poses[: len(poses) - int(np.argmin(past[::-1]))]
     error = 1000 * distance(poses[len(poses) // 20 :, :2], points)
     return Result(
         rms=float(np.sqrt(np.mean(error**2))),
         worst=float(error.max()),
-        ended=outcome is Reason.GOAL_REACHED,
+        end=1000 * end if outcome in ENDED else math.inf,
         lost=outcome is Reason.PATH_LOST,
         work_ms=1000 * float(np.median(work)),
         longest_ms=1000 * float(np.quantile(work, 0.99)),
@@ -255,18 +271,18 @@ def report(part: Part, table: dict) -> None:
     best = {}
     for column in columns:
         row = {name: table[(*column, name)] for name in KINDS}
-        cells = "".join(f"{'' if r.ended else 'x'}{r.rms:8.1f}/{r.worst:6.1f}".rjust(17) for r in row.values())
+        cells = "".join(f"{'' if r.arrived else 'x'}{r.rms:8.1f}/{r.worst:6.1f}".rjust(17) for r in row.values())
         print(f"{column[0]:>14} {column[1]:4} {column[2]:>6} {column[3]:>8}{cells}")
-        arrived = {name: r for name, r in row.items() if r.ended}
+        arrived = {name: r for name, r in row.items() if r.arrived}
         best[column] = min(arrived.values(), key=lambda r: r.rms) if arrived else None
     for name in KINDS:
         runs = [r for key, r in table.items() if key[4] == name]
-        part.add(f"{name}.not_arrived", sum(not r.ended for r in runs), 0 if name in MUST_ARRIVE else None)
+        part.add(f"{name}.not_arrived", sum(not r.arrived for r in runs), 0 if name in MUST_ARRIVE else None)
+        part.add(f"{name}.off_the_end_max_mm", max(r.end for r in runs))
         part.add(f"{name}.step_ms", float(np.median([r.work_ms for r in runs])))
         part.add(f"{name}.step_p99_ms", max(r.longest_ms for r in runs))
-        print(
-            f"{name}: step {part.figures[f'{name}.step_ms']:.2f} ms, p99 {part.figures[f'{name}.step_p99_ms']:.2f} ms"
-        )
+        off, step, slow = (part.figures[f"{name}.{key}"] for key in ("off_the_end_max_mm", "step_ms", "step_p99_ms"))
+        print(f"{name}: at most {off:.0f} mm off the end; step {step:.2f} ms, p99 {slow:.2f} ms")
     for (course, speed, axles, version), found in best.items():
         if found is None:
             part.add(f"{course}.{speed}.{axles}.{version}.arrived", 1, 0)

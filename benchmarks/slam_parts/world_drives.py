@@ -22,7 +22,7 @@ from monstertruck_sim.world.world import World
 Route = tuple[tuple[float, float], ...]
 
 TICK = SECOND // 100
-SPEED, LOOKAHEAD, STEEPEST = 0.3, 0.45, 0.42
+SPEED, LOOKAHEAD = 0.3, 0.45
 BEAM = 2 * math.pi / 1024
 SWEEP = SECOND // 10
 RIG_NOISE = 9
@@ -103,9 +103,10 @@ class Pilot:
         dx, dy = line[ahead] - pose[:2]
         side = -math.sin(pose[2]) * dx + math.cos(pose[2]) * dy
         curvature = 2 * side / max(dx * dx + dy * dy, 0.01)
-        angle = min(max(math.atan(curvature * self.chassis.bicycle.wheelbase / 2), -STEEPEST), STEEPEST)
-        self.servos = self.chassis.servos(angle, -angle)
-        speed = 0.0 if nearest >= len(line) - 3 else self.chassis.shaft_speeds(SPEED, angle, -angle)[0]
+        angle = math.atan(curvature * self.chassis.bicycle.wheelbase / 2)
+        angles = self.chassis.reached((angle, -angle))
+        self.servos = self.chassis.servos(*angles)
+        speed = 0.0 if nearest >= len(line) - 3 else self.chassis.shaft_speeds(SPEED, *angles)[0]
         return self.chassis.drivetrain.motor_angle(speed) * 30 / math.pi
 
 
