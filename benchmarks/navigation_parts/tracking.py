@@ -12,15 +12,17 @@ with cusps, where it passes by at held speed (which the tracker cannot bring to 
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
-from monstertruck_planners.track.path_tracker import TruckState
+from monstertruck_planners.track.path_tracker import PathTracker, TruckState
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
@@ -88,11 +90,21 @@ class Result:
     worst: float
     end: float
     """Distance from the course's end; infinite where the tracker did not end the run."""
-    work_ms: float
-    longest_ms: float
+    steps_ms: np.ndarray
+    """Processor time of every step."""
     track: np.ndarray
     width: float = 0.0
     lost: bool = False
+
+    @property
+    def work_ms(self) -> float:
+        """Median of a step."""
+        return float(np.median(self.steps_ms))
+
+    @property
+    def longest_ms(self) -> float:
+        """99th percentile of a step."""
+        return float(np.quantile(self.steps_ms, 0.99))
 
     @property
     def arrived(self) -> bool:
@@ -182,9 +194,10 @@ def drive(
     axles: str,
     version: str,
     geometry: FourWheelSteering = YARDSTICK,
+    build: Callable[[AnyTracker, FourWheelSteering], PathTracker[Any]] = build_tracker,
     **more: object,
 ) -> Result:
-    """One run from 5 cm to the left of the beginning."""
+    """One run from 5 cm to the left of the beginning, by the tracker that ``build`` makes."""
     dead_time, lag, rate = RESPONSES[axles]
     config = ADAPTER.validate_python(
         {
@@ -203,7 +216,7 @@ def drive(
             **more,
         }
     )
-    tracker = build_tracker(config, geometry)
+    tracker = build(config, geometry)
     plant = Plant(geometry, dead_time, lag, rate, config.angle)
     yaw = math.atan2(*(points[1] - points[0])[::-1])
     x, y = points[0] + 0.05 * np.array([-math.sin(yaw), math.cos(yaw)])
@@ -212,6 +225,7 @@ def drive(
     path = SegmentedPath(route(points, version), plant.pose, config.beyond)
     progress, track, work, outcome = path.start, [plant.pose], [], Reason.DRIVING
     plant.speed = 0.0 if version == "cusps" else direction * speed
+    tracker.prepare(path, progress)
     for k in range(round(5 * path.length / speed / PERIOD) + 200):
         begin = time.thread_time()
         command = tracker.control(TruckState(plant.pose, plant.speed), path, progress, k * PERIOD)
@@ -235,8 +249,7 @@ def drive(
         worst=float(error.max()),
         end=1000 * end if outcome in ENDED else math.inf,
         lost=outcome is Reason.PATH_LOST,
-        work_ms=1000 * float(np.median(work)),
-        longest_ms=1000 * float(np.quantile(work, 0.99)),
+        steps_ms=1000 * np.array(work),
         track=poses,
         width=swept(poses[len(poses) // 20 :], points),
     )

@@ -22,7 +22,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.error_model import BASES, LEAST_LAG
 from monstertruck_planners.track.lqr import GainTable
-from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
+from monstertruck_planners.track.path_tracker import STEEPEST, Angles, PathTracker, TrackingState
 from monstertruck_planners.track.response import Response
 from monstertruck_planners.track.segments import ReferenceStates
 from monstertruck_schemas.plan import Steering
@@ -153,30 +153,31 @@ class Mpc(PathTracker[MpcConfig]):
 
     def _roll(self, state: TrackingState, reference: ReferenceStates, layout: Layout, plan: Array) -> Rollout:
         angles = self._fading[:, None] * np.array(state.angles) + layout.effect @ plan.ravel()
-        tangents = np.tan(np.clip(angles, -1.4, 1.4))
+        tangents = np.tan(np.minimum(np.maximum(angles, -STEEPEST), STEEPEST))
         slopes = 1.0 + tangents**2
         c, base = self.geometry.cg_split, self.geometry.wheelbase
         slip_tangent = (1.0 - c) * tangents[:, 0] + c * tangents[:, 1]
         cosine = 1.0 / np.sqrt(1.0 + slip_tangent**2)
         turn = cosine * (tangents[:, 0] - tangents[:, 1]) / base
-        errors = self._integrate(state, reference, turn, np.arctan(slip_tangent))
+        steps = self._h * state.speeds(self._middles)
+        errors = self._integrate(state, reference, turn, np.arctan(slip_tangent), steps)
         # One column of axle angles per input, then sums along the way.
         effect = layout.effect * slopes[:, :, None]
-        ahead = (self._h * state.speeds(self._middles))[:, None]
-        by_turn = np.cumsum(ahead * (cosine / base)[:, None] * (effect[:, 0] - effect[:, 1]), axis=0)
-        halfway = by_turn - 0.5 * np.diff(by_turn, axis=0, prepend=0.0)
-        by_slip = (cosine**2)[:, None] * ((1.0 - c) * effect[:, 0] + c * effect[:, 1])
-        by_side = np.cumsum(ahead * (halfway + by_slip), axis=0)
-        return Rollout(errors, np.vstack((by_side, by_turn)))
+        by_step = (steps * cosine / base)[:, None] * (effect[:, 0] - effect[:, 1])
+        by_turn = by_step.cumsum(axis=0)
+        by_slip = (steps * cosine**2)[:, None] * ((1.0 - c) * effect[:, 0] + c * effect[:, 1])
+        by_side = (steps[:, None] * (by_turn - 0.5 * by_step) + by_slip).cumsum(axis=0)
+        return Rollout(errors, np.concatenate((by_side, by_turn)))
 
-    def _integrate(self, state: TrackingState, reference: ReferenceStates, turn: Array, slip: Array) -> Array:
-        """Errors along the plan in the path's curved frame."""
+    def _integrate(
+        self, state: TrackingState, reference: ReferenceStates, turn: Array, slip: Array, steps: Array
+    ) -> Array:
+        """Errors along the plan in the path's curved frame; ``steps`` are the metres of the fine steps."""
         furthest = APPROACH * float(state.distances(self._times[-1:])[0] - state.s)
         side, turned = min(max(state.lateral_error, -furthest), furthest), state.heading_error
-        steps = self._h * state.speeds(self._middles)
         bend = state.segment.direction * reference.curvature
         sides, yaws = [], []
-        rows = np.column_stack((turn, slip - reference.slip, reference.turn, bend, steps)).tolist()
+        rows = np.array((turn, slip - reference.slip, reference.turn, bend, steps)).T.tolist()
         for body_turn, beside, wanted_turn, curvature, ahead in rows:
             along = math.cos(turned + beside) / max(1.0 - curvature * side, 0.2)
             gained = ahead * (body_turn - wanted_turn * along)
