@@ -20,7 +20,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, inverse, rotation, transform
-from monstertruck_estimation.slam.correlation import Submap, correlate, merged
+from monstertruck_estimation.slam.budget import (
+    EDGE,
+    EDGE_OPTIMISED,
+    ELEMENT,
+    VERIFIED,
+    Budget,
+    Pieces,
+    Progress,
+    finished,
+)
+from monstertruck_estimation.slam.correlation import Submap, correlate, look_ups, merged
 from monstertruck_estimation.slam.graph import optimise, residuals, robust_weights
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.registration import measure, register
@@ -48,6 +58,8 @@ QUERY_CELL: Final = 0.1
 """About one of their points is used per square of this edge, m."""
 QUERY_POINTS: Final = 320
 """Points of the query at most."""
+WORK: Final = 40_000
+"""Blocks looked at in one search below the coarsest level, at most."""
 PLACE_KEYS: Final = 60
 """Keyframes of the place it is searched in, at most."""
 MIN_SCORE: Final = 0.45
@@ -98,6 +110,8 @@ MAX_AGE: Final = 60
 """Keyframes after which a match without support is dropped."""
 SEARCH_INTERVAL: Final = 4
 """Keyframes between two searches in the same place."""
+MOST_WAITING: Final = 20
+"""Keyframes that wait for their search, at most."""
 MAX_STRAINED: Final = 0.02
 """Share of the edges that may become outliers before a closure is removed."""
 
@@ -118,42 +132,70 @@ class LoopCloser:
     def __init__(self) -> None:
         self._hits: list[LoopMatch] = []
         self._tried: dict[int, int] = {}
-        self._fingerprints: list[Array] = []
+        self._fingerprints: dict[int, Array] = {}
+        self._waiting: list[int] = []
+        self._progress: Progress[bool] | None = None
         self.searches = 0
         """Searches made."""
         self.refused = 0
         """Closures removed because the optimised graph rejected them."""
 
-    def close(self, keyframes: KeyframeMap) -> bool:
-        """Search for loops from the newest keyframe; True if a closure has moved the poses."""
-        newest = len(keyframes) - 1
-        own, query = surroundings(keyframes, newest)
-        while len(self._fingerprints) < newest:
-            self._fingerprints.append(np.zeros_like(describe(query.points)))
-        self._fingerprints.append(describe(query.points))
-        covariances, far = keyframes.drift(newest)
-        self._hits = [hit for hit in self._hits if newest - hit.target < MAX_AGE]
-        self._tried = {place: when for place, when in self._tried.items() if newest - when < SEARCH_INTERVAL}
-        for candidate in self._candidates(keyframes, newest, covariances, far):
-            self._tried[candidate] = newest
-            window = _window(covariances[candidate])
-            hit = self._search(keyframes, query, own, newest, candidate, window)
-            sure = window[0] <= SMALL_WINDOW[0] and window[1] <= SMALL_WINDOW[1]
-            if hit is not None and self._accepted(keyframes, hit, sure=sure):
+    @property
+    def busy(self) -> bool:
+        """Whether a search is on its way."""
+        return self._progress is not None
+
+    def watch(self, at: int) -> None:
+        """Search from keyframe ``at`` in its turn; beyond ``MOST_WAITING`` the oldest are dropped."""
+        self._waiting = [*self._waiting, at][-MOST_WAITING:]
+
+    def step(self, keyframes: KeyframeMap, budget: Budget) -> bool:
+        """Continue the searches; True if a closure has moved the poses."""
+        while self._progress is not None or self._waiting:
+            if self._progress is None:
+                self._progress = Progress(self._close(keyframes, self._waiting.pop(0)))
+            if not self._progress.run(budget):
+                return False
+            closed, self._progress = self._progress.result, None
+            if closed:
                 return True
         return False
 
-    def join(self, keyframes: KeyframeMap, at: int) -> bool | None:
+    def _close(self, keyframes: KeyframeMap, at: int) -> Pieces[bool]:
+        """Search for loops from keyframe ``at``; True if a closure has moved the poses."""
+        yield 2 * EDGE * len(keyframes.edges)
+        own, query = surroundings(keyframes, at)
+        self._fingerprints[at] = describe(query.points)
+        covariances, far = keyframes.drift(at)
+        self._hits = [hit for hit in self._hits if at - hit.target < MAX_AGE]
+        self._tried = {place: when for place, when in self._tried.items() if at - when < SEARCH_INTERVAL}
+        for candidate in self._candidates(keyframes, at, covariances, far):
+            self._tried[candidate] = at
+            window = _window(covariances[candidate])
+            hit = yield from self._search(keyframes, query, own, at, candidate, window)
+            if hit is None:
+                continue
+            sure = window[0] <= SMALL_WINDOW[0] and window[1] <= SMALL_WINDOW[1]
+            yield EDGE_OPTIMISED * len(keyframes.edges)
+            if self._accepted(keyframes, hit, sure=sure):
+                return True
+        return False
+
+    def join(self, keyframes: KeyframeMap, at: int) -> Pieces[bool | None]:
         """Verify keyframe ``at`` of the newest submap where it is in the map that the submap is apart from.
 
         Like a match of a wide search it needs the support of others. True if the submap was joined, False if the match
         waits for others, None if there is none.
         """
+        yield 2 * EDGE * len(keyframes.edges)
         numbers = np.flatnonzero(keyframes.joined())
         candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
         own, query = surroundings(keyframes, at)
-        hit = self._search(keyframes, query, own, at, candidate, MARGIN, least=JOIN_OVERLAP)
-        return None if hit is None else self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE)
+        hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=JOIN_OVERLAP)
+        if hit is None:
+            return None
+        yield EDGE_OPTIMISED * len(keyframes.edges)
+        return self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE)
 
     def review(self, keyframes: KeyframeMap) -> bool:
         """Search from all keyframes (seconds of work) for places of which only a part was seen before.
@@ -175,7 +217,10 @@ class LoopCloser:
         """Only the marked keyframes are kept, with new numbers."""
         self._hits.clear()
         self._tried.clear()
-        self._fingerprints = [one for one, left in zip(self._fingerprints, kept.tolist(), strict=False) if left]
+        self._waiting.clear()
+        self._progress = None
+        number = np.cumsum(kept) - 1
+        self._fingerprints = {int(number[k]): one for k, one in self._fingerprints.items() if kept[k]}
 
     def _partial_match(self, keyframes: KeyframeMap, at: int) -> LoopMatch | None:
         """Keyframe ``at`` found near the likeliest place before it, if little else is possible."""
@@ -188,7 +233,7 @@ class LoopCloser:
             return None
         own, query = surroundings(keyframes, at)
         tries = (
-            self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True)
+            finished(self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True))
             for wider in PART_WIDER
         )
         return next((hit for hit in tries if hit is not None), None)
@@ -200,6 +245,7 @@ class LoopCloser:
             return []
         first = int(numbers[0])
         elsewhere = np.sort(numbers[_distance(keyframes, first)[numbers] > VIEW])
+        elsewhere = elsewhere[[int(k) in self._fingerprints for k in elsewhere]]
         if not len(elsewhere):
             return [first]
         alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
@@ -230,7 +276,7 @@ class LoopCloser:
         *,
         part: bool = False,
         least: float = MIN_OVERLAP,
-    ) -> LoopMatch | None:
+    ) -> Pieces[LoopMatch | None]:
         """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``."""
         self.searches += 1
         window = min(window[0], MAX_WINDOW[0]), min(window[1], MAX_WINDOW[1])
@@ -241,13 +287,18 @@ class LoopCloser:
         if not len(numbers):
             return None
         numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
+        yield EDGE * len(keyframes.edges) + ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
         submap = keyframes.submap(numbers)
+        yield submap.grid_cost(LEVELS)
+        grid = submap.grid(LEVELS)
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
         guess = keyframes.poses[at]
         score = PART_SCORE if part else MIN_SCORE
-        peak = correlate(submap.grid(LEVELS), query.points, guess, window, deviation, score, MIN_SEPARATION)
+        yield look_ups(query.points, window, LEVELS)
+        peak = correlate(grid, query.points, guess, window, deviation, score, MIN_SEPARATION, WORK)
         if peak is None or peak.rival > MAX_RIVAL * peak.score:
             return None
+        yield VERIFIED
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import rotation
+from monstertruck_estimation.slam.budget import CELL, DRAWN
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
@@ -74,6 +75,12 @@ class Peak:
     """Best score of a clearly different pose in the window; 0 if none came near."""
 
 
+def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
+    """Look-ups of the coarsest level when ``points``, shape (n, 2), are searched for in ``window`` (m, rad)."""
+    block = RESOLUTION * min(1 << (levels - 1), max(math.ceil(2 * window[0] / RESOLUTION), 1))
+    return 2 * window[1] / RESOLUTION * _lever(points) * (2 * window[0] / block + 1) ** 2 * len(points)
+
+
 def correlate(
     grid: LikelihoodGrid,
     points: Array,
@@ -98,8 +105,7 @@ def correlate(
     """
     if not len(points):
         return None
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    lever = float(np.clip(np.percentile(ranges, 80), 1.0, 12.0))
+    lever = _lever(points)
     step = RESOLUTION / lever
     half = math.ceil(window[1] / step)
     turns = np.arange(-half, half + 1) * step
@@ -118,6 +124,11 @@ def correlate(
     return Peak(pose, float(score), float(rival))
 
 
+def _lever(points: Array) -> float:
+    """Typical range of ``points``, m: a yaw moves them by so much per radian."""
+    return float(np.clip(np.percentile(np.hypot(points[:, 0], points[:, 1]), 80), 1.0, 12.0))
+
+
 @njit(cache=True)
 def _stamp(grid, points, normals, extents, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     for i in range(points.shape[0]):
@@ -133,21 +144,26 @@ def _stamp(grid, points, normals, extents, x0, y0):  # type: ignore[no-untyped-d
 def _dot(grid, px, py):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     half = 4
     cx, cy = int(px), int(py)
+    # The exponential of a sum is a product: one factor per column and one per row.
+    along = np.empty(2 * half + 1)
+    for k in range(2 * half + 1):
+        dx = (cx - half + k + 0.5 - px) * RESOLUTION
+        along[k] = math.exp(-0.5 * dx * dx / (SMEAR * SMEAR))
     for gy in range(cy - half, cy + half + 1):
-        for gx in range(cx - half, cx + half + 1):
-            dx, dy = (gx + 0.5 - px) * RESOLUTION, (gy + 0.5 - py) * RESOLUTION
-            value = np.uint8(255 * math.exp(-0.5 * (dx * dx + dy * dy) / (SMEAR * SMEAR)))
-            grid[gy, gx] = max(grid[gy, gx], value)
+        dy = (gy + 0.5 - py) * RESOLUTION
+        across = 255 * math.exp(-0.5 * dy * dy / (SMEAR * SMEAR))
+        for k in range(2 * half + 1):
+            value = np.uint8(across * along[k])
+            grid[gy, cx - half + k] = max(grid[gy, cx - half + k], value)
 
 
-@njit(cache=True)
-def _pool(source, target, step):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    rows, columns = source.shape
-    for y in range(rows):
-        y2 = min(y + step, rows - 1)
-        for x in range(columns):
-            x2 = min(x + step, columns - 1)
-            target[y, x] = max(source[y, x], source[y, x2], source[y2, x], source[y2, x2])
+def _pool(source: NDArray[np.uint8], target: NDArray[np.uint8], step: int) -> None:
+    """Maximum of each cell and those ``step`` further right, up, and both; the last row and column continue outside."""
+    right = source.copy()
+    np.maximum(source[:, :-step], source[:, step:], out=right[:, :-step])
+    np.maximum(source[:, -step:], source[:, -1:], out=right[:, -step:])
+    np.maximum(right[:-step], right[step:], out=target[:-step])
+    np.maximum(right[-step:], right[-1:], out=target[-step:])
 
 
 @njit(cache=True)
@@ -278,6 +294,13 @@ class Submap:
 
     cloud: Cloud
     _grids: dict[int, LikelihoodGrid] = field(default_factory=dict)
+
+    def grid_cost(self, levels: int) -> float:
+        """Work of making that grid; 0 once it is made."""
+        if levels in self._grids:
+            return 0.0
+        edges = (self.cloud.points.max(axis=0) - self.cloud.points.min(axis=0)) / RESOLUTION + (2 << (levels - 1))
+        return DRAWN * len(self.cloud.points) + CELL * levels * float(edges.prod())
 
     def grid(self, levels: int) -> LikelihoodGrid:
         """Likelihood pyramid of at least this many levels."""

@@ -226,8 +226,8 @@ class KeyframeMap:
 
     def place(self, at: int, pose: Array) -> None:
         """Move the newest submap, joined to nothing, so that its keyframe ``at`` is at ``pose``, shape (3,)."""
-        submap = slice(self.begin, None)
-        self.poses[submap] = compose(pose, between(self.poses[at], self.poses[submap]))
+        moved = compose(pose, between(self.poses[at], self.poses[self.begin :]))
+        self.poses = np.vstack((self.poses[: self.begin], moved))
 
     def joined(self) -> NDArray[np.bool_]:
         """Which keyframes are related to the first one, shape (n,)."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
+from monstertruck_estimation.slam.budget import Budget
 from monstertruck_estimation.slam.closure import PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
@@ -154,8 +155,7 @@ class Mapper:
             events += self._extend(scan, stamp, match)
         if len(self.map):
             self._append_to_trajectory(stamp)
-        if self.map.begin and self._searched():
-            events += (MappingEvent.JOINED,)
+        events += self._searched()
         odom_now = self._motion.odom
         correction = None if odom_now is None or self.lost else compose(self._pose, inverse(odom_now))
         covariance = UNKNOWN if self.lost else self._covariance
@@ -225,18 +225,25 @@ class Mapper:
         self._relocation = Relocation()
         self._look_around()
 
-    def _searched(self) -> bool:
-        """Do a slice of the search for the submap's place; True if it was joined."""
-        place = between(self.map.poses[-1], self._pose)
-        joined = self._relocation.step(self.map, self._closer)
-        self._pose = compose(self.map.poses[-1], place)
-        if joined:
+    def _searched(self) -> tuple[MappingEvent, ...]:
+        """Continue the searches for loops and, while lost, for the submap's place, each as far as its budget goes."""
+        if not len(self.map):
+            return ()
+        poses, place = self.map.poses, between(self.map.poses[-1], self._pose)
+        events: tuple[MappingEvent, ...] = ()
+        if self._closer.step(self.map, Budget()):
+            events += (MappingEvent.CLOSED,)
+        # A search for loops within the submap must not see it moved.
+        if self.map.begin and not self._closer.busy and self._relocation.step(self.map, self._closer, Budget()):
             self.map.begin = 0
-        self._look_around()
-        return joined
+            events += (MappingEvent.JOINED,)
+        if events or self.map.poses is not poses:
+            self._pose = compose(self.map.poses[-1], place)
+            self._look_around()
+        return events
 
     def _extend(self, scan: Scan, stamp: int, match: ScanMatch) -> tuple[MappingEvent, ...]:
-        """Add the scan as a keyframe with its edges, search for a loop closure, prune the map."""
+        """Add the scan as a keyframe with its edges, have loops searched for from it, prune the map."""
         events: tuple[MappingEvent, ...] = (MappingEvent.KEY,)
         self.map.add(scan, stamp, self._pose)
         if not self._loss.fits:
@@ -245,9 +252,7 @@ class Mapper:
             self.map.add_odometry_edge(*self._since_key)
             if match.accepted:
                 self.map.add_scan_edges(self._local)
-            if self._closer.close(self.map):
-                events += (MappingEvent.CLOSED,)
-                self._pose = self.map.poses[-1].copy()
+            self._closer.watch(len(self.map) - 1)
         if len(self.map) > self.config.most_keys:
             events += (MappingEvent.PRUNED,)
             kept, stand_in, offset = self.map.prune()

@@ -7,14 +7,14 @@ both only with the support of matches from other places.
 """
 
 import math
-from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam.budget import ELEMENT, Budget, Pieces, Progress
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, surroundings
-from monstertruck_estimation.slam.correlation import RESOLUTION, Peak, Submap, correlate
+from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
 from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch
@@ -117,10 +117,12 @@ MAP_KEYS: Final = 300
 """Keyframes of the whole map searched in, at most."""
 POINTS: Final = 160
 """Points of the surroundings searched for, at most."""
-SLICE: Final = 6e6
-"""Look-ups of the first level in one slice of the search, about 10 ms,"""
-WORK: Final = 40_000
-"""and blocks looked at below it."""
+SLICE: Final = 2e6
+"""Look-ups of the first level in one slice of the search,"""
+WORK: Final = 15_000
+"""blocks looked at below it, at most,"""
+FEWEST_SLICES: Final = 4
+"""and slices at least."""
 ANYWHERE: Final = (1e6, 1e6)
 """Standard deviation of the predicted pose, m and rad: nothing is known of it."""
 MIN_SCORE: Final = 0.5
@@ -141,97 +143,78 @@ FEWEST_KEYS: Final = 2
 """Keyframes of a submap before it is searched for."""
 
 
-@dataclass
-class _Search:
-    """Search for the surroundings of keyframe ``at``."""
-
-    at: int
-    points: Array
-    """Shape (n, 2), in its frame, m."""
-    middle: Array
-    half: float
-    slices: int
-    done: int = 0
-    peaks: list[Peak] = field(default_factory=list)
-
-
 class Relocation:
     """Joins the newest submap of a keyframe map to the part that begins at the first keyframe."""
 
     def __init__(self) -> None:
         self._whole: tuple[int, Submap] | None = None
-        self._search: _Search | None = None
+        self._progress: Progress[bool] | None = None
         self._last = -1
-        self._checks: list[int] = []
-        self._failed = 0
 
-    def step(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
-        """Do one slice of the search; True if the submap was joined, which moves poses."""
+    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: Budget) -> bool:
+        """Continue the search; True if the submap was joined, which moves poses. A place found moves the submap."""
         newest = len(keyframes) - 1
-        if self._search is None and not self._checks:
+        if self._progress is None:
             if newest - keyframes.begin + 1 < FEWEST_KEYS or newest == self._last:
                 return False
-            self._search = self._begin(keyframes, newest)
+            self._last = newest
+            self._progress = Progress(self._joined(keyframes, closer, newest))
+        if not self._progress.run(budget):
             return False
-        if self._checks:
-            return self._check(keyframes, closer)
-        search, submap = self._search, self._submap(keyframes)
-        assert search is not None
-        turn = math.tau / search.slices
-        guess = search.middle + np.array((0.0, 0.0, (search.done + 0.5) * turn))
-        least = max(MIN_SCORE, MAX_RIVAL * max((peak.score for peak in search.peaks), default=0.0))
-        window = search.half, turn / 2
-        if search.done < search.slices:
-            peak = correlate(submap.grid(LEVELS), search.points, guess, window, ANYWHERE, least, work=WORK)
-            search.peaks += [] if peak is None else [peak]
-            search.done += 1
-            return False
-        self._search = None
-        best = _unique(search.peaks)
-        if best is None:
-            return False
-        # Once more round the best, for a place that looks alike from the same direction.
-        window = search.half, RIVAL_TURN
-        peak = correlate(submap.grid(LEVELS), search.points, best, window, ANYWHERE, MIN_SCORE, APART[0], WORK)
-        if peak is None or peak.rival > MAX_RIVAL * peak.score:
-            return False
-        keyframes.place(search.at, peak.pose)
-        self._checks = _checks(keyframes, search.at)
-        return False
-
-    def _check(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
-        """Verify the next keyframe where the place found puts it; give the place up when most do not fit."""
-        found = closer.join(keyframes, self._checks.pop(0))
-        self._failed += found is None
-        if self._failed > MOST_FAILED:
-            self._checks = []
-        if not self._checks:
-            self._failed = 0
-        return bool(found)
+        joined, self._progress = self._progress.result, None
+        return bool(joined)
 
     def forget(self) -> None:
         """The keyframes have other numbers."""
-        self._whole, self._search, self._last, self._checks, self._failed = None, None, -1, [], 0
+        self._whole, self._progress, self._last = None, None, -1
 
-    def _begin(self, keyframes: KeyframeMap, newest: int) -> _Search:
-        self._last = newest
-        cloud = self._submap(keyframes).cloud
-        low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-        half = float((high - low).max() / 2) + 1.0
-        _, query = surroundings(keyframes, newest)
-        points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
-        lever = float(np.clip(np.percentile(np.hypot(*points.T), 80), 1.0, 12.0))
-        blocks = (2 * half / RESOLUTION / (1 << (LEVELS - 1)) + 1) ** 2
-        work = math.tau * lever / RESOLUTION * blocks * len(points)
-        return _Search(newest, points, np.array((*((low + high) / 2), 0.0)), half, max(math.ceil(work / SLICE), 4))
+    def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[bool]:
+        """Place the submap by the surroundings of keyframe ``at``, and verify it there; True if it was joined.
 
-    def _submap(self, keyframes: KeyframeMap) -> Submap:
-        """The part that begins at the first keyframe."""
+        The place is given up when most of the keyframes verified do not fit.
+        """
+        pose = yield from self._place(keyframes, at)
+        if pose is None:
+            return False
+        keyframes.place(at, pose)
+        failed = 0
+        for key in _checks(keyframes, at):
+            found = yield from closer.join(keyframes, key)
+            failed += found is None
+            if found or failed > MOST_FAILED:
+                return bool(found)
+        return False
+
+    def _place(self, keyframes: KeyframeMap, at: int) -> Pieces[Array | None]:
+        """Where in the whole map the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
         if self._whole is None or self._whole[0] != keyframes.begin:
             numbers = np.flatnonzero(keyframes.joined())
             numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), MAP_KEYS)).astype(np.intp)]
+            yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
             self._whole = keyframes.begin, keyframes.submap(numbers)
-        return self._whole[1]
+        submap = self._whole[1]
+        yield submap.grid_cost(LEVELS)
+        grid, cloud = submap.grid(LEVELS), submap.cloud
+        low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+        middle, half = (low + high) / 2, float((high - low).max() / 2) + 1.0
+        _, query = surroundings(keyframes, at)
+        points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
+        slices = max(math.ceil(look_ups(points, (half, math.pi), LEVELS) / SLICE), FEWEST_SLICES)
+        peaks: list[Peak] = []
+        for k in range(slices):
+            yield SLICE + WORK * len(points)
+            guess = np.array((*middle, (k + 0.5) * math.tau / slices))
+            least = max(MIN_SCORE, MAX_RIVAL * max((peak.score for peak in peaks), default=0.0))
+            peak = correlate(grid, points, guess, (half, math.pi / slices), ANYWHERE, least, work=WORK)
+            peaks += [] if peak is None else [peak]
+        best = _unique(peaks)
+        if best is None:
+            return None
+        # Once more round the best, for a place that looks alike from the same direction.
+        window = half, RIVAL_TURN
+        yield look_ups(points, window, LEVELS)
+        peak = correlate(grid, points, best, window, ANYWHERE, MIN_SCORE, APART[0], WORK)
+        return None if peak is None or peak.rival > MAX_RIVAL * peak.score else peak.pose
 
 
 def _checks(keyframes: KeyframeMap, at: int) -> list[int]:
