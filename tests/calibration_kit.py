@@ -8,9 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest
+from monstertruck_sim.world.config import ServoModelConfig
 from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
@@ -24,6 +26,15 @@ STOPPED: Final = 0.2
 """Chance that something stops a servo on its way to one side."""
 CHAIN: Final = 0.012
 """From a command of the gate to the servo, s: the serial line, and half a frame of pulses."""
+MODES: Final = {
+    "front_left": (1, 0),
+    "front_right": (-1, 0),
+    "rear_left": (0, 1),
+    "rear_right": (0, -1),
+    "counter_left": (1, -1),
+    "counter_right": (-1, 1),
+}
+"""Sides to which the front and rear wheels are steered."""
 START_UP: Final = 3.0
 """Seconds in which every device of the emulated truck is up."""
 
@@ -167,7 +178,47 @@ def hidden(
         own = np.random.default_rng([seed, 7])
         answer = {"dead_time": own.uniform(0.0, 0.12), "lag": own.uniform(0.0, 0.06)}
         truck["front_servo"], truck["rear_servo"] = _servo(1, rng) | answer, _servo(0, rng) | answer
+        truck["steering"] = {axle: _linkage(sign, own) for axle, sign in (("front", 1), ("rear", -1))}
     return with_overlay(config, {"sim": {"seed": seed, "world": world}})
+
+
+def _linkage(sign: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Linkage of an axle whose higher powers are off by up to 100 %."""
+    left, right = ([*(k * rng.uniform(0.0, 2.0) for k in c[:4]), *c[4:]] for c in (F_CORRECTED, G_PRINTED))
+    pair = (left, right) if sign > 0 else (mirrored(tuple(left)), mirrored(tuple(right)))
+    return dict(zip(("left_from_servo", "right_from_left"), pair, strict=True))
+
+
+def curvature_errors(calibrated: SimulatedTruckConfig) -> dict[str, float]:
+    """Greatest error of the curvature that the calibrated truck believes, by mode, as a share.
+
+    From 0.3 of full lock to where pulses reach and nothing stops a servo.
+    """
+    believed, truck = calibrated.chassis(), calibrated.sim.world.truck
+    true, steering = truck.chassis(), calibrated.devices.steering
+    assert steering is not None
+    assert believed.linkage is not None
+    servos = (steering.driver.front, truck.front_servo), (steering.driver.rear, truck.rear_servo)
+    ends = [
+        [min(max(_arm(ours.quarters(end) / 4, real), -real.right_stop_deg), real.left_stop_deg) for end in reach]
+        for (ours, real), reach in zip(servos, believed.linkage.ranges, strict=True)
+    ]
+    errors = {}
+    for mode, sides in MODES.items():
+        full = [end[side > 0] if side else 0.0 for end, side in zip(ends, sides, strict=True)]
+        shares = []
+        for share in np.linspace(0.3, 1.0, 8).tolist():
+            arms = [share * end for end in full]
+            pulses = [real.centre_us + real.us_per_degree * arm for (_, real), arm in zip(servos, arms, strict=True)]
+            angles = [ours.angle(round(4 * pulse)) for (ours, _), pulse in zip(servos, pulses, strict=True)]
+            expected = true.bicycle.curvature(*true.steering(*np.radians(arms).tolist()))
+            shares.append(believed.bicycle.curvature(*believed.steering(*angles)) / expected - 1)
+        errors[mode] = float(np.abs(shares).max())
+    return errors
+
+
+def _arm(pulse_us: float, servo: ServoModelConfig) -> float:
+    return (pulse_us - servo.centre_us) / servo.us_per_degree
 
 
 def _servo(channel: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -6,12 +6,13 @@ and a string on the floor shows what neither sees, the crabbing of two axles tha
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
 
 from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
@@ -27,8 +28,8 @@ ROUGH: Final = (0.06, 0.1, 0.4)
 """Speed (m/s), axle angle (rad) and way (m) of the first arcs: too little turn for the gate to call the steering dead,
 should it go the wrong way."""
 ARC: Final = (0.12, 0.18, 1.0)
-FULL: Final = (0.12, 0.35)
-"""Speed and axle angle of full circles."""
+FULL: Final = 0.12
+"""Speed of full circles."""
 TRAVEL: Final = (0.1, 0.6)
 """Speed and way of arcs with the wheels as far over as the gate lets them."""
 STRAIGHT: Final = (0.12, 2.0)
@@ -47,7 +48,7 @@ WHEELBASE: Final = 0.003
 WAY: Final = 0.02
 """Share by which the way may be wrong while the drive is not calibrated."""
 SHORT: Final = math.radians(2.0)
-"""Servo angle, rad, that has to be missing before a stop is believed."""
+"""Servo angle, rad, that has to be missing before a stop is believed; circles keep as far from the ends."""
 MARGIN: Final = 1.0
 """Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
 SCALE: Final = 0.02
@@ -65,7 +66,7 @@ _OFFSET: Final = Number(
 
 @dataclass(frozen=True, slots=True)
 class SteeringWizard:
-    """Short arcs for the directions; then travel, straights along a string and full circles."""
+    """Short arcs for the directions; then travel, straights along a string, full circles and weaves."""
 
     rough: bool = False
     """Directions and a first centre only: before the compass is calibrated"""
@@ -85,7 +86,7 @@ class SteeringWizard:
         await context.confirm(CLEAR)
         arcs = await self._arcs(context, maps, ROUGH)
         directions = context.fit("directions", lambda: _directions(arcs))
-        start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]))
+        start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]), maps.deficit)
         wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
         if self.rough or wrong:
             again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
@@ -94,7 +95,7 @@ class SteeringWizard:
         first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
         travel = await self._travel(context, maps, model, first)
         legs += await self._straights(context, maps)
-        legs += await self._circles(context, maps, travel)
+        legs += await self._circles(context, maps, model, first, travel)
         weaving = [await context.move(move) for move in weaves(self.weaves)]
         answer = context.fit("dead time and lag", lambda: response(weaving, chassis))
         result = context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
@@ -151,21 +152,28 @@ class SteeringWizard:
         return legs
 
     @staticmethod
-    async def _circles(context: WizardContext, maps: Maps, travel: "list[Reach]") -> list[SteeringRun]:
-        """A full turn to each side with each axle, which no slow error of the compass can falsify."""
-        speed, angle = FULL
+    async def _circles(
+        context: WizardContext, maps: Maps, model: SteeringModel, first: Maps, travel: "list[Reach]"
+    ) -> list[SteeringRun]:
+        """A full turn to each side with each axle and with both, which no slow error of the compass can falsify.
+
+        The wheels are as far over as they follow; what is commanded for that is known by the ``first`` maps.
+        """
+        ends = {(reach.axle, reach.sign): reach.sign * (abs(reach.servo) - SHORT) for reach in travel}
         legs = []
-        for reach in travel:
-            front, rear = _steered(reach.axle, reach.sign * min(angle, 0.95 * abs(reach.axle_angle)))
-            move = MoveStep(
-                f"a full circle by the {AXLES[reach.axle]} wheels, {'left' if reach.sign > 0 else 'right'}",
-                speed,
-                front,
-                rear,
-                2.6 * math.pi / abs(context.chassis.bicycle.curvature(front, rear)),
-                done=lambda track: abs(track.turned()) > 2 * math.pi,
-            )
-            legs.append(SteeringRun.of(await context.move(move), maps))
+        for wheels, steered in (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1))):
+            for sign, side in ((1, "left"), (-1, "right")):
+                servos = [ends.get((axle, sign * way), 0.0) for axle, way in enumerate(steered)]
+                front, rear = model.commands(servos, first, maps)
+                move = MoveStep(
+                    f"a full circle by {wheels} wheels, {side}",
+                    FULL,
+                    front,
+                    rear,
+                    2.6 * math.pi / abs(context.chassis.bicycle.curvature(front, rear)),
+                    done=lambda track: abs(track.turned()) > 2 * math.pi,
+                )
+                legs.append(SteeringRun.of(await context.move(move), maps))
         return legs
 
     # Judging
@@ -201,13 +209,14 @@ class SteeringWizard:
             for reach in travel:
                 if reach.axle == axle:
                     estimates += reach.estimates(name, centre, scale, before)
+        estimates += _deficits(maps, halves[4:], len(legs), band)
         strings = f"along {self.strings} strings" if self.strings else "without a string"
         return Result(
             wizard="steering",
-            measured=f"{len(legs)} legs: arcs and full circles with one axle at a time, straights {strings}",
+            measured=f"{len(legs)} legs: arcs with one axle, full circles with one and with both, straights {strings}",
             estimates=tuple(estimates),
             unobserved=(
-                "the linkage: its polynomials and the wheelbase are taken as configured, their errors show as scale",
+                "the wheelbase, whose error shows as scale, and the linkage but for what its turns lack",
                 "travel beyond the limits of gate and servo",
                 *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
             ),
@@ -245,7 +254,7 @@ class Reach:
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
-        angle = model.axle_angle(axle, servo)
+        angle = model.axle_angle(axle, servo, maps)
         noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
@@ -359,6 +368,29 @@ def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -
         meaning=f"pulse that steers straight ahead; {meaning}",
         key=f"{STEERING}.{name}.centre_us",
     )
+
+
+def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estimate]:
+    """What the turns lack.
+
+    Args:
+        maps: fitted.
+        halves: half the 95 % intervals; (6,).
+        samples: legs.
+        band: what the intervals cover.
+    """
+    return [
+        Estimate(
+            name=f"deficit_{name}",
+            value=value,
+            low=value - float(half),
+            high=value + float(half),
+            samples=samples,
+            meaning=f"what the turns lack by the linkage, {name.replace('_', ' ')}; {band}",
+            key=f"body.turn_deficit.{name}",
+        )
+        for (name, value), half in zip(asdict(maps.deficit).items(), halves, strict=True)
+    ]
 
 
 def _way_error(context: WizardContext) -> float:

@@ -6,18 +6,21 @@ errors of both centres make the truck crab without turning, which no compass see
 string, and faintly as unlike circles to the left and to the right, as far as the linkage is what it is taken for.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
 
+from monstertruck_kinematics.axles import LinkedAxles, TurnDeficit
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_kinematics.polynomials import SERVO_LIMIT
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.body import TruckBody
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
 from monstertruckd.tools.calibrate.steps import MoveRecord
@@ -35,6 +38,8 @@ LINKAGE: Final = 0.005
 """Share of a turn by which the linkage may differ from its polynomials."""
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
+DEFICIT: Final = 0.3
+"""Standard deviation of a coefficient of the turn deficit, where nothing else tells: 5 % of the turn at full lock."""
 GAIN: Final = 0.15
 """Share by which a pulse map may differ from the configured one, where nothing else tells."""
 
@@ -50,6 +55,8 @@ class Maps:
     """Front and rear, us."""
     scales: tuple[float, float]
     """Front and rear, us per degree."""
+    deficit: TurnDeficit = field(default_factory=TurnDeficit)
+    """What the axles turn less than the linkage says."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> "Maps":
@@ -63,21 +70,24 @@ class Maps:
             raise InputError("devices.steering: not in this truck's configuration, so there is nothing to calibrate")
         servos = (steering.driver.front, steering.driver.rear)
         front, rear = servos
+        deficit = config.body.turn_deficit.model_dump() if isinstance(config.body, TruckBody) else {}
         return cls(
             (front.centre_us, rear.centre_us),
             (front.direction * front.scale_us_per_deg, rear.direction * rear.scale_us_per_deg),
+            TurnDeficit(**deficit),
         )
 
     @classmethod
     def from_parameters(cls, parameters: Array) -> "Maps":
-        """From (front centre, front scale, rear centre, rear scale)."""
-        front, front_scale, rear, rear_scale = (float(value) for value in parameters)
-        return cls((front, rear), (front_scale, rear_scale))
+        """From (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
+        front, front_scale, rear, rear_scale, *deficit = (float(value) for value in parameters)
+        return cls((front, rear), (front_scale, rear_scale), TurnDeficit(*deficit))
 
     @property
     def parameters(self) -> Array:
-        """(4,), see ``from_parameters``."""
-        return np.array((self.centres[0], self.scales[0], self.centres[1], self.scales[1]))
+        """(10,), see ``from_parameters``."""
+        pulses = self.centres[0], self.scales[0], self.centres[1], self.scales[1]
+        return np.array((*pulses, *astuple(self.deficit)))
 
     def pulses(self, axle: int, servo: Array) -> Array:
         """Pulses, us, that the daemon sends for servo angles, rad."""
@@ -126,30 +136,36 @@ class SteeringModel:
     """
 
     def __init__(self, chassis: TruckChassis) -> None:
-        assert chassis.linkage is not None
+        assert isinstance(chassis.linkage, LinkedAxles)
         self.chassis = chassis
-        self.axles = chassis.linkage
+        self._linkage = chassis.linkage
 
-    def angles(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array]:
-        """Axle angles, rad, that the pulses of a leg mean; (n,) each."""
-        return self.axles.angles(maps.servo(0, leg.pulses[0]), maps.servo(1, leg.pulses[1]))
+    def axles(self, maps: Maps) -> LinkedAxles:
+        """The linkage with the deficit of ``maps``."""
+        return replace(self._linkage, deficit=maps.deficit)
 
-    def axle_angle(self, axle: int, servo: float) -> float:
+    def axle_angle(self, axle: int, servo: float, maps: Maps) -> float:
         """Angle, rad, of an axle at its servo angle, the other one straight."""
-        return self.axles.angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
+        return self.axles(maps).angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
-    def moves(self, leg: SteeringRun, maps: Maps) -> tuple[Array, Array, Array]:
-        """Forward, sideways (m) and turn (rad) between readings of a leg, in the body's frame; (n,) each."""
-        front, rear = self.angles(leg, maps)
+    def commands(self, servos: Sequence[float], true: Maps, believed: Maps) -> tuple[float, float]:
+        """Axle angles, rad, to command of a daemon with the maps ``believed`` for servo angles, rad, by ``true``."""
+        front, rear = (float(believed.servo(i, true.pulses(i, np.array(servo)))) for i, servo in enumerate(servos))
+        return self.axles(believed).angles(front, rear)
+
+    def predict(self, legs: Sequence[SteeringRun], maps: Maps) -> tuple[Array, Array]:
+        """Turns, rad, and sideways offsets, m, left positive, of legs; (n,) each."""
+        sizes = [leg.motor.size for leg in legs]
+        starts = list(itertools.accumulate(sizes[:-1], initial=0))
+        motor = np.concatenate([leg.motor for leg in legs])
+        servos = (maps.servo(axle, np.concatenate([leg.pulses[axle] for leg in legs])) for axle in (0, 1))
+        front, rear = self.axles(maps).angles(*servos)
         bicycle = self.chassis.bicycle
-        ways = self.chassis.drivetrain.distance(leg.motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
-        return bicycle.body_twist(ways, front, rear)
-
-    def predict(self, leg: SteeringRun, maps: Maps) -> tuple[float, float]:
-        """Turn, rad, and sideways offset, m, left positive, of a leg."""
-        forward, sideways, turned = self.moves(leg, maps)
-        heading = np.cumsum(turned) - turned / 2
-        return float(turned.sum()), float(np.sum(forward * np.sin(heading) + sideways * np.cos(heading)))
+        ways = self.chassis.drivetrain.distance(motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
+        forward, sideways, turned = bicycle.body_twist(ways, front, rear)
+        turns = np.add.reduceat(turned, starts)
+        heading = np.cumsum(turned) - turned / 2 - np.repeat(np.cumsum(turns) - turns, sizes)
+        return turns, np.add.reduceat(forward * np.sin(heading) + sideways * np.cos(heading), starts)
 
     def way(self, leg: SteeringRun) -> float:
         """Way rolled on a leg, m."""
@@ -164,22 +180,24 @@ class SteeringModel:
             gain: share within which the scales are believed beforehand.
         """
         guess = start.parameters
-        sigmas = [math.hypot(leg.sigma, SLIP * math.sqrt(self.way(leg))) for leg in legs]
+        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self.way(leg))) for leg in legs])
+        turns = np.array([leg.turn for leg in legs])
+        strings = [(k, leg.offset, leg.offset_sigma) for k, leg in enumerate(legs) if leg.offset is not None]
 
         def residual(parameters: Array) -> Array:
-            maps = Maps.from_parameters(parameters)
-            rows = []
-            for leg, sigma in zip(legs, sigmas, strict=True):
-                turn, aside = self.predict(leg, maps)
-                rows.append((turn - leg.turn) / sigma)
-                if leg.offset is not None:
-                    rows.append((aside - leg.offset) / leg.offset_sigma)
+            turned, aside = self.predict(legs, Maps.from_parameters(parameters))
             off = np.radians((parameters[[0, 2]] - guess[[0, 2]]) / guess[[1, 3]])
-            rows += [float(off.sum()) / (math.sqrt(2) * EYE)]
-            rows += list((parameters[[1, 3]] / guess[[1, 3]] - 1) / gain)
-            return np.array(rows)
+            return np.array(
+                (
+                    *((turned - turns) / sigmas),
+                    *((aside[k] - offset) / sigma for k, offset, sigma in strings),
+                    off.sum() / (math.sqrt(2) * EYE),
+                    *((parameters[[1, 3]] / guess[[1, 3]] - 1) / gain),
+                    *(parameters[4:] / DEFICIT),
+                )
+            )
 
-        spread = np.array((150.0, 0.5 * abs(guess[1]), 150.0, 0.5 * abs(guess[3])))
+        spread = np.array((150.0, 0.5 * abs(guess[1]), 150.0, 0.5 * abs(guess[3]), *(np.inf,) * (guess.size - 4)))
         return least_squares(residual, guess, guess - spread, guess + spread)
 
     def reached(self, leg: SteeringRun, maps: Maps, axle: int) -> tuple[float, float]:
@@ -187,12 +205,13 @@ class SteeringModel:
 
         The other axle is taken as the maps have it. Valid for a leg with steady steering.
         """
+        axles = self.axles(maps)
         bicycle, sense = self.chassis.bicycle, 1.0 if axle == 0 else -1.0
         rolled = float(self.chassis.drivetrain.distance(leg.motor.sum()))
         meant = [float(maps.servo(i, leg.pulses[i]).mean()) for i in (0, 1)]
 
         def turned(servo: float) -> float:
-            angles = self.axles.angles(*((servo, meant[1]) if axle == 0 else (meant[0], servo)))
+            angles = axles.angles(*((servo, meant[1]) if axle == 0 else (meant[0], servo)))
             return bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)[2]
 
         low, high = -SERVO_LIMIT, SERVO_LIMIT
@@ -203,7 +222,7 @@ class SteeringModel:
         return low, meant[axle]
 
 
-def half_widths(fit: FitResult, priors: int = 3) -> Array:
+def half_widths(fit: FitResult, priors: int = 9) -> Array:
     """Half the 95 % intervals of the parameters.
 
     The errors of a leg are known beforehand; where the legs disagree by more, their spread counts.

@@ -1,4 +1,4 @@
-"""Pulse maps from legs: what turns tell, what only the string tells, and stops."""
+"""Pulse maps and turn deficit from legs: what turns tell, what only the string tells, and stops."""
 
 import math
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis, truck_chassis
+from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePolynomials, SteeringPolynomials, mirrored
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.steering import Reach, _directions, _rough
+from monstertruckd.config.calibration import KEYS
+from monstertruckd.tools.calibrate.steering import Reach, _deficits, _directions, _rough
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 
 CHASSIS = truck_chassis(Dimensions(DriveTrain()))
@@ -35,7 +37,7 @@ def leg(
     pulses = BELIEVED.pulses(0, np.full(count, servos[0])), BELIEVED.pulses(1, np.full(count, servos[1]))
     arm = np.clip(true.servo(0, pulses[0]), -stop, stop)
     real = SteeringRun(motor, (true.pulses(0, arm), pulses[1]), 0.0, 0.002)
-    turn, aside = MODEL.predict(real, true)
+    turn, aside = (float(value) for (value,) in MODEL.predict([real], true))
     if rng is not None:
         turn += float(rng.normal(0, math.hypot(0.002, 0.005 * turn, 0.004 * math.sqrt(abs(metres)))))
         aside += float(rng.normal(0, 0.008))
@@ -129,3 +131,76 @@ def test_a_free_axle_has_no_limit_and_a_limit_found_before_stays():
     )
     before = earlier.model_copy(update={"estimates": (limit,)})
     assert reach.estimates("front", *TRUE.parameters[:2], before)[1] == limit
+
+
+# What the turns lack by another linkage
+
+FULL = math.radians(36)
+CIRCLES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))
+"""Front and rear servo, in shares of full lock."""
+
+
+def another_linkage(rng: np.random.Generator) -> SteeringModel:
+    """A truck whose linkage has other higher powers."""
+
+    def other(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+        *higher, slope, start = coefficients
+        return (*(float(k * rng.uniform(0, 2)) for k in higher), slope, start)
+
+    front, rear = (
+        AxlePolynomials(other(f), other(g))
+        for f, g in ((F_CORRECTED, G_PRINTED), (mirrored(F_CORRECTED), mirrored(G_PRINTED)))
+    )
+    chassis = truck_chassis(Dimensions(DriveTrain(), polynomials=SteeringPolynomials(front, rear)))
+    assert isinstance(chassis, TruckChassis)
+    return SteeringModel(chassis)
+
+
+def rolled(truck: SteeringModel, front: float, rear: float, metres: float, rng: np.random.Generator) -> SteeringRun:
+    """What a truck with that linkage and the true maps does with its servos at these shares of full lock."""
+    motor = np.full(16, CHASSIS.drivetrain.motor_angle(metres) / 16)
+    pulses = TRUE.pulses(0, np.full(16, front * FULL)), TRUE.pulses(1, np.full(16, rear * FULL))
+    (turn,), _ = truck.predict([SteeringRun(motor, pulses, 0.0, 0.002)], TRUE)
+    sigma = math.hypot(0.002, 0.005 * turn)
+    noise = float(rng.normal(0, math.hypot(sigma, 0.004 * math.sqrt(abs(metres)))))
+    return SteeringRun(motor, pulses, float(turn) + noise, sigma)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_circles_in_all_modes_make_the_curvature_right_up_to_full_lock(seed: int):
+    rng = np.random.default_rng(seed)
+    truck = another_linkage(rng)
+    arcs = [rolled(truck, 0.45 * f, 0.45 * r, d, rng) for f, r in CIRCLES[:4] for d in (1.0, -1.0)]
+    turns = [rolled(truck, f, r, 5.0, rng) for f, r in CIRCLES]
+    straights = [leg(0, 0, sign * 2.0, TRUE, rng, string=sign > 0) for _ in range(3) for sign in (1, -1)]
+    fit = MODEL.fit([*arcs, *turns, *straights], BELIEVED)
+    maps = Maps.from_parameters(fit.parameters)
+
+    def curvature(model: SteeringModel, believed: Maps, servos: list[float]) -> float:
+        return CHASSIS.bicycle.curvature(*model.axles(believed).angles(*servos))
+
+    plain = []
+    for sides in CIRCLES:
+        for share in (0.3, 0.5, 0.75, 1.0):
+            servos = [side * share * FULL for side in sides]
+            expected = curvature(truck, Maps.from_parameters(TRUE.parameters), servos)
+            read = [float(maps.servo(i, TRUE.pulses(i, np.array(servo)))) for i, servo in enumerate(servos)]
+            assert curvature(MODEL, maps, read) == pytest.approx(expected, rel=0.02)
+            plain.append(abs(curvature(MODEL, TRUE, servos) / expected - 1))
+    assert max(plain) > 0.02, "without the deficit it is not"
+    assert np.isfinite(half_widths(fit)).all()
+
+
+def test_what_servos_shall_do_is_commanded_by_the_believed_maps():
+    servos = (math.radians(30), math.radians(-25))
+    front, rear = MODEL.commands(servos, TRUE, BELIEVED)
+    sent = CHASSIS.servos(front, rear)
+    arms = [float(TRUE.servo(i, BELIEVED.pulses(i, np.array(servo)))) for i, servo in enumerate(sent)]
+    assert arms == pytest.approx(servos, abs=1e-6)
+
+
+def test_every_coefficient_is_saved_with_its_interval():
+    fit = MODEL.fit(session(TRUE), BELIEVED)
+    estimates = _deficits(Maps.from_parameters(fit.parameters), half_widths(fit)[4:], 10, "noise")
+    assert [e.key for e in estimates] == [key for key in KEYS["steering"] if key.startswith("body.turn_deficit.")]
+    assert all(e.low is not None and e.high is not None and e.low < 0 < e.high for e in estimates)
