@@ -32,11 +32,13 @@ def _skid_steer(
     radius: float = 0.021,
     half_track: float = 0.0525,
     icr_x: float = 0.0,
+    front: float = 0.0305,
+    rear: float = 0.0305,
     gain_left: float = 1.0,
     gain_right: float = 1.0,
     max_rate: float = math.inf,
 ) -> Drive:
-    return SkidSteer(radius, half_track, -half_track, icr_x, gain_left, gain_right, max_rate)
+    return SkidSteer(radius, half_track, -half_track, icr_x, gain_left, gain_right, max_rate, front, rear)
 
 
 FAMILIES: dict[str, Callable[..., Drive]] = {

@@ -211,7 +211,11 @@ class Ackermann:
         return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
 
     def steer_from_wheels(self, left: Real, right: Real) -> Real:
-        """Bicycle angle of two ideal front wheels: cot d = (cot d_l + cot d_r)/2 (2.13), defined at 0 too."""
+        """Bicycle angle of two front wheels: the mean of the tangents that each wheel alone gives the bicycle.
+
+        For ideal wheels both are the same and cot d = (cot d_l + cot d_r)/2 (2.13), defined at 0 too. Other wheels have
+        no common ICR, and their least-squares motion another angle: see ``axles.LinkedAxles``.
+        """
         tan_l, tan_r = tan(left), tan(right)
         half = 0.5 * self.track / self.wheelbase
         return atan2(0.5 * (tan_l / (1.0 + half * tan_l) + tan_r / (1.0 - half * tan_r)), 1.0 + 0.0 * tan_l)

@@ -94,7 +94,8 @@ class SkidSteer:
         gain_left: effective over nominal radius, slip included, of the left side.
         gain_right: of the right side.
         max_rate: of a wheel, rad/s.
-        length: between front and rear wheels, m; only ``wheels`` uses it.
+        front: b, distance of the front wheels ahead of the reference point, m.
+        rear: a, distance of the rear wheels behind it, m; unlike ``front`` where the mass lies off the middle.
 
     Raises:
         KinematicsError: a length or gain not above 0, or icr_left not left of icr_right.
@@ -107,12 +108,13 @@ class SkidSteer:
     gain_left: float = 1.0
     gain_right: float = 1.0
     max_rate: float = math.inf
-    length: float = 0.061
+    front: float = 0.0305
+    rear: float = 0.0305
 
     inputs = ("left", "right")
 
     def __post_init__(self) -> None:
-        for name in ("radius", "gain_left", "gain_right", "length"):
+        for name in ("radius", "gain_left", "gain_right", "front", "rear"):
             require_positive(name, getattr(self, name))
         for name in ("icr_left", "icr_right", "icr_x"):
             require_finite(name, getattr(self, name))
@@ -132,6 +134,11 @@ class SkidSteer:
         width = self.icr_left - self.icr_right
         wz = (right - left) / width
         return (right * self.icr_left - left * self.icr_right) / width, -self.icr_x * wz, wz
+
+    def skids(self, command: Sequence[Real]) -> tuple[Real, Real]:
+        """Sideways speeds, m/s, of the front and rear wheels: (b - x_ICR) omega and (-a - x_ICR) omega (eq. 9)."""
+        _, vy, wz = self.forward(command)
+        return vy + self.front * wz, vy - self.rear * wz
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
         """Wheel rates for a twist whose side speed is -x_ICR times its yaw rate."""
@@ -165,14 +172,13 @@ class SkidSteer:
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """Four fixed wheels where the sides' centres lie: without slip they could only go straight."""
         unpacked(command, self.inputs)
-        ahead = self.length / 2.0
         return tuple(
             FixedWheel(name, x, y, self.radius)
             for name, x, y in (
-                ("rear left", -ahead, self.icr_left),
-                ("front left", ahead, self.icr_left),
-                ("front right", ahead, self.icr_right),
-                ("rear right", -ahead, self.icr_right),
+                ("rear left", -self.rear, self.icr_left),
+                ("front left", self.front, self.icr_left),
+                ("front right", self.front, self.icr_right),
+                ("rear right", -self.rear, self.icr_right),
             )
         )
 

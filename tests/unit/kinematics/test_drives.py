@@ -348,3 +348,11 @@ def test_frames_are_inverse_and_points_move_with_the_body():
     assert to_body(0.7, *to_world(0.7, 0.3, -0.4)) == pytest.approx((0.3, -0.4))
     assert to_world(math.pi / 2, 1.0, 0.0) == pytest.approx((0.0, 1.0))
     assert twist_at(0.0, 0.0, 2.0, 0.5, 0.25) == pytest.approx((-0.5, 1.0, 2.0))
+
+
+def test_steer_from_wheels_is_the_mean_of_the_tangents_that_each_wheel_gives():
+    car = Ackermann()
+    half = car.track / car.wheelbase / 2
+    single = [math.atan(math.tan(0.3) / (1 + side * half * math.tan(0.3))) for side in (1, -1)]
+    assert [car.front_angles(steer)[wheel] for wheel, steer in enumerate(single)] == pytest.approx([0.3, 0.3])
+    assert math.tan(car.steer_from_wheels(0.3, 0.3)) == pytest.approx(np.tan(single).mean())

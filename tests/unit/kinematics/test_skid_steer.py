@@ -52,10 +52,12 @@ def test_offset_centre_is_the_same_robot_seen_elsewhere(rng):
 
 
 def test_slip_of_front_and_rear_wheels():
-    robot = SkidSteer(0.021, 0.06, -0.06, icr_x=0.01)
+    robot = SkidSteer(0.021, 0.06, -0.06, icr_x=0.01, front=0.02, rear=0.04)
     twist = robot.forward((1.0, 2.0))
-    slip = twist_at(*twist, 0.03, 0.0)[1], twist_at(*twist, -0.03, 0.0)[1]
-    assert slip == pytest.approx(((0.03 - 0.01) * twist[2], (-0.03 - 0.01) * twist[2]))
+    assert robot.skids((1.0, 2.0)) == pytest.approx(((0.02 - 0.01) * twist[2], (-0.04 - 0.01) * twist[2]))
+    assert {wheel.name: wheel.x for wheel in robot.wheels((1.0, 2.0))} == {
+        "rear left": -0.04, "front left": 0.02, "front right": 0.02, "rear right": -0.04,
+    }  # fmt: skip
     with pytest.raises(KinematicsError, match=r"vy is 0\.1"):
         robot.inverse((0.1, 0.1, 0.0))
 
