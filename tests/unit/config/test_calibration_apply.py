@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_kinematics.axles import LinkedAxles, TurnDeficit
 from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName, value_at
 from monstertruckd.config.load import load_truck, resolved
@@ -39,6 +40,13 @@ def config(tmp_path: Path) -> Path:
 def save(config: Path, *results: Result) -> Path:
     store = CalibrationStore(load_truck(config)[0].calibration_folder, "truck")
     return [store.save(one, 0) for one in results][-1]
+
+
+def test_the_measured_turn_deficit_is_the_kinematics(config: Path):
+    save(config, result("steering", body__turn_deficit__rear_left=0.2, body__turn_deficit__counter_right=-0.1))
+    axles = load_truck(config)[0].chassis().linkage
+    assert isinstance(axles, LinkedAxles)
+    assert axles.deficit == TurnDeficit(rear_left=0.2, counter_right=-0.1)
 
 
 def test_measured_values_win_and_show_where_they_come_from(config: Path):
