@@ -62,6 +62,7 @@ def build(
         raise InputError(done.error)
     assert done.whole is not None
     rows, columns = done.whole.cells.shape
+    facts["poses"] = "joint registration" if done.joint else "graph"
     facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
     if trajectory is not None:
         assert done.trajectory is not None

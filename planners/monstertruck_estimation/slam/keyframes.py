@@ -16,6 +16,7 @@ from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equati
 from monstertruck_estimation.slam.scan_matcher import deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
 
 INITIAL_ROWS: Final = 64
 """Rows allocated at first."""
@@ -305,11 +306,21 @@ class KeyframeMap:
         """Optimise the pose graph; the first pose is fixed."""
         self.poses = optimise(self.poses, self.edges.edges())
 
-    def refine(self) -> None:
-        """Register all keyframes jointly: seconds of work."""
-        if len(self) > 1:
-            edges = self.edges.edges()
-            self.poses = refine(self.frames, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
+    def refine(self) -> bool:
+        """Register all keyframes jointly (seconds of work), if those far apart in time agree better then.
+
+        Returns:
+            Whether the poses are those of the joint registration; else they are the graph's.
+        """
+        if len(self) < 2:
+            return False
+        edges = self.edges.edges()
+        poses = refine(self.frames, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
+        pairs = witnesses(self.frames, self.poses, parts(edges, len(self)))
+        if agreement(self.frames, poses, pairs) <= agreement(self.frames, self.poses, pairs):
+            return False
+        self.poses = poses
+        return True
 
     def prune(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
         """Remove the keyframes that others make redundant.
@@ -475,6 +486,47 @@ def partners(poses: Array) -> NDArray[np.int64]:
         _, first = np.unique(stretch[near], return_index=True)
         result += [(int(j), k) for j in near[np.sort(first)][:REFINE_PARTNERS]]
     return np.array(result, dtype=np.int64).reshape(-1, 2)
+
+
+WITNESS_PAUSE: Final = 60.0
+"""Seconds between two views of a place that judge the joint registration,"""
+WITNESS_SHARE: Final = 0.25
+"""or this share of a shorter run."""
+WITNESSES: Final = 1500
+"""Most pairs that judge it, evenly chosen."""
+WITNESS_REACH: Final = 0.05
+"""Distance within which a point agrees with the other scan, m."""
+
+
+def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pairs (earlier, later), shape (n, 2), that see the same place at times far apart, but are not ``partners``.
+
+    The joint registration has no term of theirs, so that they can judge it.
+    """
+    stamps = np.array([key.stamp for key in keys])
+    pause = min(WITNESS_PAUSE * SECOND, WITNESS_SHARE * float(stamps[-1] - stamps[0]))
+    used = {(i, j) for i, j in partners(poses).tolist()}
+    result: list[tuple[int, int]] = []
+    for k in range(1, len(poses)):
+        before = np.flatnonzero((stamps[:k] <= stamps[k] - pause) & (part[:k] == part[k]))
+        off = between(poses[k], poses[before])
+        near = before[np.hypot(off[:, 0], off[:, 1]) + REFINE_TURN * np.abs(off[:, 2]) < REFINE_REACH]
+        near = near[np.linspace(0, len(near) - 1, min(len(near), REFINE_PARTNERS)).astype(np.intp)]
+        others = [int(j) for j in near if (int(j), k) not in used]
+        result += [(j, k) for j in others if _share(keys, poses, j, k) > REFINE_OVERLAP]
+    chosen = np.linspace(0, len(result) - 1, min(len(result), WITNESSES)).astype(np.intp)
+    return np.array(result, dtype=np.int64).reshape(-1, 2)[chosen]
+
+
+def agreement(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64]) -> float:
+    """Sum over ``pairs`` of the share of points that lie within ``WITNESS_REACH`` of the other scan's surfaces."""
+    return float(sum(_share(keys, poses, i, j, WITNESS_REACH) for i, j in pairs.tolist()))
+
+
+def _share(keys: list[Keyframe], poses: Array, i: int, j: int, reach: float = CELL) -> float:
+    """Share of the points of keyframe ``j`` that find a partner in ``i`` nearer than ``reach``, m."""
+    _, _, found = normal_equations(keys[j].scan, keys[i].cloud, between(poses[i], poses[j]), reach)
+    return found / max(len(keys[j].scan), 1)
 
 
 def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:

@@ -155,8 +155,9 @@ class LocalisationEstimator:
     def trajectory(self) -> None:
         """See ``Estimator``: the poses were estimated one by one."""
 
-    def finish(self) -> None:
+    def finish(self) -> bool:
         """See ``Estimator``: there is nothing to optimise."""
+        return False
 
     def _track(
         self, scan: Scan, delta: Array, guess: Array, covariance: Array, mount: Vector

@@ -185,14 +185,20 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
         return match
 
-    def finish(self) -> None:
-        """Search for remaining loop closures and register all keyframes jointly: seconds of work."""
-        if len(self.map):
-            place = between(self.map.poses[-1], self._pose)
-            self._closer.review(self.map)
-            self.map.refine()
-            self._pose = compose(self.map.poses[-1], place)
-            self._look_around()
+    def finish(self) -> bool:
+        """Search for remaining loop closures and register all keyframes jointly: seconds of work.
+
+        Returns:
+            Whether the joint registration was kept (``KeyframeMap.refine``).
+        """
+        if not len(self.map):
+            return False
+        place = between(self.map.poses[-1], self._pose)
+        self._closer.review(self.map)
+        joint = self.map.refine()
+        self._pose = compose(self.map.poses[-1], place)
+        self._look_around()
+        return joint
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans, as the graph has them now."""
@@ -328,8 +334,8 @@ class Estimator(Protocol):
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
         ...
 
-    def finish(self) -> None:
-        """Optimise everything jointly."""
+    def finish(self) -> bool:
+        """Optimise everything jointly; False if the result was not kept."""
         ...
 
 
@@ -430,10 +436,10 @@ class MappingEstimator:
         """See ``Estimator``."""
         return self.mapper.trajectory()
 
-    def finish(self) -> None:
+    def finish(self) -> bool:
         """See ``Estimator``."""
-        self.mapper.finish()
         self._moved = True
+        return self.mapper.finish()
 
     def _draw_submap(self) -> None:
         """Add the keyframes of a submap to the grid, which waited until it was joined to the map."""

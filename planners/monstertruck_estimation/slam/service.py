@@ -340,7 +340,8 @@ class SlamService:
 
     def _report_saved(self, outputs: WorkerOutput) -> None:
         if outputs.saved is not None:
-            self._events(Reason.MAP_SAVED, Severity.INFO, self.name, outputs.saved)
+            poses = {None: "", True: ", poses by joint registration", False: ", poses by the graph"}[outputs.joint]
+            self._events(Reason.MAP_SAVED, Severity.INFO, self.name, f"{outputs.saved}{poses}")
         if outputs.error is not None:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")
 

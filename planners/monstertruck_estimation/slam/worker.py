@@ -64,14 +64,13 @@ class SlamWorker:
                         made = replace(made, disagreement=self._witness.compare(scan, made))
                     if made is not None and MappingEvent.PRUNED in made.events:
                         give_back()
-        if inputs.finish:
-            estimator.finish()
+        joint = estimator.finish() if inputs.finish else None
         tiles, redrawn = estimator.changes() if inputs.tiles else ([], False)
         whole = estimator.patch() if inputs.whole or redrawn else None
         saved, error = self._save(inputs, estimator)
         trajectory = estimator.trajectory() if inputs.trajectory else None
         counts = dict(estimator.counts)
-        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory)
+        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory, joint)
 
     def _begin(self, start: Start) -> None:
         config = start.config

@@ -155,3 +155,5 @@ class WorkerOutput:
     """Why the map could not be saved."""
     trajectory: tuple[NDArray[np.int64], Array] | None = None
     """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
+    joint: bool | None = None
+    """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""

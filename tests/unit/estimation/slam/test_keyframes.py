@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam import keyframes
 from monstertruck_estimation.slam.keyframes import Trajectory
+from monstertruck_estimation.slam.mapping import Mapper
+from tests.unit.estimation.slam.kit import rounds, scan
+from tests.unit.estimation.slam.test_relocation import HALL
 
 
 def straight(count: int = 9, every: int = 4) -> tuple[Trajectory, np.ndarray]:
@@ -39,3 +43,33 @@ def test_a_trail_of_one_key_scan_follows_it():
     stamps, poses = trail.poses(np.array([[1.0, 2.0, 0.0]]))
     assert stamps.tolist() == [0, 1, 2]
     assert poses == pytest.approx(np.array([[1.0, 2.0, 0.0], [2.0, 2.0, 0.0], [3.0, 2.0, 0.0]]))
+
+
+@pytest.fixture(scope="module")
+def twice_round():
+    """Keyframes of two rounds through a hall, in which the second sees what the first saw."""
+    mapper = Mapper()
+    for k, pose in enumerate(rounds(160, 2.0, 3.6, 2.2)):
+        mapper.step(scan(HALL, pose), k * 10**8, pose)
+    return mapper.map
+
+
+def test_a_joint_registration_is_kept_only_where_views_far_apart_in_time_agree_better(twice_round, monkeypatch):
+    good = twice_round.poses.copy()
+    bent = good + 0.2 * np.sin(np.linspace(0, 9.0, len(good)))[:, None] * (1.0, 1.0, 0.0)
+    monkeypatch.setattr(keyframes, "refine", lambda *_: bent)
+    assert not twice_round.refine()
+    assert np.array_equal(twice_round.poses, good)
+    twice_round.poses = bent
+    monkeypatch.setattr(keyframes, "refine", lambda *_: good)
+    assert twice_round.refine()
+    assert np.array_equal(twice_round.poses, good)
+
+
+def test_views_that_judge_are_far_apart_in_time_and_no_partners(twice_round):
+    pairs = keyframes.witnesses(twice_round.frames, twice_round.poses, np.zeros(len(twice_round), int))
+    stamps = np.array([key.stamp for key in twice_round.frames])
+    assert len(pairs) > 10
+    assert np.diff(stamps[pairs], axis=1).min() >= 0.25 * (stamps[-1] - stamps[0])
+    partners = set(map(tuple, keyframes.partners(twice_round.poses).tolist()))
+    assert not partners & set(map(tuple, pairs.tolist()))
