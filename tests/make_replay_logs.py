@@ -18,6 +18,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Role
+from monstertruck_sim.world.obstacles import Box
 from monstertruckd.config.load import load_config, load_tree
 from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.demo.runs import run_fast_demo, write_overlay
@@ -31,14 +32,14 @@ FOLDER = ROOT / "tests" / "data" / "replay"
 RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8), "fusion": ("fusion.yaml", 0.6)}
 """Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and two that map."""
 GOALS = ((0.2, -1.7), (0.42, -1.72))
-"""ActorFactory (x, y) that the run ``goals`` drives to: asked for by topic, and by remote call."""
+"""Places (x, y) that the run ``goals`` drives to: asked for by topic, and by remote call."""
 PLANNER = {
     "route": {"kind": "hybrid", "effort": 3000, "unknown": "free"},
     "local_planner": {"kind": "rsband"},
     "local": {"clearance": 0.6},
     "latency": 0.2,
 }
-"""Of that run: so much clearance is wanted that every route is deformed."""
+"""Of that run: so much clearance is wanted that a box beside the routes deforms them."""
 
 
 def short_config(source: Path, folder: Path, **changes: Any) -> Path:
@@ -74,6 +75,7 @@ def drive_to_goals(folder: Path) -> None:
             operator = LocalOperator(rig.daemon, clock)
             states = rig.bus.subscribe(topics.GOAL, fifo(256))
             await clock.sleep(0.73)
+            rig.world.add(clock.now(), Box(0.8, -1.35, 0.2, 0.2))
             for number, (x, y) in enumerate(GOALS, start=1):
                 gate, now = rig.bus.newest(topics.GATE), clock.now()
                 assert gate is not None

@@ -35,7 +35,7 @@ def complete_planner(incomplete: str) -> Iterator[tuple[str, str]]:
 
 
 def complete_role(incomplete: str) -> list[str]:
-    """ActorFactory for devices in a configuration."""
+    """Roles of devices in a configuration."""
     from monstertruck_drivers.config import Devices
 
     return [role for role in Devices.model_fields if role.startswith(incomplete)]

@@ -24,7 +24,7 @@ APPROACH: Final = 0.6
 JUST_BEFORE: Final = 0.03
 """A change of steering, m: more than the spacing of the reference."""
 BETWEEN: Final = 4
-"""ActorFactory per period whose mean is the reference."""
+"""Samples per period whose mean is the reference."""
 
 
 @dataclass(frozen=True, slots=True)

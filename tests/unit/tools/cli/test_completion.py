@@ -27,7 +27,7 @@ def test_configurations_of_the_folder(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_shell_gets_them():
-    asked = {"_MONSTERTRUCKD_COMPLETE": "complete_bash", "COMP_WORDS": "monstertruckd echo state/g", "COMP_CWORD": "2"}
+    asked = {"_MONSTERTRUCKD_COMPLETE": "complete_bash", "COMP_WORDS": "monstertruckd echo state/ga", "COMP_CWORD": "2"}
     done = subprocess.run(
         [sys.executable, "-c", "from monstertruckd.tools.cli.main import app; app(prog_name='monstertruckd')"],
         cwd=ROOT,
