@@ -153,7 +153,8 @@ async def _watched(
     watching = asyncio.create_task(_say_why_it_stands(gate, clock))
     ending = asyncio.ensure_future(end)
     try:
-        if arm:
+        if arm and not ((state := gate.latest) is not None and state.mode.active):
+            # A truck that is armed already may have set off.
             try:
                 await driver.arm()
             except RequestRefusedError as error:
