@@ -196,8 +196,8 @@ class SimulatedCompass:
 
     The accelerometer feels the reaction to gravity and to the body's own acceleration, and pitch and roll are what it
     takes for the vertical. The level field is turned by the deviation curve and by noise, tilted with the body,
-    distorted by the truck's iron and by the motor's current; the heading is what a compensation by that pitch and roll
-    makes of it.
+    distorted by the truck's iron and by the motor's current; the heading is what a compensation by the true tilt makes
+    of it: errors of the heading while the body accelerates are not modelled.
     """
 
     def __init__(self, plant: TruckPlant, config: CompassModelConfig, seed: int | None) -> None:
@@ -231,8 +231,8 @@ class SimulatedCompass:
         field = self._distorted(_to_body(level, pitch, roll))
         forward, left = self._plant.acceleration
         force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0), pitch, roll)
-        pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         x, y, _ = _to_level(field, pitch, roll)
+        pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
         return CompassReading(
             heading_deg=degrees(atan2(y, x)) % 360.0,

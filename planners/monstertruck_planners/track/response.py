@@ -216,6 +216,8 @@ MOVED: Final = 0.01
 """An estimate that differs by less than this from the one in use changes nothing, s."""
 SURE: Final = 3.0
 """Standard deviations by which the estimate must differ from the configured response to contradict it."""
+SURE_AGAIN: Final = 1.0
+"""Standard deviations within which it must come back for the configured response to count again."""
 DIFFERENT: Final = 0.03
 """And this, s: what is not modelled looks like a delay of this size."""
 DIVIDED: Final = 0.05
@@ -236,9 +238,9 @@ def choose(used: Response, configured: Response | None, estimate: ResponseEstima
     """
     found = estimate.response
     if configured is not None:
-        share = 1.0 if used == configured else 0.5
-        near = abs(found.total - configured.total) <= SURE * estimate.deviation + share * DIFFERENT
-        alike = abs(found.dead_time - configured.dead_time) <= SURE * estimate.shape_deviation + share * DIVIDED
+        sure, share = (SURE, 1.0) if used == configured else (SURE_AGAIN, 0.5)
+        near = abs(found.total - configured.total) <= sure * estimate.deviation + share * DIFFERENT
+        alike = abs(found.dead_time - configured.dead_time) <= sure * estimate.shape_deviation + share * DIVIDED
         if near and alike:
             return configured
     new = rounded(estimate)
