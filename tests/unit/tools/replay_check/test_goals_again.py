@@ -109,7 +109,7 @@ def test_routes_of_another_planner_are_held_against_those_that_were_driven(tmp_p
     assert path.greatest[Kind.LENGTH].value > 0.001
     assert rows[topics.POSE].differing == 0
     goal = rows[topics.GOAL].first
-    assert goal is None or set(goal.fields) <= {"outcome", "text"}, "how near to the end of another route"
+    assert goal is None or set(goal.fields) <= {"remaining", "outcome", "text"}, "of another route"
 
 
 def test_another_deformation_shows_where_it_begins(tmp_path):
