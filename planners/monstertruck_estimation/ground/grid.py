@@ -1,13 +1,12 @@
 """Tilt and roughness of the ground by cells, from what the robot felt driving over it and what tilted scans hit."""
 
 import io
-import math
 import zipfile
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
@@ -29,6 +28,8 @@ PATCH: Final = 0.3
 """Side of the squares a plane is fitted to, m."""
 FEWEST: Final = 8
 """Points of such a plane."""
+KEY: Final = 1 << 24
+"""Makes one number of two of a cell or square."""
 SPREAD: Final = 0.05
 """Standard deviation they need in every direction, m."""
 
@@ -49,20 +50,23 @@ class GroundGrid:
         """Whether nothing was observed."""
         return not self._counts.any()
 
-    def observe(self, points: Array, tilt: float, roughness: float) -> None:
+    def observe(self, points: Array, tilt: ArrayLike, roughness: ArrayLike) -> None:
         """Count an observation of the cells of ``points``, (n, 2), m.
 
         Args:
-            points: one or more in each cell that is observed.
-            tilt: of the ground, rad.
-            roughness: standard deviation of its height, m.
+            points: one or more in each cell that is observed; the first one counts.
+            tilt: of the ground, rad; one value or n.
+            roughness: standard deviation of its height, m; one value or n.
         """
-        cells = np.unique(np.floor(points / RESOLUTION).astype(np.int64), axis=0)
+        cells = np.floor(points / RESOLUTION).astype(np.int64)
+        _, first = np.unique(cells[:, 0] * KEY + cells[:, 1], return_index=True)
+        cells = cells[first]
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
             return
         columns, rows = (cells - self._corner).T
         count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, REMEMBERED)
-        for layer, value in ((self._tilt, tilt), (self._roughness, roughness)):
+        for layer, values in ((self._tilt, tilt), (self._roughness, roughness)):
+            value = np.broadcast_to(values, len(points))[first]
             layer[rows, columns] += (value - layer[rows, columns]) / count
 
     def message(self, stamp: int, seq: int, frame: str) -> Ground:
@@ -143,28 +147,28 @@ class GroundGrid:
         return True
 
 
-def planes(points: Array) -> list[tuple[Array, float, float]]:
+def planes(points: Array) -> tuple[Array, Array, Array]:
     """Planes through points on the ground, square by square.
 
     Args:
         points: shape (n, 3), m.
 
     Returns:
-        For each square with enough of them: its points (k, 2), the plane's tilt, rad, and the standard deviation of
-        the heights about it, m.
+        The points in squares with enough of them, (k, 2), with the tilt of their square's plane, (k,), rad, and the
+        standard deviation of the heights about it, (k,), m.
     """
-    found = []
-    squares = np.floor(points[:, :2] / PATCH).astype(np.int64)
-    _, which = np.unique(squares, axis=0, return_inverse=True)
-    for number in range(int(which.max(initial=-1)) + 1):
-        own = points[which.reshape(-1) == number]
-        if len(own) < FEWEST:
-            continue
-        centred = own - own.mean(axis=0)
-        moments = centred[:, :2].T @ centred[:, :2] / len(own)
-        if np.linalg.eigvalsh(moments)[0] < SPREAD**2:
-            continue
-        slope = np.linalg.solve(moments, centred[:, :2].T @ centred[:, 2] / len(own))
-        rest = centred[:, 2] - centred[:, :2] @ slope
-        found.append((own[:, :2], math.atan(math.hypot(*slope)), float(rest.std())))
-    return found
+    x, y = np.floor(points[:, :2] / PATCH).astype(np.int64).T
+    _, which, counts = np.unique(x * KEY + y, return_inverse=True, return_counts=True)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(which, values, len(counts)) / counts)
+
+    dx, dy, dz = (values - mean(values)[which] for values in points.T)
+    xx, xy, yy, xz, yz, zz = (mean(a * b) for a, b in ((dx, dx), (dx, dy), (dy, dy), (dx, dz), (dy, dz), (dz, dz)))
+    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    good = (counts >= FEWEST) & (least >= SPREAD**2)
+    determinant = np.where(good, xx * yy - xy**2, 1.0)
+    along, across = (yy * xz - xy * yz) / determinant, (xx * yz - xy * xz) / determinant
+    rough = np.sqrt(np.maximum(zz - along * xz - across * yz, 0.0))
+    tilt, chosen = np.arctan(np.hypot(along, across)), good[which]
+    return points[chosen, :2], tilt[which][chosen], rough[which][chosen]

@@ -81,16 +81,15 @@ def test_planes_through_points_of_slopes_and_of_rough_ground():
     rng = np.random.default_rng(2)
     xy = rng.uniform((0.0, 0.0), (0.29, 0.29), (200, 2))
     slope = np.column_stack((xy, 0.1 * xy[:, 0]))
-    ((points, tilt, roughness),) = planes(slope)
-    assert len(points) == 200
+    points, tilt, roughness = planes(np.vstack((slope, slope + np.array((0.6, -0.3, 1.0)), [(5.0, 5.0, 0.0)])))
+    assert len(points) == len(tilt) == len(roughness) == 400, "a lone point makes no plane"
     assert tilt == pytest.approx(math.atan(0.1), abs=1e-6)
-    assert roughness == pytest.approx(0.0, abs=1e-9)
+    assert roughness == pytest.approx(0.0, abs=1e-6)
     slope[:, 2] += rng.normal(0.0, 0.02, 200)
-    assert planes(slope)[0][2] == pytest.approx(0.02, rel=0.15)
+    assert planes(slope)[2] == pytest.approx(0.02, rel=0.15)
 
 
 def test_a_line_of_points_makes_no_plane():
     line = np.column_stack((np.linspace(0, 0.29, 50), np.full(50, 0.1), np.zeros(50)))
-    assert planes(line) == []
-    assert planes(np.empty((0, 3))) == []
-    assert planes(np.array([(0.1, 0.1, 0.0)])) == []
+    for points in (line, np.empty((0, 3)), np.array([(0.1, 0.1, 0.0)])):
+        assert not any(map(len, planes(points)))
