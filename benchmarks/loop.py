@@ -187,6 +187,7 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
             for task in tasks:
                 if not task.cancel():
                     task.result()
+            await asyncio.wait(tasks)  # a cancelled lap disarms
             subscriber.stdin.close()
             received = int(await subscriber.stdout.readline())
     found = json.loads(report.read_text())
