@@ -180,7 +180,7 @@ class Link:
         A time limit is one timer for many waits, set anew only when it rings.
 
         Raises:
-            RuntimeError: somebody waits already.
+            RuntimeError: a task waits already.
         """
         if self._waiting is not None:
             raise RuntimeError(f"{self.name}: two readers")

@@ -25,7 +25,7 @@ Steps = Generator[Need, bytes, T]
 
 
 class Talk(Generic[T]):
-    """One conversation, begun at once and carried to its end whether or not somebody waits for it.
+    """One conversation, begun at once and carried to its end whether or not a task waits for it.
 
     Args:
         link: of which it is the only reader until it has ended.
@@ -112,7 +112,7 @@ class Talk(Generic[T]):
                     return
         except StopIteration as stop:
             self._finish(stop.value, None)
-        except Exception as raised:  # noqa: BLE001  # for whoever waits
+        except Exception as raised:  # noqa: BLE001  # raised where the result is awaited
             self._finish(None, raised)
 
     def _finish(self, value: T | None, error: BaseException | None) -> None:

@@ -99,7 +99,7 @@ class EmulatedComputer:
         return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
 
     def command(self, words: list[str]) -> None:
-        """Obey one word on the USB tree, see ``HELP``; a hub that returns takes its time.
+        """Execute one word on the USB tree, see ``HELP``; a hub that returns takes its time.
 
         Raises:
             InputError: it is not understood, or there is no such place.

@@ -57,6 +57,6 @@ def _load_error(row: Any) -> str | None:
         row.implementation_class()
     except InputError as error:
         return str(error)
-    except Exception as raised:  # noqa: BLE001  # whatever somebody else's module does
+    except Exception as raised:  # noqa: BLE001  # whatever the plug-in's module does
         return f"{type(raised).__name__}: {raised}"
     return None

@@ -1,4 +1,4 @@
-"""The daemon's side: it alone writes the calibration, where its user may, and tells which file it runs on."""
+"""The daemon's side: it alone writes the calibration, where its user may, and says which file it runs on."""
 
 import json
 from collections.abc import Callable

@@ -128,7 +128,7 @@ class PlainFormatter(logging.Formatter):
 def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> bool:
     """Whether systemd's journal reads ``stream``: JOURNAL_STREAM names its device and inode (systemd.exec(5)).
 
-    The variable alone does not tell, as it is inherited by whoever has its output elsewhere.
+    The variable alone is no proof: processes whose output goes elsewhere inherit it.
     """
     named = environment.get("JOURNAL_STREAM")
     if named is None:

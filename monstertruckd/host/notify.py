@@ -51,7 +51,7 @@ def watchdog_seconds(environment: Mapping[str, str], pid: int) -> float | None:
 
 
 class NotifyService:
-    """Tells systemd READY once the daemon is up and the tick runs, then pings while the tick keeps its pace.
+    """Sends systemd READY once the daemon is up and the tick runs, then pings while the tick keeps its pace.
 
     Args:
         send: where lines go.

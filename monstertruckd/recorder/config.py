@@ -66,7 +66,7 @@ class BlackBoxConfig(Schema):
     interval: Annotated[float, Field(ge=0)] = 60.0
     """Least seconds between two boxes of one reason; a trip meanwhile waits for it, at most ``before``."""
     unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
-    """Reasons without a box: by default what somebody ordered."""
+    """Reasons without a box: by default what an operator ordered."""
 
 
 class MapRender(Schema):

@@ -130,7 +130,7 @@ class LogWriter:
             return file
 
     def _keep_quota(self) -> None:
-        """Remove the oldest files that exceed the quota; never one that somebody is writing or repairing."""
+        """Remove the oldest files that exceed the quota; never one that is being written or repaired."""
         excess = self._file.size + sum(self._others.values()) - self._config.quota_bytes
         for path, size in list(self._others.items()):
             if excess <= 0:

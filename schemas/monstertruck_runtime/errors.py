@@ -36,7 +36,7 @@ class BusyError(TruckError):
 
 
 class NotPermittedError(TruckError):
-    """The user lacks a right; the text tells how to get it."""
+    """The user lacks a right; the text says how to get it."""
 
     reason = Reason.NOT_PERMITTED
 

@@ -80,7 +80,7 @@ async def supervise(
 ) -> None:
     """Run ``service`` again and again by ``policy`` until cancelled, reporting its health.
 
-    A service that returns, or ends by somebody else's cancellation, is as much a bug as an unexpected exception.
+    A service that returns, or ends by another task's cancellation, is as much a bug as an unexpected exception.
 
     Args:
         service: what to run.
@@ -206,7 +206,7 @@ class Scope:
         """End all services, newest first and each completely, whatever cancels the owner meanwhile.
 
         Returns:
-            True if the owner was cancelled meanwhile by somebody else, who must still hear of it.
+            True if the owner was cancelled meanwhile by another task, which must still be informed.
         """
         self._ending = True
         disturbed = False

@@ -79,7 +79,7 @@ class ExtensibleTable(Mapping[str, R]):
                     if getattr(row, "name", entry.name) != entry.name
                     else self.fault(row)
                 )
-            except (Exception, SystemExit) as raised:  # noqa: BLE001  # whatever somebody else's module does
+            except (Exception, SystemExit) as raised:  # noqa: BLE001  # whatever the plug-in's module does
                 error = f"{type(raised).__name__}: {raised}"
             if error is None:
                 rows[entry.name], origins[entry.name] = row, origin

@@ -73,7 +73,7 @@ class Stop(Message):
     mode: GateMode
     """State of the gate after it."""
     ordered: bool = False
-    """Somebody ordered an ordinary end of driving."""
+    """An operator ordered an ordinary end of driving."""
     quick: bool = False
     """By the drive's quick stop instead of its ordinary ramp."""
     holder: str | None = None

@@ -110,7 +110,7 @@ class SlamHealth(Message):
     closures: Annotated[int, Field(ge=0)] = 0
     """Loops closed."""
     rejected: Annotated[int, Field(ge=0)] = 0
-    """Matches that were not believed."""
+    """Rejected matches."""
     left_out: Annotated[int, Field(ge=0)] = 0
     """Scans that were too tilted, empty, late or of another geometry."""
     drops: Annotated[int, Field(ge=0)] = 0

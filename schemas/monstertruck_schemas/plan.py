@@ -75,7 +75,7 @@ class GoalPhase(StrEnum):
     """What is being done about a goal."""
 
     IDLE = "idle"
-    """Nothing: there is none, or ``outcome`` tells how the last one ended."""
+    """Nothing: there is none, or ``outcome`` says how the last one ended."""
     PLANNING = "planning"
     DRIVING = "driving"
     BACKING_OUT = "backing_out"

@@ -85,7 +85,7 @@ class DriveRequest(Request):
     @model_validator(mode="after")
     def _one_form(self) -> Self:
         if self.twist is not None and (self.speed, self.front, self.rear) != (0.0, 0.0, 0.0):
-            raise ValueError("a request has one form: expected speed, front and rear of 0 beside twist")
+            raise ValueError("a request has one form: expected speed, front and rear of 0 with a twist")
         return self
 
     @property

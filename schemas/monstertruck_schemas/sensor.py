@@ -150,7 +150,7 @@ class Battery(Message):
 
 
 class CompressedImage(Message):
-    """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera tells."""
+    """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera states it."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
 

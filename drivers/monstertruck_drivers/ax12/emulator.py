@@ -35,7 +35,7 @@ class Ax12Bus:
     """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` makes exchanges as long as real ones.
 
     The adapter lives from USB, the units from the 12 V rail: unplugging leaves them as they are, ``power off``
-    silences all of them while the port stays. Two units with one number both obey, and garble each other's answers.
+    silences all of them while the port stays. Two units with one number both answer, and garble each other's answers.
     Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
     (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``reset ID``
     (factory), ``renumber ID NEW``, ``latch on|off`` (error bits outlast their cause), ``echo on|off``, and for the
@@ -187,7 +187,7 @@ class Ax12Bus:
     # Serving
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve whoever has the port open."""
+        """Serve the host that has the port open."""
         parser, heard = Parser(), 0
         while True:
             data = await end.read()

@@ -22,7 +22,7 @@ async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) ->
 
     Raises:
         DeviceLostError: not plugged in.
-        DeviceTimeoutError: silence; the text tells what to check.
+        DeviceTimeoutError: silence; the text says what to check.
         WrongDeviceError: bytes, but no unit.
         PortBusyError: another process holds the port.
     """

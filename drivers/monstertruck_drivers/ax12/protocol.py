@@ -11,7 +11,7 @@ from typing import Final, Self
 
 HEADER: Final = b"\xff\xff"
 BROADCAST: Final = 254
-"""Unit number that all units obey and none answers."""
+"""Unit number that all units execute and none answers."""
 ID_MAX: Final = 253
 LONGEST: Final = 150
 """Greatest length byte a parser waits for; what lies beyond is taken for damage."""
@@ -127,7 +127,7 @@ RESERVED: Final = frozenset(range(TABLE_SIZE)) - {r.address + i for r in REGISTE
 """Addresses without meaning."""
 
 PRESENT_SIZE: Final = 8
-"""Bytes from ``PRESENT_POSITION`` to the temperature: one read tells a unit's whole state."""
+"""Bytes from ``PRESENT_POSITION`` to the temperature: one read holds a unit's whole state."""
 
 
 def slope_of(value: int) -> int:

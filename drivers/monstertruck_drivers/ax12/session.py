@@ -125,7 +125,7 @@ class Ax12Session:
         Args:
             request: whole packet.
             count: data bytes the answer should have.
-            wanted: tells the answer from late ones to earlier requests.
+            wanted: distinguishes the answer from late ones to earlier requests.
         """
         await self._clock.sleep_until(self._quiet_until)
         self._link.discard()

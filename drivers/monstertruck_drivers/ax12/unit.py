@@ -42,7 +42,7 @@ HISTORY: Final = 1024
 
 
 class Unit:
-    """Device side of one servo; time passes when somebody asks.
+    """Device side of one servo; time advances when its state is read.
 
     The shaft follows the goal with a speed proportional to the drive, which grows over the compliance slope from the
     margin on, is never below the punch, and is cut by torque limit and moving speed. A load slows it down.

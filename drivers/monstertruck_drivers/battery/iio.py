@@ -102,7 +102,7 @@ def channel(converter: Converter, number: int, full_scale: int | None = None) ->
     """Prepare a channel.
 
     Raises:
-        DeviceMismatchError: the converter has no such channel, or tells no scale.
+        DeviceMismatchError: the converter has no such channel, or states no scale.
         DeviceError: see ``read_text``.
     """
     stem = f"in_voltage{number}"

@@ -87,7 +87,7 @@ class Exchanger:
         self._node = node
         self._flight: Talk[Any] | None = None
         self._hurried = False
-        """Somebody waits for the end of the row that is read."""
+        """A task waits for the end of the exchange that is read."""
         self.quiet_until = quiet_until
         """Instant from which the controller listens again; in the past while all is well."""
         self.strange = b""
@@ -330,7 +330,7 @@ class _BusyError(Exception):
 
 
 class _HeldUpError(Exception):
-    """The wait outlasted its own limit: the controller has long forgotten this exchange and hears a new one at once."""
+    """The wait outlasted its own limit: the controller has long dropped this exchange and accepts a new one at once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
 
-Three tasks run for ever: one hears request lines, one answers them a little later, and one is the rotor,
+Three tasks run for ever: one reads request lines, one answers them a little later, and one is the rotor,
 which turns on a 100 ms grid of the sensor's own clock whether or not anybody listens. A stream, once asked
 for, goes on until QT, RS, its count or the supply ends it; a host that dies changes nothing.
 
@@ -39,7 +39,7 @@ LEAST_MM: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class ScanOrder:
-    """A scan somebody asked for."""
+    """A requested scan."""
 
     command: str
     """MD, MS, GD, GS or G."""
@@ -203,7 +203,7 @@ class HokuyoEmulator:
     async def run(self, end: DeviceEnd) -> None:
         """Serve for ever."""
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._listen(end), name=f"{self.name} hears")
+            tasks.create_task(self._listen(end), name=f"{self.name} requests")
             tasks.create_task(self._serve(end), name=f"{self.name} answers")
             tasks.create_task(self._turn(end), name=f"{self.name} turns")
 

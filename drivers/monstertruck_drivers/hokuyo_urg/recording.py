@@ -96,7 +96,7 @@ def _parse(line: str, where: str) -> tuple[int, NDArray[np.int32]]:
 class RecordedHokuyoEmulator(HokuyoEmulator):
     """Scanner that turns when the recorded one did; reports steps 43..725 as the recorded one.
 
-    The first request for a stream starts the recording, which then runs through once, whoever listens.
+    The first request for a stream starts the recording, which then runs through once, whether or not anything listens.
 
     Args:
         clock: the world's time.

@@ -144,7 +144,7 @@ def parse_parameters(fields: dict[str, str]) -> Parameters:
         and found.rpm > 0
     )
     if not sound:
-        raise ProtocolError(f"SCIP: PP tells an impossible geometry: {found}")
+        raise ProtocolError(f"SCIP: PP states an impossible geometry: {found}")
     return found
 
 
@@ -482,7 +482,7 @@ class ScipSession:
         if "URG" not in names:
             raise WrongDeviceError(f"{self._link.name}: expected a URG scanner, found {names!r}")
         if sensor.state is not None and not sensor.identity.protocol.startswith("SCIP 2"):
-            raise ProtocolError(f"{self._link.name}: expected SCIP 2, the sensor tells {sensor.identity.protocol!r}")
+            raise ProtocolError(f"{self._link.name}: expected SCIP 2, the sensor states {sensor.identity.protocol!r}")
         wanted, found = self._config.serial_number, sensor.identity.serial
         if wanted is not None and found != wanted:
             raise WrongDeviceError(f"{self._link.name}: expected unit {wanted}, found {found}")

@@ -18,7 +18,7 @@ async def probe(port: Port, clock: Clock, settings: MaestroConfig | None = None)
 
     Raises:
         DeviceLostError: not plugged in.
-        DeviceTimeoutError: silence; the text tells what to check.
+        DeviceTimeoutError: silence; the text says what to check.
         WrongDeviceError: another device.
         PortBusyError: another process holds the port.
     """

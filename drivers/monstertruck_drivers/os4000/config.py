@@ -17,7 +17,7 @@ class IronConfig(Schema):
     """The truck's own magnetism, to be taken out of the measured field: ``soft (field - hard)``, device axes.
 
     As calibrated on level ground: the vertical field is left as it is, and ``soft`` is scaled to determinant 1. With
-    the values below the unit's own heading is believed; with any others it is computed here.
+    the values below the unit's own heading is used; with any others it is computed here.
     """
 
     hard_x: float = 0.0

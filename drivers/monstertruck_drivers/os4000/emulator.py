@@ -159,7 +159,7 @@ class Os4000Emulator:
         self._boot()
 
     async def run(self, end: DeviceEnd) -> None:
-        """Stream and obey."""
+        """Stream, and execute commands."""
         self._end = end
         end.on_plug = self._plugged
         self._boot()

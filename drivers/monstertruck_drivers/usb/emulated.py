@@ -78,7 +78,7 @@ class EmulatedUsb:
         self.refused: set[str] = set()
         """Attributes that may not be written, as for a user without rights: ``latency_timer`` ..."""
         self.busy_numbers: set[int] = set()
-        """Node numbers still taken by somebody who has a vanished node open."""
+        """Node numbers still taken by a process that has a vanished node open."""
         self.commands: list[Sequence[str]] = []
         """Programs that were run."""
         self._things: dict[str, _Thing] = {}

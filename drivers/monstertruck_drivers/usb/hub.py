@@ -114,7 +114,7 @@ class HubCoordinator:
     def _waits(self, slot: _Slot) -> bool:
         return slot.free_at is None or max(slot.free_at, slot.held_until) > self._clock.now()
 
-    # What the watching service tells
+    # Called by the watching service
 
     def update(self, snapshot: TreeSnapshot) -> None:
         """Take a new look at the tree into account, and whatever has come due since the last one."""
@@ -360,7 +360,7 @@ def _nothing() -> None:
 BURST: Final = 0.02
 """Seconds in which announcements are gathered: a hub announces dozens at once."""
 IMPATIENT: Final = 0.5
-"""Seconds between two looks while somebody waits for a hub."""
+"""Seconds between two looks while a driver waits for a hub."""
 PERIOD: Final = SECOND
 """Nanoseconds between two trees when nothing changes."""
 

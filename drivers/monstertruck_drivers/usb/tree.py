@@ -41,7 +41,7 @@ class UsbDevice:
 
     name: str
     devnum: int
-    """Address; a new one is given at every enumeration, so it tells a replug from no change."""
+    """Address; a new one is given at every enumeration, so it distinguishes a replug from no change."""
     usb_id: str
     hub: bool
     title: str

@@ -18,7 +18,7 @@ class WebcamConfig(Schema):
     rate: Annotated[float, Field(gt=0, le=120)] = 15.0
     """Pictures a second; the camera takes the nearest it has"""
     watchdog: Annotated[float, Field(gt=0, le=60)] = 2.0
-    """Seconds without a whole picture that end the session: a stuck camera tells nothing"""
+    """Seconds without a whole picture that end the session: a stuck camera reports nothing"""
     buffers: Annotated[int, Field(ge=2, le=32)] = 4
     """Pictures the kernel may keep for us"""
     frame: FrameId = "camera"

@@ -66,7 +66,7 @@ def _follow(data: bytes) -> tuple[int, bool]:
 
 
 OLDEST: Final = SECOND
-"""Nanoseconds a picture may have taken to arrive; its stamp is not believed beyond."""
+"""Nanoseconds a picture may have taken to arrive; its stamp is not used beyond."""
 
 
 class WebcamDriver:
@@ -77,7 +77,7 @@ class WebcamDriver:
         source: the camera: ``V4l2Source`` or ``RenderedSource``.
         clock: time; a real camera's stamps are of CLOCK_MONOTONIC, as the wall clock is.
         out: pictures.
-        events: modes that differ, pictures refused, stamps not believed.
+        events: modes that differ, pictures refused, stamps not used.
         name: service name.
     """
 

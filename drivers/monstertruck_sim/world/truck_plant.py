@@ -2,7 +2,7 @@
 
 Steps are 5 ms: a quarter of the fastest lag (which is integrated exactly anyway), a quarter of a servo frame, and at
 0.22 m/s a body point moves less than 2 mm a step, so testing the footprint after each step misses no cell. A step
-ends early at the instant somebody asks for; the grid itself never shifts.
+ends early at the requested instant; the grid itself never shifts.
 """
 
 from collections import deque

@@ -48,7 +48,7 @@ WHEELBASE: Final = 0.003
 WAY: Final = 0.02
 """Share by which the way may be wrong while the drive is not calibrated."""
 SHORT: Final = math.radians(2.0)
-"""Servo angle, rad, that has to be missing before a stop is believed; circles keep as far from the ends."""
+"""Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
 MARGIN: Final = 1.0
 """Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
 SCALE: Final = 0.02

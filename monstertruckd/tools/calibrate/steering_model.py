@@ -1,7 +1,7 @@
 """From pulses to the truck's turns, and back: the fit behind the steering wizard.
 
 Both axles are steered, so a turn shows the difference of their angles only: wz = v_x (tan front - tan rear) / L.
-Driving arcs with one axle at a time tells the gain of each, and straight driving the difference of their centres. Equal
+Driving arcs with one axle at a time shows the gain of each, and straight driving the difference of their centres. Equal
 errors of both centres make the truck crab without turning, which no compass sees: they show as a sideways offset from a
 string, and faintly as unlike circles to the left and to the right, as far as the linkage is what it is taken for.
 """
@@ -39,9 +39,9 @@ LINKAGE: Final = 0.005
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
 DEFICIT: Final = 0.3
-"""Standard deviation of a coefficient of the turn deficit, where nothing else tells: 5 % of the turn at full lock."""
+"""Standard deviation of a coefficient of the turn deficit before it is measured: 5 % of the turn at full lock."""
 GAIN: Final = 0.15
-"""Share by which a pulse map may differ from the configured one, where nothing else tells."""
+"""Share by which a pulse map may differ from the configured one, before anything is measured."""
 
 
 _HALVINGS: Final = 40
@@ -148,10 +148,10 @@ class SteeringModel:
         """Angle, rad, of an axle at its servo angle, the other one straight."""
         return self.axles(maps).angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
-    def commands(self, servos: Sequence[float], true: Maps, believed: Maps) -> tuple[float, float]:
-        """Axle angles, rad, to command of a daemon with the maps ``believed`` for servo angles, rad, by ``true``."""
-        front, rear = (float(believed.servo(i, true.pulses(i, np.array(servo)))) for i, servo in enumerate(servos))
-        return self.axles(believed).angles(front, rear)
+    def commands(self, servos: Sequence[float], true: Maps, configured: Maps) -> tuple[float, float]:
+        """Axle angles, rad, to command of a daemon with the maps ``configured`` for servo angles, rad, by ``true``."""
+        front, rear = (float(configured.servo(i, true.pulses(i, np.array(servo)))) for i, servo in enumerate(servos))
+        return self.axles(configured).angles(front, rear)
 
     def predict(self, legs: Sequence[SteeringRun], maps: Maps) -> tuple[Array, Array]:
         """Turns, rad, and sideways offsets, m, left positive, of legs; (n,) each."""
@@ -177,7 +177,7 @@ class SteeringModel:
         Args:
             legs: driven.
             start: first guess, directions right.
-            gain: share within which the scales are believed beforehand.
+            gain: share within which the scales are known beforehand.
         """
         guess = start.parameters
         sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self.way(leg))) for leg in legs])

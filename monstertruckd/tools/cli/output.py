@@ -37,7 +37,7 @@ WIDE_CELL: Final = 48
 
 
 def on_terminal(stream: TextIO | None) -> bool:
-    """Whether somebody looks at a standard stream, which is None if it was closed before the start."""
+    """Whether a standard stream is a terminal, which is None if it was closed before the start."""
     return stream is not None and stream.isatty()
 
 
@@ -81,7 +81,7 @@ def _plain(value: Any) -> Any:
 
 
 def console(*, error: bool = False) -> "Console":
-    """Where styled text goes: plain and uncut unless somebody looks at it."""
+    """Where styled text goes: plain and uncut unless it is a terminal."""
     from rich.console import Console
 
     class PipedConsole(Console):
@@ -143,7 +143,7 @@ def remark(text: str) -> None:
 
 @contextmanager
 def progress(what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
-    """A bar on standard error, if somebody looks at it; yields a function that sets how much of ``total`` is done.
+    """A bar on standard error, if that is a terminal; yields a function that sets how much of ``total`` is done.
 
     Args:
         what: is being done, in a word or two.

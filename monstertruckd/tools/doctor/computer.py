@@ -106,7 +106,9 @@ async def access(context: HostContext) -> AsyncIterator[Finding]:
     outside = [endpoint for endpoint in zenoh.listen if not _address(endpoint).startswith(LOOPBACK)]
     opened = [endpoint for endpoint in outside if not endpoint.startswith("tls/")]
     if opened:
-        seen = f"zenoh.listen {', '.join(opened)}: whoever reaches it may drive the truck; use tls/... with zenoh.tls"
+        seen = (
+            f"zenoh.listen {', '.join(opened)}: anyone who reaches it may drive the truck; use tls/... with zenoh.tls"
+        )
         yield fail("access", Reason.LINK_OPEN, seen)
     elif outside:
         yield fine("access", f"{', '.join(outside)}, by certificate")
@@ -155,7 +157,7 @@ async def _expiry(context: HostContext, certificate: Path) -> AsyncIterator[Find
 
 
 def _listening(context: HostContext) -> set[int]:
-    """Local TCP ports on which somebody listens."""
+    """Local TCP ports on which a process listens."""
     rows = [
         line.split()
         for name in ("tcp", "tcp6")

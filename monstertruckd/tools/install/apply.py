@@ -31,7 +31,7 @@ from monstertruckd.tools.install.plan import (
 )
 
 UNFINISHED: Final = FOLDER / ".unfinished"
-"""There while an installation is under way: if it breaks off, the next one tells the programs all the same."""
+"""There while an installation is under way: if it breaks off, the next one notifies the programs all the same."""
 BOOTED: Final = Path("/run/systemd/system")
 """There while systemd runs, see sd_booted(3)."""
 FILES: Final = (ENABLED, UNIT, RULES, MODULES, TMPFILES, SYSUSERS)
@@ -46,7 +46,7 @@ class Change(StrEnum):
     SAME = "same"
     REMOVED = "removed"
     MASKED = "masked"
-    """A link to /dev/null is in its place: somebody has switched it off."""
+    """A link to /dev/null is in its place: it was masked."""
 
 
 @dataclass(slots=True)

@@ -1,6 +1,6 @@
 """Trajectories as text of the TUM benchmark: one line ``t x y z qx qy qz qw`` per scan, metres and seconds.
 
-A scan's stamp, and the pose estimated for it, are of its first beam. Whoever draws a whole scan at one pose, or
+A scan's stamp, and the pose estimated for it, are of its first beam. To draw a whole scan at one pose, or
 compares poses with another system, needs that of the middle: so each line has the time of the middle of the sweep, by
 the clock of the log, and the pose at that time (between the poses of neighbouring scans).
 """

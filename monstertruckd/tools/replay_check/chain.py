@@ -275,12 +275,12 @@ class Chain:
         return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
 
     def _turn_of(self, service: str, output: LogMessage) -> int:
-        """When that turn was, ns: what one of the goal service tells on the wall clock has several stamps."""
+        """When that turn was, ns: what one of the goal service publishes on the wall clock has several stamps."""
         near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
         return output.stamp if near is None else near
 
     async def _call(self, call: Call, instant: int) -> None:
-        """Somebody asked the goal service, at ``instant``, ns; whoever had a turn before goes first."""
+        """A request reached the goal service, at ``instant``, ns; earlier turns go first."""
         await asyncio.sleep(0)
         gate = self.bus.newest(topics.GATE)
         if self._goals is None or gate is None:

@@ -85,7 +85,7 @@ def gate_heading(
     A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating),
     disturbed if the device says so, the field's strength is not that of the start, or the local deviation has crept
     further than that. Neither locks the compass out:
-    ``config.recover`` good ones over ``config.regain`` let it in again (beside a magnet, too, there is a place where
+    ``config.recover`` good ones over ``config.regain`` let it in again (next to a magnet, too, there is a place where
     the heading is right), and so does one that is steadily off for ``config.patience``, as a
     new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it.
     """

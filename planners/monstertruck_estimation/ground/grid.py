@@ -87,7 +87,7 @@ class GroundGrid:
         )
 
     def save(self, folder: Path) -> None:
-        """Write the grid beside a saved map.
+        """Write the grid next to a saved map.
 
         Raises:
             OSError: it could not be written.

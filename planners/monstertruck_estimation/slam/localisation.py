@@ -55,7 +55,7 @@ def submap_of(saved: SavedMap) -> Submap:
         return Submap(Cloud.of(merged(saved.graph.scans, saved.graph.poses)))
     surfaces = surface_elements(saved.grid)
     if not len(surfaces):
-        msg = "the map has no occupied cells beside free ones: nothing to localise in"
+        msg = "the map has no occupied cells next to free ones: nothing to localise in"
         raise InputError(msg)
     return Submap(Cloud.of(surfaces))
 

@@ -191,7 +191,7 @@ def surface_elements(grid: WorldMap) -> Scan:
     if not len(cells):
         return elements(np.zeros((0, 2)), normals=np.zeros((0, 2)), variances=np.zeros((0, 2)))
     normals, straight, aside = _fitted(cells, towards, max(NORMAL_REACH / step, NORMAL_CELLS))
-    # A free cell beside a wall is one cell from the middle of the wall's cells.
+    # A free cell next to a wall is one cell from the middle of the wall's cells.
     points = (cells + aside - normals + 0.5) * step + np.array(grid.origin)
     across = WALL_NOISE**2 + step**2 / 12
     variances = np.stack((np.full(len(points), across), np.where(straight, SLIDE**2, across)), axis=-1)

@@ -1,1 +1,1 @@
-"""Goals: from a pose that somebody asks for to standing there, or to a reason why not."""
+"""Goals: from a requested pose to the truck at rest there, or to the reason why not."""

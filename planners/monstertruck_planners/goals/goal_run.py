@@ -171,7 +171,7 @@ def order(run: GoalRun, what: GoalOrder, source: str, now: float) -> Step:
 
 
 def displaced(run: GoalRun, text: str) -> Step:
-    """Somebody else's path is followed now: end without touching it."""
+    """Another source's path is followed: end without touching it."""
     ended, actions = _end(run, Reason.CANCELLED, text, Severity.WARNING)
     return ended, tuple(action for action in actions if not isinstance(action, Halt))
 

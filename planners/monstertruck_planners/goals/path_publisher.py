@@ -100,7 +100,7 @@ class PathPublisher:
 
     @property
     def displaced(self) -> bool:
-        """Whether somebody else's path is followed."""
+        """Whether another source's path is followed."""
         return self.followed is not None and self._in.path.latest is not self.followed.message
 
     def follow(self, answer: PlanAnswer, name: str, before: float = 0.0) -> None:

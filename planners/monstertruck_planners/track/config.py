@@ -33,7 +33,7 @@ class TrackerConfig(Schema):
     """Lease of each request, s."""
     steering: Steering = "counter"
     """Steered axles where the path does not say: one alone; both by opposite or (keeping the heading) equal angles;
-    or hybrid, opposite for the curve and equal for what is beside it"""
+    or hybrid, opposite for the curve and equal for the lateral error"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.362
     """Greatest axle angle, rad: with both axles opposite a circle of 0.42 m; less where the servos reach less."""
     speed: Positive = 0.18

@@ -28,7 +28,7 @@ BASES: Final[dict[Steering, Array]] = {
 """Columns: axle tangents (front, rear) of one unit of input."""
 
 LEAST_LAG: Final = 1e-3
-"""AxleModel that obey at once are taken to need this long, s."""
+"""Axles that answer at once are taken to need this long, s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,7 +166,7 @@ class TruckState(NamedTuple):
     """Whether the axles do what the tracker requests."""
     heading: tuple[float, float] | None = None
     """Instant (s) and yaw (rad, in any frame) of a measurement that does not depend on the requests; None: there is no
-    compass, and the pose's yaw tells how the truck turns."""
+    compass, and the pose's yaw shows how the truck turns."""
 
 
 @dataclass(slots=True)

@@ -35,10 +35,10 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
             return self._hybrid(state, ahead, aside, goal.tangent)
         arm = {"front": -self.geometry.l_r, "rear": self.geometry.l_f}.get(state.steering, 0.0)
         if arm == 0.0:
-            # The turning centre lies beside the base point: the arc is tangent to the truck there.
+            # The turning centre lies abeam of the base point: the arc is tangent to the truck there.
             turn = 2 * aside / max(ahead**2 + aside**2, LEAST_SQUARE)
         elif arm * direction < 0:
-            # The turning centre lies beside the axle behind; still it is the base point that has to meet the goal.
+            # The turning centre lies abeam of the rear axle; still it is the base point that has to meet the goal.
             turn = 2 * aside / max(ahead**2 + aside**2 - 2 * arm * ahead, LEAST_SQUARE)
         else:
             # The fixed axle leads, and only its own arc is stable: it has to meet its own goal.

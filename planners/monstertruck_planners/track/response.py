@@ -29,7 +29,7 @@ EARLY: Final = 1e-6
 PAUSE: Final = 0.5
 """Poses further apart in time than this are not compared, s."""
 EXPECTED: Final = (0.05, 0.08)
-"""Mean and standard deviation of dead time and lag together of a truck that nobody has measured, s."""
+"""Mean and standard deviation of dead time and lag together of a truck that was not measured, s."""
 GAIN: Final = 0.15
 """Standard deviation of the share by which the truck may turn more or less than requested."""
 TRIM: Final = 0.1

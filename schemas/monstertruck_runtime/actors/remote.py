@@ -1,7 +1,7 @@
 """Steps taken on another machine: it calls the robot for work and brings the outputs back.
 
-So the robot listens as always, and whoever may call it may compute for it (``monstertruckd plan-server``). What travels
-is JSON of known classes, see ``StepCodec``; nothing that comes in is executed.
+So the robot listens as always, and any client that may call it may compute for it (``monstertruckd plan-server``). What
+travels is JSON of known classes, see ``StepCodec``; nothing that comes in is executed.
 """
 
 import asyncio
