@@ -87,9 +87,15 @@ class Servo:
 
     def step(self, dt: float) -> None:
         """Turn towards the held pulse for dt seconds."""
-        while self._due and self._due[0][0] <= self._elapsed + 1e-9:
-            self._target = self._due.popleft()[1]
-        self._elapsed += dt
+        end = self._elapsed + dt
+        while self._due and self._due[0][0] < end - 1e-9:
+            at, target = self._due.popleft()
+            self._turn(at - self._elapsed)
+            self._elapsed, self._target = at, target
+        self._turn(end - self._elapsed)
+        self._elapsed = end
+
+    def _turn(self, dt: float) -> None:
         if self._held_us is not None:
             lag = self._config.lag
             target = self._target if lag == 0.0 else self._target + (self.angle - self._target) * exp(-dt / lag)

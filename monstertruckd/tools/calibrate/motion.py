@@ -94,9 +94,7 @@ class Mover:
         run.track.left = self._clock.now()
         way, since = 0.0, self._clock.now()
         while True:
-            side = 1
-            if move.weave:
-                side = -1 if (self._clock.now() - run.track.left) // round(move.weave * SECOND) % 2 else 1
+            side = move.side((self._clock.now() - run.track.left) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
             new = abs(run.track.way(self._drivetrain))
             report(new)

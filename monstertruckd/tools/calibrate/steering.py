@@ -218,6 +218,7 @@ class SteeringWizard:
             unobserved=(
                 "the wheelbase, whose error shows as scale, and the linkage but for what its turns lack",
                 "travel beyond the limits of gate and servo",
+                "an error of devices.compass.driver.delay, which shows as dead time of the steering",
                 *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
             ),
         )

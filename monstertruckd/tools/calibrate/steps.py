@@ -1,5 +1,6 @@
 """Steps of a wizard: what it may ask of the operator and the truck, and what the sensors measured during a move."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -136,10 +137,19 @@ class MoveStep:
     """Seconds of standing still at each end"""
     approach: float = 0.0
     """Axle angle from which straight wheels are turned to where they shall be, rad: servos stop short of their goal"""
-    weave: float = 0.0
-    """Seconds after which the axle angles change their sign, again and again, while it drives; 0 = never"""
+    weave: tuple[float, ...] = ()
+    """Seconds after which the axle angles change their sign while it drives, in turn, again and again; none: never"""
     done: Callable[[MoveRecord], bool] | None = None
     """Ends the way earlier"""
+
+    def side(self, seconds: float) -> int:
+        """Sign of the axle angles so long after the truck set off."""
+        if not self.weave:
+            return 1
+        ends = list(itertools.accumulate(self.weave))
+        rounds, left = divmod(seconds, ends[-1])
+        changes = int(rounds) * len(ends) + sum(end <= left for end in ends)
+        return -1 if changes % 2 else 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,3 +34,9 @@ def test_a_servo_turns_with_its_lag():
     for k in (3, 20, 50):
         expected = math.radians(10) * -math.expm1(-max((k + 1) * STEP - 0.02, 0.0) / 0.1)
         assert found[k] == pytest.approx(expected, rel=0.01, abs=1e-9)
+
+
+def test_a_servo_moves_when_its_dead_time_ends_within_a_step():
+    found = angles(dead_time=0.0625, lag=0.1)
+    assert not any(found[:12])
+    assert found[12] == pytest.approx(math.radians(10) * -math.expm1(-0.0025 / 0.1), rel=0.01)

@@ -14,10 +14,12 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
-from monstertruckd.tools.calibrate.response import ANGLE, SPEED, WEAVE, estimates, response, weaves
-from monstertruckd.tools.calibrate.steps import MoveRecord
+from monstertruckd.tools.calibrate.response import ANGLE, HALF_FRAME, SPEED, WEAVE, estimates, response, weaves
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 CHASSIS = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
+STEP = 0.001
+"""s."""
 MOTOR = SPEED / 0.075 * 644.0
 """rad/s."""
 
@@ -25,42 +27,47 @@ MOTOR = SPEED / 0.075 * 644.0
 def record(dead_time, lag, direction=1, gain=0.9, seconds=12.0, noise=0.002, seed=1):
     """What is read of a truck that weaves; commands are ramped as the gate does."""
     rng = np.random.default_rng(seed)
-    found, waiting = MoveRecord(), deque([0.0] * round(dead_time / 0.01))
-    command = angle = yaw = 0.0
-    for k in range(round(seconds / 0.01)):
-        t = round((1.0 + k * 0.01) * SECOND)
+    found, waiting = MoveRecord(), deque([0.0] * round(dead_time / STEP))
+    move, command, angle, yaw = weaves(1)[0], 0.0, 0.0, 0.0
+    for k in range(round(seconds / STEP)):
+        t = round((1.0 + k * STEP) * SECOND)
         header = {"stamp": t, "received": t, "seq": k}
-        if k % 2 == 0:
-            wanted = ANGLE if int(k * 0.01 / WEAVE) % 2 == 0 else -ANGLE
+        if k % 20 == 0:
+            wanted = move.side(k * STEP) * ANGLE
             command += min(max(wanted - command, -0.02), 0.02)
             found.commands.append(
                 SteeringCommand(**header, front=command, rear=-command, front_servo=0.0, rear_servo=0.0)
             )
-        if k % 5 == 0:
+        if k % 50 == 0:
             heading = (-yaw + noise * rng.standard_normal()) % math.tau
             found.attitude.append(Attitude(**header, heading=heading, roll=0.0, pitch=0.0))
             found.drive.append(
                 DriveFeedback(
-                    **header, position=direction * MOTOR * 0.01 * k, velocity=direction * MOTOR, mode=DriveMode.ENABLED
+                    **header, position=direction * MOTOR * STEP * k, velocity=direction * MOTOR, mode=DriveMode.ENABLED
                 )
             )
         waiting.append(command)
-        angle += (1.0 if lag == 0.0 else -math.expm1(-0.01 / lag)) * (waiting.popleft() - angle)
-        yaw += 0.01 * gain * CHASSIS.bicycle.body_twist(direction * SPEED, angle, -angle)[2]
+        before = angle
+        angle += (1.0 if lag == 0.0 else -math.expm1(-STEP / lag)) * (waiting.popleft() - angle)
+        middle = 0.5 * (before + angle) if lag else angle
+        yaw += STEP * gain * CHASSIS.bicycle.body_twist(direction * SPEED, middle, -middle)[2]
     return found
 
 
-@pytest.mark.parametrize(("dead_time", "lag"), [(0.0, 0.0), (0.02, 0.06), (0.12, 0.05)])
-def test_their_sum_is_known_to_ten_milliseconds(dead_time, lag):
-    records = [record(dead_time, lag, sign, seed=seed) for seed in (1, 2, 3) for sign in (1, -1)]
-    by_name = {estimate.name: estimate for estimate in estimates(response(records, CHASSIS))}
-    delay = by_name["delay"]
-    # What is commanded acts for a tick of the gate before the next one: half a tick more.
-    assert delay.low - 0.005 <= dead_time + lag <= delay.high + 0.005
-    assert (delay.high - delay.low) / 2 < 0.010
+@pytest.mark.parametrize(
+    ("dead_time", "lag"), [(0.0, 0.0), (0.02, 0.06), (0.037, 0.0), (0.042, 0.013), (0.093, 0.031), (0.12, 0.05)]
+)
+@pytest.mark.parametrize("seed", [10, 20])
+def test_dead_time_and_lag_lie_in_narrow_intervals(dead_time, lag, seed):
+    records = [record(dead_time, lag, sign, seed=seed + k) for k in (1, 2, 3) for sign in (1, -1)]
+    found = response(records, CHASSIS)
+    assert found.delay.value == pytest.approx(dead_time + lag, abs=0.002)
+    assert found.delay.half < HALF_FRAME + 0.002
+    by_name = {estimate.name: estimate for estimate in estimates(found)}
     assert by_name["dead_time"].low <= dead_time <= by_name["dead_time"].high
     assert by_name["lag"].low <= lag <= by_name["lag"].high
-    assert delay.key is None
+    assert by_name["lag"].high - by_name["lag"].value < 0.020
+    assert by_name["delay"].key is None
     assert by_name["lag"].key == "devices.steering.driver.lag"
 
 
@@ -72,3 +79,11 @@ def test_a_truck_that_does_not_turn_is_refused():
 def test_it_weaves_ahead_and_back():
     assert [move.speed for move in weaves(2)] == [SPEED, -SPEED, SPEED, -SPEED]
     assert all(move.weave == WEAVE for move in weaves(1))
+
+
+def test_sides_change_in_turn_and_long_arcs_go_to_both():
+    move = MoveStep("weaving", 0.1, weave=(0.25, 0.25, 1.0))
+    assert [move.side(t) for t in (0.0, 0.2, 0.25, 0.5, 1.4, 1.5, 1.75, 2.0, 2.9, 3.0)] == [
+        1, 1, -1, 1, 1, -1, 1, -1, -1, 1,
+    ]  # fmt: skip
+    assert MoveStep("straight", 0.1).side(5.0) == 1
