@@ -36,7 +36,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
-from monstertruckd.assembly.devices import Cabling, build_drivers, of_duty, sensor_services
+from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
@@ -47,7 +47,7 @@ from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate import rpc as gate_rpc
 from monstertruckd.gate.core import Gate
-from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch
+from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService
 from monstertruckd.host.journal import published
@@ -69,7 +69,8 @@ class Daemon:
         tree: origins of the configuration's values, kept with the log.
         seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
-        environment: socket and watchdog period of systemd (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``).
+        environment: what systemd gives a service: socket and watchdog period (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``),
+            ``RUNTIME_DIRECTORY``.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class Daemon:
         )
         self._drivers = build_drivers(config, self._cabling, self._computer, clock, self.bus)
         self._body = Body.of(config)
-        self.gate = self._build_gate()
+        self.gate = self._build_gate(environment)
         self.bus.listen(topics.REQ_CONTROL, self.gate.control)
         self.bus.listen(topics.REQ_DRIVE, self.gate.request)
         self.bus.listen(topics.PLAN_DRIVE, self.gate.planner_request)
@@ -267,9 +268,9 @@ class Daemon:
 
     # Building
 
-    def _build_gate(self) -> GateService:
+    def _build_gate(self, environment: Mapping[str, str]) -> GateService:
         config, bus = self.config, self.bus
-        latch = self._build_latch()
+        latch = self._build_latch(environment)
         nonce = secrets.token_hex(8) if self._seed is None else self._rng.bytes(8).hex()
         gate = Gate(
             config.gate,
@@ -278,6 +279,7 @@ class Daemon:
             points=self._body.points,
             services=sensor_services(config),
             nonce=nonce,
+            battery_measured=measures_battery(config),
             latched=latch.engaged(),
         )
         shafts = len(self._body.chassis.shafts)
@@ -301,16 +303,18 @@ class Daemon:
             latch,
             black_box=lambda trip: None if self.black_box is None else self.black_box.trip(trip),
             offload=self._offload,
+            weakened=config.weakened(),
         )
 
-    def _build_latch(self) -> Latch:
+    def _build_latch(self, environment: Mapping[str, str]) -> Latch:
         if self._seed is not None:
             return MemoryLatch()
-        latch = EstopLatch(self.config.state_directory / "estop")
+        marks = marks_folder(self.config.runtime_directory, environment)
+        latch = EstopLatch(self.config.state_directory / "estop", marks)
         try:
             latch.prepare()
         except OSError as error:
-            msg = f"state_directory: an emergency stop could not be remembered: {error}"
+            msg = f"state_directory, runtime_directory: an emergency stop could not be remembered: {error}"
             raise ConfigError(msg) from error
         return latch
 

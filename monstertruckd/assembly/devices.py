@@ -139,6 +139,14 @@ def sensor_services(config: TruckConfig) -> dict[str, Reason]:
     }
 
 
+def measures_battery(config: TruckConfig) -> bool:
+    """Whether anything is configured to measure the battery."""
+    steering = config.devices.steering
+    return config.monitors.battery is not None or (
+        steering is not None and getattr(steering.driver, "battery", None) is not None
+    )
+
+
 def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:
     """Those of the drivers that are there for one of ``duties``."""
     return {role: driver for role, driver in drivers.items() if DEVICES.roles[role].duty in duties}

@@ -27,6 +27,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
+from monstertruckd.gate.ceilings import SIGHT, BodyLimits, beyond, weakened
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
@@ -48,6 +49,10 @@ class Geometry(Schema):
     """Metres, bumper to bumper"""
     width: Metres = 0.34
     """Metres, over the wheels"""
+    mass: Annotated[float, Field(gt=0, le=1000)] = 7.25
+    """Kilograms"""
+    pull: Annotated[float, Field(gt=0, le=10_000)] = 25.0
+    """Newtons: greatest force of all driven wheels at the ground, as where the slipper clutch slips"""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -122,6 +127,9 @@ class TruckConfig(Schema):
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
     """Where the e-stop latch is kept"""
+    runtime_directory: Path | None = None
+    """Folder on a tmpfs for the mark of an emergency stop that is not yet on the disk; null = that of the service, of
+    the user, or /run"""
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
     sim: Any = None
@@ -155,6 +163,31 @@ class TruckConfig(Schema):
             return Path(self.blackbox.directory)
         return None if self.blackbox is None or self.recorder is None else Path(self.recorder.directory) / "blackbox"
 
+    @property
+    def body_limits(self) -> BodyLimits:
+        """What bounds the motion of this body."""
+        geometry, lidar = self.geometry, self.devices.lidar
+        metres = 2 * math.pi * geometry.wheel_radius / (60 * geometry.drive_ratio)
+        rates = [d.driver.max_motor_rpm for d in self.devices.shafts().values() if isinstance(d.driver, EposConfig)]
+        return BodyLimits(
+            length=geometry.length,
+            mass=geometry.mass,
+            pull=geometry.pull,
+            motor_speed=min(rates) * metres if rates else None,
+            sight=None if lidar is None else SIGHT - geometry.length / 2 + lidar.mount.x,
+        )
+
+    def weakened(self) -> tuple[str, ...]:
+        """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
+        usual = EposConfig()
+        return weakened(self.gate) + tuple(
+            f"devices.{role}.driver.{name} {value:g}, default {default:g}"
+            for role, device in self.devices.shafts().items()
+            if isinstance(device.driver, EposConfig)
+            for name in ("command_timeout", "quick_stop_after")
+            if (value := getattr(device.driver, name)) > (default := getattr(usual, name))
+        )
+
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""
         chassis = self.chassis()
@@ -166,6 +199,8 @@ class TruckConfig(Schema):
     @model_validator(mode="after")
     def _complete(self) -> Self:
         self._check_actuators()
+        for excess in beyond(self.gate, self.body_limits):
+            raise ValueError(excess)
         self._check_planner()
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")

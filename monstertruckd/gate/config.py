@@ -17,7 +17,7 @@ Share = Annotated[float, Field(ge=0)]
 class SensorLimit(Schema):
     """When one sensor is stale, and what that means."""
 
-    stale_after: Positive
+    stale_after: Annotated[float, Field(gt=0, le=60)]
     """Age of the newest valid sample, s since the daemon received it, from which on the sensor is stale."""
     critical: bool = True
     """A stale sensor stops the truck; otherwise only the limits derived from it lapse."""

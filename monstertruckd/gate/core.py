@@ -83,6 +83,8 @@ class GateOutput(NamedTuple):
     reasons: tuple[Reason, ...]
     stopping_distance: float
     """M."""
+    waiting: tuple[str, ...]
+    """Planners that request motion while nobody drives."""
     events: tuple[GateEvent, ...]
     trips: tuple[Trip, ...]
 
@@ -97,6 +99,7 @@ class Gate:
         points: converts scans to points in base.
         services: the services of the sensors, with the reason their loss gives.
         nonce: of this run; requests must carry it.
+        battery_measured: something is there to measure the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
     """
 
@@ -109,12 +112,13 @@ class Gate:
         points: ScanPoints,
         services: Mapping[str, Reason],
         nonce: str,
+        battery_measured: bool,
         latched: bool = False,
     ) -> None:
         self._config = config
         self._chassis = chassis
         self._sources = Sources(nonce, config)
-        self._sensors = SensorMonitor(config, chassis, services)
+        self._sensors = SensorMonitor(config, chassis, services, battery_measured=battery_measured)
         self._outages = Outages(services)
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._motion = Motion(config, chassis)
@@ -292,7 +296,7 @@ class Gate:
         moving = self.mode is GateMode.STOPPING or not self._sensors.at_rest(now)
         if moving or self._sources.motion_requested(now, OPERATORS):
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request)
-        self._sources.release()
+        self._sources.release(planners=not request.hold)
         self._states.arm(now, request.source)
         return ACCEPTED
 
@@ -445,6 +449,7 @@ class Gate:
             speed_limit=min(limits.values(), default=self._config.speed) if moving_allowed else 0.0,
             reasons=reasons,
             stopping_distance=self._limiter.stopping_distance(now),
+            waiting=self._sources.waiting(now) if holder is None else (),
             events=self._events.drain(),
             trips=self._stops.drain(now),
         )

@@ -1,16 +1,38 @@
-"""Persistent latch of the emergency stop: a file that exists while the stop is latched."""
+"""Persistent latch of the emergency stop: a file that exists while the stop is latched, and a mark in memory before it.
 
+Storing a file so that it outlasts a loss of power takes the disk's time. Meanwhile the mark holds the stop: one byte of
+a file on a tmpfs, which outlasts the process but not the computer.
+"""
+
+import hashlib
 import os
+import stat
 import threading
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
+
+FREE: Final = b"0"
+MARKED: Final = b"1"
 
 
 class Latch(Protocol):
     """Persistent flag."""
 
     def engaged(self) -> bool:
-        """Whether the emergency stop is latched."""
+        """Whether the emergency stop is latched, by the file or by the mark."""
+        ...
+
+    def stored(self) -> bool:
+        """Whether the file says so, which outlasts a loss of power."""
+        ...
+
+    def mark(self, engaged: bool) -> None:
+        """Set or clear the mark; never blocks.
+
+        Raises:
+            OSError: it could not be written.
+        """
         ...
 
     def store(self, engaged: bool) -> None:
@@ -19,6 +41,10 @@ class Latch(Protocol):
         Raises:
             OSError: it could not be stored.
         """
+        ...
+
+    def close(self) -> None:
+        """Remove the mark: the disk agrees, and nothing changes any more."""
         ...
 
 
@@ -32,9 +58,57 @@ class MemoryLatch:
         """Whether the emergency stop is latched."""
         return self._engaged
 
+    def stored(self) -> bool:
+        """The same: there is no disk."""
+        return self._engaged
+
+    def mark(self, engaged: bool) -> None:
+        """Nothing: memory needs no mark."""
+
     def store(self, engaged: bool) -> None:
         """Set the flag."""
         self._engaged = engaged
+
+    def close(self) -> None:
+        """Nothing to remove."""
+
+
+class Mark:
+    """One byte of a file that is kept open: writing it needs neither a name, nor space, nor the disk.
+
+    Args:
+        path: the file, on a tmpfs. Damaged contents count as marked.
+
+    Raises:
+        OSError: it cannot be opened, or is not a file of this user alone.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        status = os.fstat(self._file)
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_nlink != 1:
+            os.close(self._file)
+            raise PermissionError(f"{path} is not a file of this user alone")
+        if status.st_size == 0:
+            self.set(marked=False)  # from here on there is space for the byte
+
+    def engaged(self) -> bool:
+        """Whether the mark is set."""
+        return os.pread(self._file, 2, 0) != FREE
+
+    def set(self, *, marked: bool) -> None:
+        """Write the mark.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        os.pwrite(self._file, MARKED if marked else FREE, 0)
+
+    def close(self) -> None:
+        """Remove the file."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._file)
 
 
 class EstopLatch:
@@ -42,13 +116,32 @@ class EstopLatch:
 
     Args:
         path: the file.
+        marks: folder of the mark, on a tmpfs; the mark's name follows from ``path``.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, marks: Path) -> None:
         self._path = path
         self._storing = threading.Lock()
+        self._mark: Mark | None = None
+        name = hashlib.blake2s(os.fsencode(path.resolve()), digest_size=8).hexdigest()
+        self._mark_path = marks / f"monstertruckd-estop-{name}"
+
+    def prepare(self) -> None:
+        """Check that the latch can be stored later, and open the mark.
+
+        Raises:
+            OSError: the file could not be created, or the mark not be opened.
+        """
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        os.close(self._draft())
+        self._draft_path.unlink()
+        self._mark = Mark(self._mark_path)
 
     def engaged(self) -> bool:
+        """Whether the file exists, or the mark is set."""
+        return self.stored() or (self._mark is not None and self._mark.engaged())
+
+    def stored(self) -> bool:
         """Whether the file exists; a directory that cannot be searched counts as latched."""
         try:
             self._path.lstat()
@@ -58,16 +151,14 @@ class EstopLatch:
             return True
         return True
 
-    def prepare(self) -> None:
-        """Check that the latch can be stored later.
+    def mark(self, engaged: bool) -> None:
+        """Set or clear the mark, once it is open.
 
         Raises:
-            OSError: its directory cannot be created or written.
+            OSError: it could not be written.
         """
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        draft = self._path.with_name(self._path.name + ".new")
-        draft.write_bytes(b"")
-        draft.unlink()
+        if self._mark is not None:
+            self._mark.set(marked=engaged)
 
     def store(self, engaged: bool) -> None:
         """Create or remove the file, atomically and synced to the disk.
@@ -78,16 +169,30 @@ class EstopLatch:
         with self._storing:
             if engaged:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                draft = self._path.with_name(self._path.name + ".new")
-                with draft.open("w") as file:
+                with os.fdopen(self._draft(), "w") as file:
                     file.write("emergency stop latched\n")
                     file.flush()
                     os.fsync(file.fileno())
-                draft.replace(self._path)
+                self._draft_path.replace(self._path)
             else:
                 self._path.unlink(missing_ok=True)
             if self._path.parent.exists():
                 self._sync_directory()
+
+    def close(self) -> None:
+        """Remove the mark."""
+        mark, self._mark = self._mark, None
+        if mark is not None:
+            mark.close()
+
+    @property
+    def _draft_path(self) -> Path:
+        return self._path.with_name(self._path.name + ".new")
+
+    def _draft(self) -> int:
+        """A new file to be written; what was there under its name, a link too, is removed and never followed."""
+        self._draft_path.unlink(missing_ok=True)
+        return os.open(self._draft_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
 
     def _sync_directory(self) -> None:
         directory = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
@@ -95,3 +200,20 @@ class EstopLatch:
             os.fsync(directory)
         finally:
             os.close(directory)
+
+
+def marks_folder(configured: Path | None, environment: Mapping[str, str], system: Path = Path("/")) -> Path:
+    """Folder for marks: the configured one, or the first usable one of systemd's, the user's and the computer's.
+
+    Args:
+        configured: ``runtime_directory`` of the configuration.
+        environment: ``RUNTIME_DIRECTORY`` of a service of systemd.
+        system: root of the computer's files.
+    """
+    if configured is not None:
+        return configured
+    given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)
+    usual: Iterable[Path] = (system / f"run/user/{os.geteuid()}", system / "run")
+    return next((folder for folder in usual if os.access(folder, os.W_OK | os.X_OK)), system / "dev/shm")

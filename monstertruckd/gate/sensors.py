@@ -91,10 +91,14 @@ class SensorMonitor:
         config: limits.
         chassis: kinematics of the body.
         services: what is stale at once when a service reports its loss.
+        battery_measured: something is there to measure the battery.
     """
 
-    def __init__(self, config: GateConfig, chassis: Chassis, services: Mapping[str, Reason]) -> None:
+    def __init__(
+        self, config: GateConfig, chassis: Chassis, services: Mapping[str, Reason], *, battery_measured: bool
+    ) -> None:
         self._config = config
+        self._battery_measured = battery_measured
         self._services = services
         self._chassis = chassis
         self.scan: LaserScan | None = None
@@ -254,15 +258,15 @@ class SensorMonitor:
         self, fresh: bool, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
     ) -> None:
         battery = self.battery
-        if battery is None:
-            return
-        values["battery_voltage"] = battery.voltage
-        # A pack that was critical stays so when its sensor becomes stale.
-        if battery.level is BatteryLevel.CRITICAL:
-            blocks.append(Reason.BATTERY_CRITICAL)
-        elif battery.level is BatteryLevel.LOW:
-            limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
-        if not fresh and not self._config.battery.critical:
+        if battery is not None:
+            values["battery_voltage"] = battery.voltage
+            # A pack that was critical stays so when its sensor becomes stale.
+            if battery.level is BatteryLevel.CRITICAL:
+                blocks.append(Reason.BATTERY_CRITICAL)
+            elif battery.level is BatteryLevel.LOW:
+                limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
+        known = self._battery_measured or battery is not None
+        if known and not fresh and not self._config.battery.critical:
             limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
 
     def staleness(self, stale: Reason, now: int) -> Staleness:

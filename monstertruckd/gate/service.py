@@ -110,6 +110,7 @@ class GateService:
         latch: keeps the emergency stop over restarts.
         black_box: called with every stop as it happens; returns the file that will hold the minute before, if any.
         offload: runs the storing of the latch, which blocks.
+        weakened: settings less safe than the defaults, shown to everybody.
     """
 
     name = "gate"
@@ -125,8 +126,10 @@ class GateService:
         latch: Latch,
         black_box: Callable[[Trip], str | None] = lambda _: None,
         offload: Offload = in_thread,
+        weakened: tuple[str, ...] = (),
     ) -> None:
         self._gate = gate
+        self._weakened = weakened
         self._rate = rate
         self._clock = clock
         self._outputs = outputs
@@ -136,8 +139,10 @@ class GateService:
         """Number of the newest stop, and its black box."""
         self._latch = latch
         self._offload = offload
-        self._latched: bool | None = latch.engaged()
+        self._latched: bool | None = latch.stored()
         """State on the disk; None while it is being written."""
+        self._marked: bool | None = None
+        """The mark of the latch; None = not written in this run."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
         self._broken = asyncio.Event()
@@ -204,6 +209,9 @@ class GateService:
 
     async def run(self, ready: Ready) -> None:
         """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk."""
+        for setting in self._weakened:
+            log.warning("%s: %s", Reason.WEAKENED.text, setting)
+            self._events(Reason.WEAKENED, Severity.WARNING, self.name, setting)
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._keep_latch(), name="gate latch")
@@ -213,7 +221,8 @@ class GateService:
                 finally:
                     self.shut_down()  # before waiting for the disk
         finally:
-            await self._store_latch()
+            if await self._store_latch():
+                self._latch.close()
 
     async def _tick_for_ever(self, ready: Ready) -> None:
         schedule = Schedule(self._clock, self._rate, ahead=0)
@@ -250,13 +259,14 @@ class GateService:
                 deadman=Reason.DRIVE_STALE not in output.reasons,
             )
         )
+        self._mark_latch(output.mode)
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
         for trip in output.trips:
             stop = self._stop(trip, now)
             self._outputs.stops.put(stop)
             log.log(logging.INFO if stop.ordered else logging.WARNING, "%s", stop.text)
-        visible = (output.mode, output.holder, output.reasons)
+        visible = (output.mode, output.holder, output.reasons, output.waiting, self._latched)
         if visible != self._published or now - self._published_at >= STATE_PERIOD:
             self._published, self._published_at = visible, now
             self._outputs.state.put(self._state(output, now))
@@ -300,7 +310,24 @@ class GateService:
             stopping_distance=output.stopping_distance,
             form=output.form,
             twist=Twist2D(**dict(zip(("vx", "vy", "wz"), output.twist, strict=True))),
+            latched=self._latched is True,
+            weakened=self._weakened,
+            waiting=output.waiting,
         )
+
+    def _mark_latch(self, mode: GateMode) -> None:
+        """Mark an emergency stop before anybody is told of it, and clear the mark once the disk agrees.
+
+        The thread that stores the latch never touches the mark: a stop that is ordered while the one before is being
+        removed from the disk keeps its own.
+        """
+        marked = mode is GateMode.ESTOPPED and self._latched is not True
+        if marked != self._marked:
+            self._marked = marked
+            try:
+                self._latch.mark(marked)
+            except OSError as error:
+                self._report(error)
 
     async def _keep_latch(self) -> None:
         while True:

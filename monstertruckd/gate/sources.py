@@ -11,14 +11,16 @@ Rules:
 - Control passes to a higher role at once, to a lower one only after a new ARM order: once a role has driven, or has
   ordered a stop, lower roles are refused until the truck is armed again. So a tracker never continues by itself after
   an operator has released the stick.
-- After a STOP order every source must send a neutral request, or none for its lease, before it may drive again.
+- After a STOP order every source must send a neutral request before it may drive again, until the truck is armed again;
+  for one that was driving, none for its lease is as good. A source that is first heard after the stop is no exception.
+- An ARM order with ``hold`` keeps planners out until one without.
 """
 
 from dataclasses import dataclass
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.requests import OPERATORS, Sequences, freshness
+from monstertruck_runtime.requests import MAX_SOURCES, OPERATORS, Sequences, freshness
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruckd.gate.config import GateConfig
@@ -85,6 +87,8 @@ class Sources:
         self._orders = Sequences()
         self._drive: dict[Key, Source] = {}
         self._min_rank = 0
+        self._released: set[Key] | None = None
+        """Sources that were heard at the STOP order or have been neutral since; None = there was none."""
 
     def accept_request(self, request: DriveRequest, now: int) -> Reason:
         """OK, or why a drive request from outside is refused."""
@@ -115,7 +119,10 @@ class Sources:
         key = (inside, request.source)
         before = self._drive.get(key)
         source = Source(request, now + round(lease * SECOND), now, inside)
-        source.held = before is not None and before.held and now <= before.deadline and not source.neutral
+        if not source.neutral:
+            source.held = self._unheard(key) or (before is not None and before.held and now <= before.deadline)
+        elif self._released is not None and len(self._released) < MAX_SOURCES:
+            self._released.add(key)
         self._drive = {other: it for other, it in self._drive.items() if now <= it.deadline}
         self._drive[key] = source
         return source
@@ -157,11 +164,29 @@ class Sources:
 
     def hold(self) -> None:
         """Every source must send a neutral request before it may drive."""
+        self._released = set(self._drive)
         for source in self._drive.values():
             source.held = True
 
-    def release(self) -> None:
-        """End ``claim`` and ``hold``: the truck was armed again."""
-        self._min_rank = 0
+    def _unheard(self, key: Key) -> bool:
+        """Whether a source has neither been heard at the STOP order nor been neutral since."""
+        return self._released is not None and key not in self._released
+
+    def release(self, *, planners: bool) -> None:
+        """End ``claim`` and ``hold``: the truck was armed again.
+
+        Args:
+            planners: may drive as well.
+        """
+        self._min_rank = 0 if planners else PRIORITY[Role.STATION]
+        self._released = None
         for source in self._drive.values():
             source.held = False
+
+    def waiting(self, now: int) -> tuple[str, ...]:
+        """Names of the planners that request motion."""
+        return tuple(
+            source.request.source
+            for source in self.live(now)
+            if source.request.role is Role.TRACKER and not source.neutral
+        )

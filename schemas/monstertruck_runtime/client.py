@@ -310,11 +310,15 @@ class TruckClient(Operator):
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist))
 
-    def order(self, order: Order) -> Coroutine[Any, Any, GateState]:
+    def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
         An emergency stop or stop is published by this call itself, whatever is known of the robot and whether or not
         its outcome is awaited. Any other order that is still waiting for the robot's nonce then is withdrawn.
+
+        Args:
+            order: what.
+            hold: of an order to arm: planners do not drive until the truck is armed without it.
 
         Raises:
             RequestRefusedError: refused, or overtaken by a stop; carries the reason.
@@ -324,13 +328,13 @@ class TruckClient(Operator):
         if order in OVERTAKING:
             self._overtaking += 1
             self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
-        return self._outcome(order, self._overtaking)
+        return self._outcome(order, self._overtaking, {"hold": True} if hold else {})
 
-    async def _outcome(self, order: Order, overtaking: int) -> GateState:
+    async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:
         header = self._header(1.0) if order in OVERTAKING else await self._answered(1.0)
         if overtaking != self._overtaking and order not in OVERTAKING:
             raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: overtaken by a stop")
-        return wire.decode(GATE, await self._call(order.value, header, ORDER_TIMEOUT))
+        return wire.decode(GATE, await self._call(order.value, header | more, ORDER_TIMEOUT))
 
     async def goal(
         self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()

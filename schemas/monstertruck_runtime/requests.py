@@ -44,8 +44,12 @@ class Operator(Protocol):
         """Call ``rpc`` with a JSON object; returns its answer."""
         ...
 
-    def order(self, order: Order) -> Coroutine[Any, Any, GateState]:
+    def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
+
+        Args:
+            order: what.
+            hold: of an order to arm: planners do not drive until the truck is armed without it.
 
         Raises:
             RequestRefusedError: refused; carries the reason.
@@ -54,9 +58,9 @@ class Operator(Protocol):
         """
         ...
 
-    async def arm(self) -> GateState:
-        """Allow driving; answered once armed. Raises as ``order`` does."""
-        return await self.order(Order.ARM)
+    async def arm(self, *, hold: bool = False) -> GateState:
+        """Allow driving, unless ``hold`` by planners too; answered once armed. Raises as ``order`` does."""
+        return await self.order(Order.ARM, hold=hold)
 
     async def disarm(self) -> GateState:
         """Stop and forbid driving; answered once disarmed. Raises as ``order`` does."""

@@ -81,6 +81,7 @@ class Reason(StrEnum):
     STEERING_DEAD = "steering_dead", 66, "the truck does not turn as it is steered"
     IMPOSSIBLE_MOTION = "impossible_motion", 67, "this body cannot move like that"
     SERVO_LIMIT = "servo_limit", 68, "a steering servo is at the end of its range: less steering than requested"
+    WEAKENED = "weakened", 77, "configured less safe than by default"
     ARMED = "armed", 0, "armed"
     DRIVING = "driving", 0, "driving"
     STOPPED = "stopped", 0, "at standstill"

@@ -128,6 +128,8 @@ class ControlRequest(Request):
     """Arm, disarm, emergency stop, its reset, or give up driving."""
 
     order: Order
+    hold: bool = False
+    """Of an order to arm: planners do not drive until the truck is armed without it."""
 
 
 class Waypoint(Schema):

@@ -153,3 +153,9 @@ class GateState(Message):
     """Form of the holder's newest request."""
     twist: Twist2D | None = None
     """Commanded velocity of the base, whatever the form of the request."""
+    latched: bool = False
+    """An emergency stop is on the disk: it outlasts a loss of power. Before that it outlasts the daemon only."""
+    weakened: tuple[str, ...] = ()
+    """Settings by which this robot is less safe than by the defaults, each with its value and the default."""
+    waiting: tuple[str, ...] = ()
+    """Planners that ask for motion while nobody drives: they set off as soon as the truck is armed without ``hold``."""

@@ -148,7 +148,7 @@ class Falling(LocalTruck):
         if not self.silent:
             await super().drive(speed, front, rear, lease)
 
-    async def order(self, order: Order) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
         if self.silent:
             raise NoAnswerError("silent")
         return await super().order(order)
@@ -285,7 +285,7 @@ def test_a_wizard_that_falls_silent_is_stopped_by_its_lease(tmp_path: Path):
 class Distant(LocalTruck):
     """Orders take a while to arrive."""
 
-    async def order(self, order: Order) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
         await self._clock.sleep(0.2)
         return await super().order(order)
 

@@ -1,7 +1,11 @@
 """``arm``, ``disarm``, ``estop``, ``reset``: one order each; its outcome is the exit code."""
 
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
@@ -35,12 +39,13 @@ class OrderOutcome:
             "text": self.text,
             "mode": self.state.mode,
             "holder": self.state.holder,
+            "waiting": self.state.waiting,
             "limited_by": self.state.reasons,
         }
 
 
-async def give(client: "TruckClient", order: "Order") -> OrderOutcome:
-    """Give an order and wait for its outcome.
+async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> OrderOutcome:
+    """Give an order and wait for its outcome; ``hold`` as of ``TruckClient.order``.
 
     Raises:
         NoAnswerError: no answer in time.
@@ -49,7 +54,7 @@ async def give(client: "TruckClient", order: "Order") -> OrderOutcome:
     from monstertruck_schemas.topics import GATE
 
     try:
-        return OrderOutcome(order, Reason.OK, Reason.OK.text, await client.order(order))
+        return OrderOutcome(order, Reason.OK, Reason.OK.text, await client.order(order, hold=hold))
     except RequestRefusedError as error:
         state = await client.get_retained(GATE)
         if state is None:
@@ -57,26 +62,54 @@ async def give(client: "TruckClient", order: "Order") -> OrderOutcome:
         return OrderOutcome(order, error.refusal, str(error), state)
 
 
-def _run(name: str, robot: str, endpoint: str, *, json_output: bool) -> None:
+async def _announce(client: "TruckClient") -> None:
+    """Say before arming who sets off then."""
+    from monstertruck_schemas.topics import GATE
+
+    state = await client.get_retained(GATE)
+    if state is not None and state.waiting:
+        print(f"sets off at once: {', '.join(state.waiting)}; --hold arms without", file=sys.stderr)
+
+
+def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool = False) -> None:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import Order
 
     async def main(clock: Clock) -> OrderOutcome:
         async with TruckClient(robot, endpoint, clock=clock) as client:
-            return await give(client, Order(name))
+            order = Order(name)
+            if order is Order.ARM and not hold:
+                await _announce(client)
+            return await give(client, order, hold=hold)
 
     outcome = run_wall(main)
     if json_output:
         print_json(outcome.as_json())
     elif outcome.reason is Reason.OK:
-        held = ", ".join(r.text for r in outcome.state.reasons if r not in (Reason.DISARMED, Reason.ESTOPPED))
-        print(outcome.state.mode.value + (f"; {held}" if held else ""))
+        print("; ".join(_told(outcome.state)))
     finish(outcome.reason, f"{name} refused: {outcome.text}")
 
 
-def arm(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:
-    """Allow the truck to move: any source that requests it may drive then, a configured path too."""
-    _run("arm", robot, endpoint, json_output=json_output)
+def _told(state: "GateState") -> Iterator[str]:
+    yield state.mode.value
+    if state.holder is not None:
+        yield f"{state.holder} drives"
+    elif state.waiting:
+        yield f"{', '.join(state.waiting)} waits to drive"
+    if held := [r.text for r in state.reasons if r not in (Reason.DISARMED, Reason.ESTOPPED)]:
+        yield ", ".join(held)
+
+
+def arm(
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
+    json_output: JsonOption = False,
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Let no tracker drive, along a configured path too, until armed without.")
+    ] = False,
+) -> None:
+    """Allow the truck to move; says before who sets off then, such as the tracker of a configured path."""
+    _run("arm", robot, endpoint, json_output=json_output, hold=hold)
 
 
 def disarm(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:

@@ -55,6 +55,8 @@ def configuration(context: HostContext) -> Iterator[Finding]:
         yield fail("config", Reason.BAD_CONFIG, context.refusal, context.command("config", "show", str(file)))
     else:
         yield fine("config", str(file))
+    if context.config is not None and (weaker := context.config.weakened()):
+        yield warn("safety", Reason.WEAKENED, "; ".join(weaker))
 
 
 def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:

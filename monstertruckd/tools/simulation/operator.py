@@ -45,12 +45,12 @@ class LocalOperator(Operator):
         """Call ``rpc`` of the daemon."""
         return await self._daemon.rpc.call(rpc, payload or {})
 
-    async def order(self, order: Order) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
         """Give an order as ``TruckClient.order`` does."""
         if order in OVERTAKING:
             request = ControlRequest.model_validate_json(json.dumps({**await self.header(), "order": order}))
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
-        answer = await self.call(order.value, await self.header())
+        answer = await self.call(order.value, {**await self.header(), "hold": hold})
         return wire.decode(topics.GATE, json.dumps(answer).encode())
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:

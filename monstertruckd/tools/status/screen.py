@@ -142,6 +142,10 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "lease left", "-" if gate.lease_left is None else f"{gate.lease_left * 1000:.0f} ms")
         _row(table, "why", Text("\n".join(r.text for r in gate.reasons[:3]) or "-", style="yellow"))
         _row(table, "limit", f"{gate.speed_limit:.2f} m/s, stops in {gate.stopping_distance * 100:.1f} cm")
+        if gate.waiting:
+            _row(table, "waiting", ", ".join(gate.waiting))
+        if gate.weakened:
+            _row(table, "weakened", Text("\n".join(gate.weakened), style="bold yellow"))
     if odometry is not None:
         speed = math.copysign(math.hypot(odometry.twist.vx, odometry.twist.vy), odometry.twist.vx)
         _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s")

@@ -100,6 +100,8 @@ def plain(state: ScreenState) -> list[str]:
     if state.gate is not None:
         reasons = ", ".join(reason.value for reason in state.gate.reasons) or "-"
         lines.append(f"gate      {state.gate.mode.value}, driver {state.gate.holder or '-'}, why {reasons}")
+        lines += [f"waiting   {name}" for name in state.gate.waiting]
+        lines += [f"weakened  {setting}" for setting in state.gate.weakened]
     lines += [f"stop      {line}" for line in state.why_stopped]
     if state.odometry is not None:
         pose = state.odometry.pose

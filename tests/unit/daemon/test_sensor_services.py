@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.catalog import COMPASS, DEVICES
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.assembly.devices import sensor_services
+from monstertruckd.assembly.devices import measures_battery, sensor_services
 from monstertruckd.config.load import load_truck
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
@@ -29,3 +29,17 @@ def test_a_role_of_another_name_that_writes_a_sensor_topic(monkeypatch: pytest.M
     monkeypatch.setattr("monstertruckd.assembly.devices.DEVICES", SimpleNamespace(roles={**DEVICES.roles, "imu": imu}))
     config = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"imu": None, "camera": None}))
     assert sensor_services(config) == {"imu": Reason.ATTITUDE_STALE}  # type: ignore[arg-type]
+
+
+def test_who_measures_the_battery():
+    config, _ = load_truck(CONFIGS / "truck.yaml")
+    devices, monitors = config.devices, config.monitors
+    assert devices.steering is not None
+    assert devices.steering.driver.battery is not None
+    assert measures_battery(config)
+    without = devices.steering.driver.model_copy(update={"battery": None})
+    blind = devices.model_copy(update={"steering": devices.steering.model_copy(update={"driver": without})})
+    assert not measures_battery(config.model_copy(update={"devices": blind}))
+    assert not measures_battery(config.model_copy(update={"devices": devices.model_copy(update={"steering": None})}))
+    watched = monitors.model_copy(update={"battery": object()})
+    assert measures_battery(config.model_copy(update={"devices": blind, "monitors": watched}))

@@ -51,7 +51,7 @@ SERVICES = {
 CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
 
 
-def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, **config):
+def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, battery_measured=False, **config):
     return Gate(
         GateConfig(**config),
         chassis=chassis,
@@ -59,6 +59,7 @@ def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, **
         points=ScanPoints((0.14, 0.0, 0.0)),
         services=services,
         nonce=nonce,
+        battery_measured=battery_measured,
         latched=latched,
     )
 
@@ -114,8 +115,8 @@ def health(now, state=ServiceState.READY, name="planner", **more):
 class Rig:
     """A gate, the time, and a truck whose speed follows the commands as the drive controller's profile does."""
 
-    def __init__(self, latched=False, chassis=CHASSIS, **config):
-        self.gate = make_gate(latched, chassis=chassis, **config)
+    def __init__(self, latched=False, chassis=CHASSIS, battery_measured=False, **config):
+        self.gate = make_gate(latched, chassis=chassis, battery_measured=battery_measured, **config)
         self.config = GateConfig(**config)
         self.now = SECOND
         self.speed = 0.0

@@ -259,6 +259,72 @@ def test_after_a_stop_a_silent_stick_is_as_good_as_neutral():
     assert rig.out.mode is GateMode.DRIVING
 
 
+def test_a_source_first_heard_after_a_stop_must_be_neutral_once():
+    rig = Rig(disarm_after=10.0).driving()
+    rig.order(Order.STOP, source="ann")
+    rig.driver = None
+    rig.tick(20)
+    new = {"source": "bob", "role": Role.GAMEPAD}
+    for _ in range(60):  # longer than any lease: silence is no proof of a stick at rest that nobody has seen
+        assert rig.drive(**new) is Reason.NOT_ARMED_SPEED
+        rig.tick()
+        assert rig.out.holder is None
+    rig.tick(60)
+    assert rig.drive(**new) is Reason.NOT_ARMED_SPEED
+    rig.drive(speed=0.0, **new)
+    assert rig.drive(**new) is Reason.OK
+    rig.tick()
+    assert rig.out.holder == "bob"
+
+
+def test_arming_again_ends_what_a_stop_asks_of_new_sources():
+    rig = Rig().driving()
+    rig.order(Order.STOP, source="ann")
+    rig.driver = None
+    rig.tick(20)
+    assert rig.order(Order.ARM) is Reason.OK
+    assert rig.drive(source="bob") is Reason.OK
+
+
+def test_names_heard_after_a_stop_are_bounded():
+    rig = Rig(disarm_after=10.0).driving()
+    rig.order(Order.STOP, source="ann")
+    rig.tick(20)
+    for number in range(200):
+        rig.drive(speed=0.0, source=f"junk{number}", lease=0.01)
+        rig.tick()
+    assert len(rig.gate._sources._released) <= 64
+
+
+def test_armed_on_hold_the_planners_wait_and_operators_drive():
+    rig = Rig().armed()
+    assert rig.order(Order.DISARM) is Reason.OK
+    rig.driver = TRACK
+    rig.tick(2)
+    assert rig.out.waiting == ("track",), "who would set off is known before"
+    assert rig.order(Order.ARM, hold=True) is Reason.OK
+    rig.tick(40)
+    assert (rig.out.mode, rig.out.holder, rig.out.speeds[0]) == (GateMode.ARMED, None, 0.0)
+    assert rig.out.waiting == ("track",)
+    assert rig.drive(**TRACK) is Reason.LOWER_PRIORITY
+    assert rig.drive(source="desk", role=Role.STATION, speed=0.1) is Reason.OK
+    rig.tick()
+    assert (rig.out.holder, rig.out.waiting) == ("desk", ())
+    rig.order(Order.STOP, source="desk")
+    rig.tick(60)
+    assert rig.order(Order.ARM) is Reason.OK
+    rig.tick(2)
+    assert rig.out.holder == "track"
+
+
+def test_a_planner_that_asks_for_standstill_waits_for_nothing():
+    rig = Rig()
+    rig.tick(2)
+    rig.drive(speed=0.0, **TRACK)
+    rig.drive(speed=0.1)
+    assert rig.tick().waiting == (), "and an operator's stick is no planner"
+
+
 def test_an_operators_stop_keeps_the_tracker_out_until_armed_again():
     rig = Rig().driving(**TRACK)
     rig.order(Order.STOP, source="desk", role=Role.STATION)

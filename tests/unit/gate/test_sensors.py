@@ -195,6 +195,21 @@ def test_a_battery_nobody_measures_any_more_slows():
     assert rig.out.speeds[0] == pytest.approx(0.1)
 
 
+def test_a_battery_that_was_never_measured_slows_until_it_is():
+    rig = Rig(battery_measured=True)
+    rig.silent = {"battery"}
+    rig.driving()
+    assert rig.out.reasons == (Reason.BATTERY_STALE,)
+    assert rig.out.speed_limit == rig.out.speeds[0] == pytest.approx(0.1)
+    rig.gate.observe_battery(battery(rig.now, BatteryLevel.UNKNOWN))
+    rig.tick()
+    assert rig.out.reasons == (Reason.BATTERY_STALE,), "a reading without a level is none"
+    rig.silent = set()
+    rig.tick(20)
+    assert rig.out.reasons == ()
+    assert rig.out.speeds[0] == pytest.approx(0.2)
+
+
 def test_a_faulty_battery_sensor_counts_as_silence():
     rig = Rig(battery={"stale_after": 0.5, "critical": True}).driving()
     rig.silent = {"battery"}

@@ -1,5 +1,10 @@
 import asyncio
+import os
+import signal
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +15,7 @@ from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.latch import EstopLatch, MemoryLatch
+from monstertruckd.gate.latch import EstopLatch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import TickMeter
 from tests.unit.gate.bench import Bench, on_bench
 from tests.unit.gate.rig import NONCE, header
@@ -165,33 +170,202 @@ def test_a_bug_ends_the_service_with_neutral_commands():
 # Latch
 
 
+def file_latch(folder):
+    (folder / "run").mkdir(exist_ok=True)
+    latch = EstopLatch(folder / "state" / "estop", folder / "run")
+    latch.prepare()
+    return latch
+
+
 def test_an_emergency_stop_survives_a_restart(tmp_path):
-    latch = EstopLatch(tmp_path / "state" / "estop")
+    latch = file_latch(tmp_path)
 
     async def stop(bench):
         bench.order(Order.ESTOP)
         await asyncio.sleep(0.05)
         for _ in range(1000):
-            if latch.engaged():
+            if latch.stored():
                 break
             await asyncio.to_thread(lambda: None)
-        assert latch.engaged()
+        assert latch.stored()
 
     on_bench(stop, latch)
+    assert list((tmp_path / "run").iterdir()) == [], "a daemon that ends in peace leaves no mark"
 
     async def restarted(bench):
         assert bench.out.state.last.mode is GateMode.ESTOPPED
+        assert bench.out.state.last.latched
         assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
         bench.order(Order.RESET)
         await asyncio.sleep(0.05)
 
-    on_bench(restarted, EstopLatch(tmp_path / "state" / "estop"))
+    latch = file_latch(tmp_path)
+    on_bench(restarted, latch)
     assert not latch.engaged()
 
     async def released(bench):
         assert bench.out.state.last.mode is GateMode.DISARMED
+        assert not bench.out.state.last.latched
 
     on_bench(released, latch)
+
+
+KILLED = """
+import asyncio, os, sys, threading
+from pathlib import Path
+from monstertruck_runtime.clock import WallClock
+from monstertruck_schemas.req import Order
+from monstertruckd.gate.latch import EstopLatch
+from tests.unit.gate.bench import Bench, Outbox
+
+def fsync(file, wait=threading.Event().wait):
+    wait()  # a disk that never comes to an end
+
+class Told(Outbox):
+    def put(self, message):
+        super().put(message)
+        if sys.argv[2] in (message.mode, "start"):
+            print(message.mode, message.latched, flush=True)
+            os.kill(os.getpid(), 9)
+
+async def main():
+    folder = Path(sys.argv[1])
+    latch = EstopLatch(folder / "state" / "estop", folder / "run")
+    latch.prepare()
+    os.fsync = fsync
+    bench = Bench(WallClock(), latch, Told())
+    async with bench.running():
+        bench.order(Order.ESTOP)
+        await asyncio.sleep(60)
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "told", "engaged"), [("estopped", "estopped False", True), ("start", "disarmed False", False)]
+)
+def test_killed_before_the_disk_has_the_latch_it_starts_as_it_was_told(tmp_path, when, told, engaged):
+    (tmp_path / "run").mkdir()
+    run = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path), when], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (run.returncode, run.stdout.strip()) == (-signal.SIGKILL, told), run.stderr
+    latch = file_latch(tmp_path)
+    assert not latch.stored()
+    assert latch.engaged() is engaged
+
+    async def restarted(bench):
+        assert bench.out.state.last.mode is (GateMode.ESTOPPED if engaged else GateMode.DISARMED)
+        bench.order(Order.RESET)
+
+    on_bench(restarted, latch)
+    assert not file_latch(tmp_path).engaged(), "a reset clears the mark as well"
+
+
+def test_the_state_says_whether_the_disk_has_the_latch():
+    latch = SlowLatch()
+
+    async def main():
+        bench = Bench(WallClock(), latch)
+        async with bench.running():
+            bench.order(Order.ESTOP)
+            while bench.out.state.last.mode is not GateMode.ESTOPPED:
+                await asyncio.sleep(0.005)
+            assert not bench.out.state.last.latched
+            assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+            latch.release.set()
+            while not bench.out.state.last.latched:
+                await asyncio.sleep(0.005)
+        assert latch.marks == [False, True, False], "the mark is cleared once the disk has the latch"
+
+    asyncio.run(main())
+
+
+def test_a_stop_while_the_one_before_is_being_removed_keeps_its_mark():
+    latch = SlowLatch()
+    latch.release.set()
+
+    async def main():
+        bench = Bench(WallClock(), latch)
+        async with bench.running():
+            bench.order(Order.ESTOP)
+            while not bench.service._latched:
+                await asyncio.sleep(0.005)
+            latch.release.clear()
+            bench.order(Order.RESET)
+            while bench.service._latched is not None:
+                await asyncio.sleep(0.005)
+            bench.order(Order.ESTOP)
+            await asyncio.sleep(0.05)
+            assert latch.marks[-1]
+            latch.release.set()
+            while not bench.service._latched:
+                await asyncio.sleep(0.005)
+        assert latch.engaged()
+
+    asyncio.run(main())
+
+
+def test_a_mark_that_cannot_be_written_is_an_event_and_the_stop_goes_on():
+    class Full(MemoryLatch):
+        def mark(self, engaged):
+            raise OSError(28, "no space left")
+
+    async def scenario(bench):
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.05)
+        assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+
+    bench = on_bench(scenario, Full())
+    assert [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
+
+
+@pytest.mark.parametrize("what", ["draft", "mark"])
+def test_links_in_the_place_of_latch_and_mark_are_not_followed(tmp_path, what):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    latch = file_latch(tmp_path)
+    (mark,) = (tmp_path / "run").iterdir()
+    latch.close()
+    if what == "mark":
+        mark.symlink_to(victim)
+        with pytest.raises(OSError, match="symbolic"):
+            latch.prepare()
+    else:
+        draft = tmp_path / "state" / "estop.new"
+        draft.symlink_to(victim)
+        latch.prepare()
+        draft.symlink_to(victim)
+        latch.store(True)
+        assert latch.stored()
+        assert not (tmp_path / "state" / "estop").is_symlink()
+    assert victim.read_text() == "precious"
+
+
+def test_a_damaged_mark_counts_as_a_stop_and_a_strangers_is_refused(tmp_path):
+    latch = file_latch(tmp_path)
+    (mark,) = (tmp_path / "run").iterdir()
+    latch.close()
+    mark.write_text("??")
+    assert file_latch(tmp_path).engaged()
+    mark.unlink()
+    other = tmp_path / "other"
+    other.write_text("0")
+    mark.hardlink_to(other)
+    with pytest.raises(PermissionError, match="this user alone"):
+        latch.prepare()
+
+
+def test_marks_are_kept_where_memory_outlasts_the_daemon(tmp_path):
+    configured, service = tmp_path / "own", {"RUNTIME_DIRECTORY": "/run/truck:/run/other"}
+    assert marks_folder(configured, service, tmp_path) == configured
+    assert marks_folder(None, service, tmp_path) == Path("/run/truck")
+    assert marks_folder(None, {}, tmp_path) == tmp_path / "dev/shm"
+    (tmp_path / "run").mkdir()
+    assert marks_folder(None, {}, tmp_path) == tmp_path / "run"
+    (user := tmp_path / f"run/user/{os.geteuid()}").mkdir(parents=True)
+    assert marks_folder(None, {}, tmp_path) == user
 
 
 class BrokenLatch(MemoryLatch):
@@ -233,6 +407,10 @@ class SlowLatch(MemoryLatch):
         super().__init__()
         self.release = threading.Event()
         self.threads = []
+        self.marks = []
+
+    def mark(self, engaged):
+        self.marks.append(engaged)
 
     def store(self, engaged):
         self.threads.append(threading.current_thread())
@@ -279,22 +457,36 @@ def test_after_quick_changes_of_mind_the_last_one_is_stored():
     assert not latch.engaged()
 
 
-def test_the_latch_file_is_synced_and_leaves_no_draft(tmp_path):
-    latch = EstopLatch(tmp_path / "a" / "estop")
+def test_the_latch_file_is_synced_and_leaves_no_draft(tmp_path, monkeypatch):
+    synced = []
+    fsync = os.fsync
+
+    def note(file):
+        synced.append(str(Path(f"/proc/self/fd/{file}").readlink()))
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", note)
+    (tmp_path / "run").mkdir()
+    folder = tmp_path / "a"
+    latch = EstopLatch(folder / "estop", tmp_path / "run")
     assert not latch.engaged()
     latch.store(False)  # nothing there yet
+    assert synced == []
     latch.store(True)
     assert latch.engaged()
-    assert [path.name for path in (tmp_path / "a").iterdir()] == ["estop"]
+    assert synced == [f"{folder}/estop.new", str(folder)], "first the contents, then the name"
+    assert [path.name for path in folder.iterdir()] == ["estop"]
+    synced.clear()
     latch.store(False)
+    assert synced == [str(folder)]
     assert not latch.engaged()
-    (tmp_path / "a" / "estop").touch()
+    (folder / "estop").touch()
     assert latch.engaged()  # an empty file stops, too
 
 
 def test_an_unreadable_latch_counts_as_engaged(tmp_path):
     (tmp_path / "file").touch()
-    assert EstopLatch(tmp_path / "file" / "estop").engaged()  # not a directory
+    assert EstopLatch(tmp_path / "file" / "estop", tmp_path).engaged()  # not a directory
 
 
 def test_meter_forgets_percentiles_but_not_the_maximum():

@@ -39,7 +39,7 @@ class Truck:
     async def drive(self, speed, front, rear=0.0, lease=0.3):
         raise AssertionError("nothing moves here")
 
-    async def order(self, order, lease=1.0):
+    async def order(self, order, lease=1.0, *, hold=False):
         raise AssertionError("nothing moves here")
 
     async def call(self, rpc, payload=None):

@@ -31,7 +31,7 @@ class Robot:
         self.newest = newest
         self.orders: list[Order] = []
 
-    async def order(self, order: Order) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
         self.orders.append(order)
         if isinstance(self.answer, TruckError):
             raise self.answer
@@ -98,5 +98,23 @@ def test_what_is_printed_and_the_exit_code(monkeypatch: pytest.MonkeyPatch, caps
         "text": "it moves",
         "mode": "estopped",
         "holder": None,
+        "waiting": [],
         "limited_by": [],
     }
+
+
+def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    driven = state(GateMode.DRIVING).model_copy(update={"holder": "tracker"})
+    held = state(GateMode.ARMED).model_copy(update={"waiting": ("tracker",)})
+    for after, words in ((driven, "driving; tracker drives\n"), (held, "armed; tracker waits to drive\n")):
+        assert shown(monkeypatch, orders.arm, OrderOutcome(Order.ARM, Reason.OK, "", after)) == 0
+        assert capsys.readouterr().out == words
+
+
+def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
+    waiting = state(GateMode.DISARMED).model_copy(update={"waiting": ("tracker",)})
+    asyncio.run(orders._announce(Robot(waiting, waiting)))  # type: ignore[arg-type]
+    assert capsys.readouterr().err == "sets off at once: tracker; --hold arms without\n"
+    for newest in (state(GateMode.DISARMED), None):
+        asyncio.run(orders._announce(Robot(waiting, newest)))  # type: ignore[arg-type]
+    assert capsys.readouterr().err == ""

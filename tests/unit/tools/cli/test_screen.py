@@ -138,3 +138,16 @@ def test_a_stopped_truck_says_why():
     for words in ("stop 3.0 s ago", "no fresh lidar scan (for 100 ms)", "because lidar: unplugged (for 100 ms)"):
         assert words in text
         assert any(line.startswith("stop ") and words in line for line in plain(state))
+
+
+def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
+    state = ScreenState("truck", started=0)
+    gate = {"mode": GateMode.DISARMED, "nonce": "n", "speed_limit": 0.0}
+    weakened = ("gate.scan.stale_after 1, default 0.25", "gate.turning null: servos without supply are not noticed")
+    state.take(GateState(**HEADER, **gate, waiting=("tracker",), weakened=weakened))
+    assert plain(state)[1:] == ["waiting   tracker", *(f"weakened  {setting}" for setting in weakened)]
+    console = Console(width=140, height=40, record=True)
+    console.print(draw(state, 140), height=40)
+    text = console.export_text()
+    for words in ("waiting", "tracker", "weakened", "gate.scan.stale_after 1", "gate.turning null"):
+        assert words in text

@@ -53,6 +53,14 @@ def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
     assert fix == f"cd {ROOT} && python3 -m monstertruckd.bootstrap sync"
 
 
+def test_limits_that_are_weaker_than_the_defaults_are_a_warning(tmp_path: Path):
+    assert bad(see(tmp_path / "a", configuration)) == {}
+    found = see(tmp_path / "b", configuration, lambda emulated: emulated.change(gate={"tilt": {"stop": 0.5}}))["safety"]
+    assert (found.level, found.reason, found.seen) == (
+        Level.WARN, Reason.WEAKENED, "gate.tilt.stop 0.5, default 0.35",
+    )  # fmt: skip
+
+
 def test_the_configuration_is_the_named_one_else_the_services(tmp_path: Path):
     def admitted(emulated: EmulatedHost) -> None:
         emulated.context = inspect(emulated.folder, PROGRAM, None, 0, emulated.clock)

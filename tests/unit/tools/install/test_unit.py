@@ -51,6 +51,7 @@ def test_a_daemon_that_hangs_or_dies_is_replaced_and_the_drive_stopped():
 def test_state_is_kept_where_it_may_be_written_and_numba_works():
     unit = settings(unit_of())
     assert unit["WorkingDirectory"] == [f"%S/{unit['StateDirectory'][0]}"]
+    assert unit["RuntimeDirectoryPreserve"] == ["yes"], "the mark of an emergency stop outlasts a killed daemon"
     assert "NUMBA_CACHE_DIR=%C/monstertruckd/numba" in unit["Environment"]
     assert "monstertruckd/numba" in unit["CacheDirectory"][0].split()
     assert "MemoryDenyWriteExecute" not in unit

@@ -1,0 +1,142 @@
+"""Ceilings that no configuration exceeds, and the settings that make a robot less safe than by default."""
+
+from pathlib import Path
+
+import pytest
+
+from monstertruckd.config.load import load_truck
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.gate.ceilings import WEAKER_ABOVE, WEAKER_BELOW, BodyLimits, beyond, stopping_distance, weakened
+from monstertruckd.gate.config import GateConfig
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+BODY = BodyLimits(length=0.47, mass=7.25, pull=25.0, motor_speed=0.2196, sight=3.9)
+STRONG = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=3.9)
+NOT_LIMITS = {
+    "leases", "remote_trackers", "scan", "drive", "steering", "attitude", "battery", "tolerated_failures", "tilt",
+    "turning", "obstacle", "event_interval", "steering_rate",
+}  # fmt: skip
+"""Sections, what is judged apart, and what makes nothing less safe."""
+
+
+def refusals(body=BODY, **config):
+    return list(beyond(GateConfig(**config), body))
+
+
+def test_the_defaults_are_within_all_ceilings_and_weaken_nothing():
+    assert refusals() == []
+    assert weakened(GateConfig()) == ()
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ({"speed": 0.23}, "gate.speed 0.23 m/s: at most 0.220, the speed at the motor's greatest rate"),
+        ({"reverse_speed": 0.22}, "gate.reverse_speed 0.22 m/s: at most gate.speed, 0.21"),
+        ({"acceleration": 3.5}, "gate.acceleration 3.5 m/s^2: at most 3.45, what 25 N"),
+        ({"deceleration": 3.5, "quick_deceleration": 3.5}, "gate.deceleration 3.5 m/s^2: at most 3.45"),
+        ({"quick_deceleration": 3.5}, "gate.quick_deceleration 3.5 m/s^2: at most 3.45"),
+        ({"scan": {"stale_after": 2.3}}, "gate.scan.stale_after 2.3 s: at most 2.24 s"),
+        ({"drive": {"stale_after": 2.3}}, "gate.drive.stale_after 2.3 s: at most 2.24 s"),
+        ({"steering": {"stale_after": 2.3, "critical": False}}, "gate.steering.stale_after 2.3 s"),
+        ({"attitude": {"stale_after": 2.3}}, "gate.attitude.stale_after 2.3 s"),
+        ({"max_latency": 2.3}, "gate.max_latency 2.3 s"),
+        ({"reaction": 2.3}, "gate.reaction 2.3 s"),
+        ({"tick_stall": 2.3}, "gate.tick_stall 2.3 s"),
+        ({"max_request_age": 2.3}, "gate.max_request_age 2.3 s"),
+    ],
+)
+def test_what_a_body_cannot_do_is_refused_by_name(config, expected):
+    assert refusals(**config)[0].startswith(expected)
+
+
+def test_a_fast_truck_must_stop_within_what_its_lidar_sees():
+    fast = {"speed": 2.0, "reverse_speed": 0.5}
+    assert stopping_distance(GateConfig(**fast)) == pytest.approx(0.05 + 2.0 * (0.25 + 0.4 + 0.08) + 2.0)
+    assert refusals(STRONG, **fast) == []
+    (refusal,) = refusals(STRONG, **(fast | {"speed": 2.2}))
+    assert "stands after 4.08 m: at most 3.90 m, what the lidar is sure to see" in refusal
+    blind = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=None)
+    (refusal,) = refusals(blind, **fast)
+    assert "at most 2.00 m, its own length, as it has no lidar" in refusal
+
+
+def test_wheels_hold_no_more_than_their_grip_however_strong_the_motor():
+    assert STRONG.acceleration == pytest.approx(0.6 * 9.81)
+    assert BODY.acceleration == pytest.approx(25 / 7.25)
+
+
+def test_a_motor_of_unknown_rate_has_no_ceiling_of_its_own():
+    assert refusals(BodyLimits(0.47, 7.25, 25.0, None, 3.9), speed=0.5) == []
+
+
+@pytest.mark.parametrize("name", WEAKER_ABOVE)
+def test_more_of_it_is_weaker(name):
+    assert any(text.startswith(f"gate.{name} ") for text in changed(name, 1.01))
+    assert changed(name, 0.99) == ()
+
+
+@pytest.mark.parametrize("name", WEAKER_BELOW)
+def test_less_of_it_is_weaker(name):
+    assert any(text.startswith(f"gate.{name} ") for text in changed(name, 0.99))
+    assert changed(name, 1.01) == ()
+
+
+def changed(name, factor):
+    """What is weaker with one setting multiplied; unchecked, as the defaults depend on each other."""
+    config, *path = GateConfig(), *name.split(".")
+    section = config if len(path) == 1 else getattr(config, path[0])
+    value = getattr(section, path[-1]) * factor
+    section = section.model_copy(update={path[-1]: value})
+    return weakened(section if len(path) == 1 else config.model_copy(update={path[0]: section}))
+
+
+def test_no_setting_is_forgotten():
+    judged = {name for name in (*WEAKER_ABOVE, *WEAKER_BELOW) if "." not in name}
+    assert judged | NOT_LIMITS == set(GateConfig.model_fields)
+
+
+def test_sensors_checks_and_services_that_are_switched_off_are_named():
+    config = GateConfig(
+        scan={"stale_after": 0.25, "critical": False},
+        turning=None,
+        tolerated_failures=("camera", "slam"),
+        remote_trackers=("desk",),
+    )
+    assert weakened(config) == (
+        "gate.scan.critical false: a silent sensor does not stop the truck",
+        "gate.turning null: servos without supply are not noticed",
+        "gate.tolerated_failures: slam may fail while the truck drives",
+        "gate.remote_trackers: desk may drive from outside",
+    )
+
+
+def truck(**gate):
+    config, _ = load_truck(CONFIGS / "truck.yaml")
+    return TruckConfig.model_validate(config.model_dump() | {"gate": gate}, strict=False)
+
+
+@pytest.mark.parametrize(
+    "gate",
+    [{"speed": 100.0}, {"scan": {"stale_after": 1e9, "critical": False}}, {"drive": {"stale_after": 10.0}}],
+)
+def test_a_truck_so_configured_is_refused(gate):
+    with pytest.raises(ValueError, match="gate"):
+        truck(**gate)
+
+
+def test_a_truck_knows_its_limits_and_what_weakens_it():
+    config = truck()
+    limits = config.body_limits
+    assert limits.motor_speed == pytest.approx(0.2195, abs=1e-4)
+    assert limits.sight == pytest.approx(4.0 - 0.235 + 0.14)
+    assert config.weakened() == ()
+    drive = config.devices.drive
+    assert drive is not None
+    slow = drive.model_copy(update={"driver": drive.driver.model_copy(update={"command_timeout": 1.0})})
+    devices = config.devices.model_copy(update={"drive": slow})
+    weak = truck(scan={"stale_after": 0.5}).model_copy(update={"devices": devices})
+    assert weak.weakened() == (
+        "gate.scan.stale_after 0.5, default 0.25",
+        "devices.drive.driver.command_timeout 1, default 0.25",
+    )
