@@ -7,7 +7,6 @@ What is unsafe is judged by an observer that sees only bytes on the wires of dri
 
 import argparse
 import json
-import os
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -16,7 +15,7 @@ from time import perf_counter
 import numpy as np
 
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, default_jobs
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--jobs", type=int, default=default_jobs())
     arguments = parser.parse_args()
     truck = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()

@@ -1,6 +1,5 @@
 """``monstertruckd drill``: seeded faults on an emulated truck, and a scored report."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +19,7 @@ def drill(
     seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
     count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
     config: SimulatedOption = FULL_CONFIG,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: all cores but one.")] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Inject random faults into the emulated truck while it drives, and score its reactions.
@@ -28,10 +27,10 @@ def drill(
     Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
     did not recover.
     """
-    from monstertruckd.tools.drill.random_drill import Drill
+    from monstertruckd.tools.drill.random_drill import Drill, default_jobs
     from monstertruckd.tools.simulation.config import load_simulated
 
-    report = _run(Drill(seed, count, load_simulated(config)), jobs or os.cpu_count() or 1)
+    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs())
     if json_output:
         print_json(report.as_json())
     else:

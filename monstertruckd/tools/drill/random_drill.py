@@ -5,6 +5,7 @@ seed, so that legs can run in parallel and still give the same report.
 """
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -38,6 +39,11 @@ DEADMAN: Final[dict[str, Any]] = {
     "sim": {"deadman_wired": True, "servo_timeout": 0.3},
 }
 """The deadman line is wired: without it a truck drives on when its drive controller cannot be reached."""
+
+
+def default_jobs() -> int:
+    """Processes of a drill: one core is left for whoever works on the computer."""
+    return max(len(os.sched_getaffinity(0)) - 1, 1)
 
 
 @dataclass(frozen=True, slots=True)

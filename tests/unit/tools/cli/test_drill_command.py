@@ -11,7 +11,7 @@ from monstertruck_sim.faults import FaultKind
 from monstertruckd.tools.cli import drill as command
 from monstertruckd.tools.cli.main import main
 from monstertruckd.tools.drill.observer import Violation
-from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, default_jobs
 
 DEMO = Path(__file__).resolve().parents[4] / "configs" / "demo.yaml"
 SAFE = FaultOutcome(
@@ -60,3 +60,22 @@ def test_json_holds_the_figures(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 def test_the_default_truck_is_shipped():
     assert command.FULL_CONFIG.exists()
+
+
+def test_a_core_is_left_by_default(monkeypatch: pytest.MonkeyPatch):
+    for cores, jobs in ((8, 7), (2, 1), (1, 1)):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        assert default_jobs() == jobs
+    used = []
+
+    def drill(self: Drill, *, jobs: int, **_: Any) -> DrillReport:
+        used.append(jobs)
+        return DrillReport(self.seed, (SAFE,))
+
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setattr(Drill, "run", drill)
+    for arguments in ((), ("--jobs", "5")):
+        monkeypatch.setattr(sys, "argv", ["monstertruckd", "drill", "--config", str(DEMO), *arguments])
+        with pytest.raises(SystemExit):
+            main()
+    assert used == [2, 5]
