@@ -23,10 +23,15 @@ import zipfile
 from pathlib import Path
 
 UV_VERSION = "0.13.8"
-UV_SHA256 = {
+WHEEL_SHA256 = {
     "x86_64": "e18a57b8b352eb7c8feb317b9f6f533c8f0ad9673fd6cf34bbe3cf1a9f6a8984",
     "aarch64": "0b3e8b1a4f5e405e31e2ff33de8af4744831e9f7338539671efbd8c3c94e791d",
 }
+PROGRAM_SHA256 = {
+    "x86_64": "4a7607589912d9c20e86b860b032f7c7f2913c9a3e76f46aef136885387452b8",
+    "aarch64": "5aa4427bd923cfdca2d56a3577f60d8fa7825aa3b496fef975dfd6f03db57d28",
+}
+"""Of the program in the wheel, as the wheel's RECORD states it; every file is compared before it is run."""
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 GATED = (
@@ -73,37 +78,46 @@ def sync(extras: tuple[str, ...]) -> None:
 
 
 def find_uv() -> str:
-    """Path of a usable ``uv``: the machine's own, or the pinned one, fetched once into the user's cache."""
-    if own := shutil.which("uv"):
-        return own
+    """Path of the pinned ``uv``: in the user's cache, or the machine's own if it is that very program, else fetched."""
+    machine = platform.machine()
+    if machine not in PROGRAM_SHA256 or platform.libc_ver()[0] != "glibc":
+        raise SystemExit(f"{machine} is not supported: x86_64 and aarch64 Linux with glibc >= 2.28 are.")
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "monstertruckd"
     target = cache / f"uv-{UV_VERSION}"
-    if not target.exists():
-        print(f"Fetching uv {UV_VERSION} ...", file=sys.stderr)
-        cache.mkdir(parents=True, exist_ok=True)
-        scratch = target.with_suffix(f".{os.getpid()}")
-        scratch.write_bytes(fetch_uv())
-        scratch.chmod(0o755)
-        scratch.replace(target)
+    own = shutil.which("uv")
+    for place in (target, *([] if own is None else [Path(own)])):
+        if place.is_file() and sha256(place.read_bytes()) == PROGRAM_SHA256[machine]:
+            return str(place)
+    print(f"Fetching uv {UV_VERSION} ...", file=sys.stderr)
+    program = fetch_uv(machine)
+    if sha256(program) != PROGRAM_SHA256[machine]:
+        raise SystemExit(f"uv {UV_VERSION}: the program in the wheel has another sha256; not used.")
+    cache.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_suffix(f".{os.getpid()}")
+    scratch.write_bytes(program)
+    scratch.chmod(0o755)
+    scratch.replace(target)
     return str(target)
 
 
-def fetch_uv() -> bytes:
+def sha256(data: bytes) -> str:
+    """Hexadecimal digest."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def fetch_uv(machine: str) -> bytes:
     """Download the pinned wheel from the package index, compare its sha256, and take the program out of it."""
-    machine = platform.machine()
-    if machine not in UV_SHA256 or platform.libc_ver()[0] != "glibc":
-        raise SystemExit(f"{machine} is not supported: x86_64 and aarch64 Linux with glibc >= 2.28 are.")
     index = os.environ.get("UV_DEFAULT_INDEX") or os.environ.get("PIP_INDEX_URL") or "https://pypi.org/simple"
     page_url = f"{index.rstrip('/')}/uv/"
     with urllib.request.urlopen(page_url, timeout=60) as reply:
         page = reply.read().decode()
-    pattern = rf'href="([^"#]*/uv-{re.escape(UV_VERSION)}-[^"#]*)#sha256={UV_SHA256[machine]}"'
+    pattern = rf'href="([^"#]*/uv-{re.escape(UV_VERSION)}-[^"#]*)#sha256={WHEEL_SHA256[machine]}"'
     found = re.search(pattern, page)
     if found is None:
         raise SystemExit(f"{page_url} does not list the pinned uv {UV_VERSION} for {machine}.")
     with urllib.request.urlopen(urllib.parse.urljoin(page_url, found[1]), timeout=300) as reply:
         wheel = reply.read()
-    if hashlib.sha256(wheel).hexdigest() != UV_SHA256[machine]:
+    if sha256(wheel) != WHEEL_SHA256[machine]:
         raise SystemExit(f"uv {UV_VERSION}: what {found[1]} sent has another sha256; not used.")
     with zipfile.ZipFile(io.BytesIO(wheel)) as archive:
         name = next(name for name in archive.namelist() if name.endswith("/scripts/uv"))
