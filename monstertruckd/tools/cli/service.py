@@ -1,6 +1,7 @@
 """Commands of the service: install it into systemd and udev, take it out again."""
 
 import shlex
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -40,6 +41,14 @@ def install_service(
         ),
     ] = None,
     start: Annotated[bool, typer.Option("--start", help="Start or restart the service as well.")] = False,
+    upgrade: Annotated[
+        bool,
+        typer.Option(
+            "--upgrade",
+            help="Run this version instead of the installed one, which comes back if this one does not become ready; "
+            "refused while the truck is armed.",
+        ),
+    ] = False,
     dry_run: DryOption = False,
     root: RootOption = Path("/"),
     json_output: JsonOption = False,
@@ -51,15 +60,20 @@ def install_service(
     from monstertruckd.tools.install.apply import install, run_command, runs_here
     from monstertruckd.tools.install.files import Program
     from monstertruckd.tools.install.plan import RESTART, plan
+    from monstertruckd.tools.install.upgrade import upgrade as upgrade_service
 
     planned = plan(config, user, Program.present(), root)
-    report = _as_root(lambda: install(planned, root, dry=dry_run))
-    if start:
+    if upgrade:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a lost connection of the operator's must not leave it half done
+        report = _as_root(lambda: upgrade_service(planned, root, dry=dry_run))
+    else:
+        report = _as_root(lambda: install(planned, root, dry=dry_run))
+    if start and not upgrade:
         report.commands.append(RESTART)
         if not dry_run:
             _as_root(lambda: run_command(RESTART))
     _print(report, planned.notes, dry=dry_run, json_output=json_output)
-    if not (start or dry_run) and report.changed and runs_here(root):
+    if not (start or upgrade or dry_run) and report.changed and runs_here(root):
         remark(f"to use it now: sudo {shlex.join(RESTART)}")
 
 

@@ -64,11 +64,11 @@ class InstallReport:
         return bool(self.commands) or any(change is not Change.SAME for change in self.changes.values())
 
 
-Run = Callable[[Sequence[str]], None]
+Run = Callable[[Sequence[str]], str]
 
 
-def run_command(arguments: Sequence[str]) -> None:
-    """Run a program of the system without a shell.
+def run_command(arguments: Sequence[str]) -> str:
+    """Run a program of the system without a shell; returns its standard output.
 
     Raises:
         NotFoundError: there is none.
@@ -81,6 +81,7 @@ def run_command(arguments: Sequence[str]) -> None:
     if done.returncode:
         said = (done.stderr or done.stdout).strip() or f"ended with {done.returncode}"
         raise CommandFailedError(f"{' '.join(arguments)}: {said}")
+    return done.stdout
 
 
 def runs_here(root: Path) -> bool:
@@ -104,7 +105,7 @@ def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
     if dry or not report.changed:
         return report
     _refuse_masked(root, report)
-    with _permission():
+    with as_permitted():
         if here:
             unfinished.parent.mkdir(parents=True, exist_ok=True)
             replace_file(unfinished, "", follow_links=False)
@@ -125,14 +126,14 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Insta
         NotPermittedError: not allowed to.
         NotFoundError, CommandFailedError: see ``run_command``.
     """
-    report = InstallReport({path: Change.REMOVED for path in FILES if os.path.lexists(_place(root, path))})
+    report = InstallReport({path: Change.REMOVED for path in FILES if os.path.lexists(place_of(root, path))})
     here = runs_here(root) and report.changed
     before = BEFORE_REMOVAL if here and UNIT in report.changes else ()
     after = AFTER_REMOVAL if here else ()
     report.commands = [*before, *after]
     if dry:
         return report
-    with _permission():
+    with as_permitted():
         for command in before:
             run(command)
         for path in report.changes:
@@ -142,8 +143,8 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Insta
     return report
 
 
-def _place(root: Path, path: Path) -> Path:
-    """Where a file is.
+def place_of(root: Path, path: Path) -> Path:
+    """Where a file of the system below ``root`` is.
 
     Raises:
         InputError: a link on the way there leads out of ``root``.
@@ -156,7 +157,7 @@ def _place(root: Path, path: Path) -> Path:
 
 
 def _change(root: Path, file: PlannedFile) -> Change:
-    place = _place(root, file.path)
+    place = place_of(root, file.path)
     if not os.path.lexists(place):
         return Change.NEW
     if place.is_symlink() and os.path.normpath(file.path.parent / place.readlink()) == os.devnull:
@@ -178,7 +179,7 @@ def _refuse_masked(root: Path, report: InstallReport) -> None:
 
 
 def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:
-    place = _place(root, file.path)
+    place = place_of(root, file.path)
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.target is not None:
         place.unlink(missing_ok=True)
@@ -200,7 +201,12 @@ def _keep(place: Path) -> Path:
 
 
 @contextmanager
-def _permission() -> Iterator[None]:
+def as_permitted() -> Iterator[None]:
+    """Turns a refused write into an error of ours.
+
+    Raises:
+        NotPermittedError: not allowed to write there.
+    """
     try:
         yield
     except PermissionError as error:

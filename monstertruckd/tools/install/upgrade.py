@@ -1,0 +1,117 @@
+"""Replaces the version that the service runs by another; the one before comes back if that does not become ready."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.errors import BusyError, CommandFailedError, InputError, NotFoundError, TruckError
+from monstertruck_runtime.small_files import replace_file
+from monstertruck_schemas.state import GateMode
+from monstertruckd.tools.install.apply import (
+    Change,
+    InstallReport,
+    Run,
+    as_permitted,
+    install,
+    place_of,
+    run_command,
+    runs_here,
+)
+from monstertruckd.tools.install.plan import AFTER_INSTALL, RESTART, SERVICE, UNIT, Command, InstallPlan
+
+STATUS: Final[Command] = ("systemctl", "show", "--property=ActiveState,StatusText", SERVICE)
+MODES: Final = {mode.value: mode for mode in GateMode}
+
+
+def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
+    """Install ``plan`` over the installed service and restart it; undo both unless it tells systemd that it is ready.
+
+    The restart returns once the daemon has told READY, which it does after its first control tick, or has failed to.
+
+    Raises:
+        InputError: the system below ``root`` does not run, or see ``install``.
+        NotFoundError: no service is installed.
+        BusyError: the truck is armed; nothing has been restarted.
+        CommandFailedError: the new version did not become ready; the text says whether the one before is back.
+        NotPermittedError: see ``install``.
+    """
+    if not runs_here(root):
+        raise InputError(f"{root}: no systemd runs there that could try the new version; install without --upgrade")
+    if not place_of(root, UNIT).is_file():
+        raise NotFoundError(f"{UNIT}: no service is installed; begin with install-service --config FILE --start")
+    report = install(plan, root, dry=True, run=run)
+    _refuse_armed(run)
+    if not dry:
+        changed = [path for path, change in report.changes.items() if change is not Change.SAME]
+        report = _replace(plan, root, [_Before.of(place_of(root, path)) for path in changed], run)
+    report.commands.append(RESTART)
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Before:
+    """What is at a place before it is replaced."""
+
+    place: Path
+    text: str | None
+    target: Path | None
+
+    @classmethod
+    def of(cls, place: Path) -> "_Before":
+        if place.is_symlink():
+            return cls(place, None, place.readlink())
+        return cls(place, place.read_text(encoding="utf-8") if place.exists() else None, None)
+
+    def put_back(self) -> None:
+        if self.text is not None:
+            replace_file(self.place, self.text, follow_links=False)
+            return
+        self.place.unlink(missing_ok=True)
+        if self.target is not None:
+            self.place.symlink_to(self.target)
+
+
+def _replace(plan: InstallPlan, root: Path, before: list[_Before], run: Run) -> InstallReport:
+    try:
+        report = install(plan, root, run=run)
+        _refuse_armed(run)  # it may have been armed in the meantime
+        run(RESTART)
+    except BusyError:
+        _put_back(before, run)
+        raise
+    except (CommandFailedError, KeyboardInterrupt) as error:
+        raise CommandFailedError(f"{error}; {_go_back(before, run)}") from error
+    return report
+
+
+def _refuse_armed(run: Run) -> None:
+    """By what the daemon last told systemd, at most a watchdog's third ago.
+
+    Raises:
+        BusyError: the truck is armed, drives or is being stopped.
+    """
+    told = dict(line.split("=", 1) for line in run(STATUS).splitlines() if "=" in line)
+    mode = MODES.get(told.get("StatusText", "").split(";")[0])
+    if told.get("ActiveState") == "active" and mode is not None and mode.active:
+        raise BusyError(f"the truck is {mode.value}: an upgrade restarts the daemon; disarm it first")
+
+
+def _put_back(before: list[_Before], run: Run) -> None:
+    with as_permitted():
+        for file in before:
+            file.put_back()
+    if before:
+        for command in AFTER_INSTALL:
+            run(command)
+
+
+def _go_back(before: list[_Before], run: Run) -> str:
+    """Run the version before again; returns how that went."""
+    if not before:
+        return "there is no version to go back to: the one before was in the same folder"
+    try:
+        _put_back(before, run)
+        run(RESTART)
+    except TruckError as error:
+        return f"nor does the version before run: {error}"
+    return "the version before runs again"
