@@ -53,6 +53,8 @@ class RoleSpec:
     """Its mount is in the tree of frames."""
     start: int = 100
     """Rank among the devices that start again behind a returned hub."""
+    loads_hub: bool = False
+    """It draws current (a motor, a sensor of pictures) or bandwidth as soon as its driver starts it."""
 
 
 def _shaft(index: int) -> RoleSpec:
@@ -74,6 +76,7 @@ LIDAR: Final = RoleSpec(
     writes={"out": topics.SCAN},
     frame=True,
     start=12,
+    loads_hub=True,
 )
 DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
 STEERING: Final = RoleSpec(
@@ -110,6 +113,7 @@ CAMERA: Final = RoleSpec(
     writes={"out": topics.CAMERA},
     frame=True,
     start=14,
+    loads_hub=True,
 )
 BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
@@ -369,3 +373,8 @@ def start_order() -> tuple[str, ...]:
     """Roles in the order in which they start behind a returned hub."""
     roles = [role for role in DEVICES.roles.values() if role.duty is not Duty.MONITOR]
     return tuple(role.name for role in sorted(roles, key=lambda role: role.start))
+
+
+def started_apart() -> tuple[str, ...]:
+    """Roles that load their hub when they start."""
+    return tuple(role.name for role in DEVICES.roles.values() if role.loads_hub)

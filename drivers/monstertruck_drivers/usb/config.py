@@ -5,7 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_drivers.catalog import start_order
+from monstertruck_drivers.catalog import start_order, started_apart
 from monstertruck_drivers.usb.tree import device_name
 from monstertruck_schemas.base import Schema
 
@@ -74,7 +74,9 @@ class UsbConfig(Schema):
     patience: Seconds = 3.0
     """Seconds a returned hub may stay empty until its devices count as unplugged"""
     stagger: Seconds = 0.3
-    """Seconds between the starts of two devices of one hub"""
+    """Seconds between the start of a device that loads the hub and the one before it"""
+    start_apart: tuple[str, ...] = Field(default_factory=started_apart)
+    """Roles that load the hub when they start; all others start as soon as its devices keep still"""
     start_order: tuple[str, ...] = Field(default_factory=start_order)
     """Roles in the order they start behind a returned hub: what stops the truck first, what loads the bus last"""
     over_current_hold: Seconds = 10.0

@@ -2,14 +2,16 @@
 
 A ``HubCoordinator`` compares snapshots. Losses are judged together after a short while: where a hub is gone, or all
 of its several devices are, the topmost such hub is the event, and whatever was behind it waits for the hub. Once the
-tree behind the returned hub keeps still, its devices may start in order of safety, spaced apart. A device may also
-have to wait because its port reported over-current.
+tree behind the returned hub keeps still, its devices may start in order of safety. Those that load the hub start apart
+from the one before: a lidar and a camera draw their in-rush then, interfaces drew theirs when they were plugged in. A
+device may also have to wait because its port reported over-current.
 """
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Final
 
 from monstertruck_drivers.computer import Machine, Watcher
@@ -234,10 +236,14 @@ class HubCoordinator:
             for name in outage.members:
                 self._slots[name].free_at = now
             starting = [name for name in back if name in self._roles]
-            for turn, name in enumerate(starting):
+            turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
+            for turn, name in zip(turns, starting, strict=True):
                 self._slots[name].free_at = now + turn * _ns(self._config.stagger)
             if outage.announced or starting:
                 self._tell_returned(outage, back, now)
+
+    def _loads(self, name: str) -> bool:
+        return self._roles.get(name) in self._config.start_apart
 
     def _start_rank(self, name: str) -> tuple[int, tuple[int, ...]]:
         order = self._config.start_order
