@@ -1,6 +1,6 @@
-"""1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck.
+"""1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck, back soon.
 
-    python benchmarks/drill.py [--seed 1] [--count 1000] [--jobs N]
+    python benchmarks/drill.py [--seed 1] [--count 1000] [--jobs N | --cluster ADDRESS]
 
 What is unsafe is judged by an observer that sees only bytes on the wires of drive and steering, and the world's truth.
 """
@@ -20,6 +20,8 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "drill.json"
+RECOVERY_GOAL = 2.0
+"""Seconds within which 99 % of what was lost is back."""
 
 
 def table(report: DrillReport) -> None:
@@ -46,21 +48,23 @@ def table(report: DrillReport) -> None:
 
 
 def main() -> int:
-    """Drill; 0 = nothing unsafe, nothing stuck."""
+    """Drill; 0 = nothing unsafe, nothing stuck, back within the goal."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=default_jobs())
+    parser.add_argument("--cluster", metavar="ADDRESS", help="dask scheduler whose workers run it")
     arguments = parser.parse_args()
     truck = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()
-    report = Drill(arguments.seed, arguments.count, truck).run(jobs=arguments.jobs)
+    report = Drill(arguments.seed, arguments.count, truck).run(jobs=arguments.jobs, cluster=arguments.cluster)
     table(report)
     figures = report.figures() | {"real_s": round(perf_counter() - began, 1)}
-    met = report.unsafe == 0 and report.stuck == 0
+    goals = {"unsafe": 0, "stuck": 0, "recovery_p99_s": RECOVERY_GOAL}
+    met = all((figures[name] or 0) <= goal for name, goal in goals.items())
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     OUTPUT.write_text(json.dumps(report.as_json(), indent=1), encoding="utf-8")
-    print(json.dumps({"bench": "drill", "figures": figures, "goals": {"unsafe": 0, "stuck": 0}, "met": met}))
+    print(json.dumps({"bench": "drill", "figures": figures, "goals": goals, "met": met}))
     return 0 if met else 1
 
 

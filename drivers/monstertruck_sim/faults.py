@@ -4,9 +4,10 @@ A fault is a pair of actions on a ``SimContext``: one starts it, one ends it. Sc
 are made of the actions defined here.
 """
 
+import asyncio
 import errno
 import math
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Generic, Protocol, TypeVar
@@ -54,6 +55,9 @@ class FaultKind(StrEnum):
     RAIL_SERVOS = "servo 5 V lost"
     RAIL_ELECTRONICS = "electronics rail lost"
     BATTERY_OFF = "battery disconnected"
+    COMPUTER_POWER = "computer power lost"
+    NETWORK = "network lost"
+    MEMORY = "memory full"
     OBSTACLE = "obstacle"
 
 
@@ -65,9 +69,21 @@ class RecorderDisk(Protocol):
         ...
 
 
+class ComputerPower(Protocol):
+    """The supply of the computer that a daemon runs on."""
+
+    async def cut(self) -> None:
+        """The daemon is gone at once; cables that lead to it must be dead before."""
+        ...
+
+    def give(self) -> None:
+        """The computer has started, and with it a new daemon."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class SimContext:
-    """What faults act on: the simulated side, and of the daemon its disk only.
+    """What faults act on: the simulated side, and of the daemon its disk and its computer's supply only.
 
     Args:
         config: of the simulation.
@@ -76,6 +92,7 @@ class SimContext:
         computer: USB tree and cables.
         clock: time.
         disk: None where nothing records.
+        power: None where the computer is this one.
     """
 
     config: SimConfig
@@ -84,6 +101,7 @@ class SimContext:
     computer: EmulatedComputer
     clock: Clock
     disk: RecorderDisk | None = None
+    power: ComputerPower | None = None
 
     def device(self, role: str) -> Emulated:
         """Emulator and cable of a device."""
@@ -95,20 +113,26 @@ class SimContext:
             for line in lines:
                 self.device(role).command(line.split())
 
-    def set_temperature(self, degrees: float) -> None:
-        """Temperature of the computer, degrees Celsius, where it is monitored."""
-        if "host" in self.robot.monitored:
-            self.robot.monitored["host"].inject("temperature", str(degrees))
+    def monitored(self, name: str, fault: str, *values: str) -> None:
+        """Change what a monitor sees; nothing where the truck has none of the name."""
+        if name in self.robot.monitored:
+            self.robot.monitored[name].inject(fault, *values)
 
     def lose_hubs(self, *hubs: str) -> None:
         """Take hubs off the bus."""
         for hub in hubs:
             self.computer.usb.lose_hub(hub)
 
-    async def return_hubs(self, *hubs: str) -> None:
-        """Bring them back, one after the other."""
-        for hub in hubs:
-            await self.computer.usb.return_hub(hub, self.clock)
+    async def return_hubs(self, *hubs: str, enumerated: bool = False) -> None:
+        """Bring them back; the kernel enumerates each hub by a work item of its own (``usb_hub_wq``), so side by side.
+
+        Args:
+            hubs: names.
+            enumerated: all behind them is there at once, as for a computer that has started.
+        """
+        times = {"first": 0.0, "between": 0.0} if enumerated else {}
+        usb, clock = self.computer.usb, self.clock
+        await asyncio.gather(*(usb.return_hub(hub, clock, **times) for hub in hubs))
 
     def exchange_cables(self, one: str, other: str) -> None:
         """Unplug two cables and plug each into the other's port."""
@@ -212,13 +236,19 @@ class FaultCatalog:
 
     Args:
         devices: of the robot.
+        monitors: of its computer, by name.
         records: whether its daemon writes a log.
+        restarts: whether its computer can be switched off.
     """
 
-    def __init__(self, devices: Devices, *, records: bool) -> None:
+    def __init__(
+        self, devices: Devices, monitors: Collection[str] = (), *, records: bool, restarts: bool = False
+    ) -> None:
         self._roles = tuple(devices.present())
         self._hubs = hubs_of(devices)
+        self._monitors = monitors
         self._records = records
+        self._restarts = restarts
         self._makers = dict(self._list())
 
     @property
@@ -261,8 +291,14 @@ class FaultCatalog:
         if self._hubs:
             yield FaultKind.HUB_LOSS, lambda rng: _hubs(rng, FaultKind.HUB_LOSS, (_pick(rng, self._hubs),))
             yield FaultKind.RAIL_ELECTRONICS, lambda rng: _hubs(rng, FaultKind.RAIL_ELECTRONICS, self._hubs)
+            if self._restarts:
+                yield FaultKind.COMPUTER_POWER, lambda rng: _computer_power(rng, self._hubs)
         if self._records:
             yield FaultKind.DISK_FULL, _disk_full
+        if "link" in self._monitors:
+            yield FaultKind.NETWORK, _network
+        if "host" in self._monitors:
+            yield FaultKind.MEMORY, _memory
 
 
 def _pick(rng: np.random.Generator, among: tuple[str, ...]) -> str:
@@ -377,17 +413,40 @@ def _obstacle(rng: np.random.Generator) -> CatalogFault:
     return _fault(FaultKind.OBSTACLE, f"{gap:.2f} m ahead", place_obstacle(gap), clear_obstacles, 2 * _hold(rng))
 
 
-# Supply rails: battery -> EPOS; 12 V -> stabiliser, fan; 5 V -> servos; electronics -> lidar and hubs
+def _network(rng: np.random.Generator) -> CatalogFault:
+    """Interface gone, or no signal."""
+    lost, back = (("remove",), ("plug",)) if rng.random() < 0.5 else (("signal", "-95"), ("signal", "-55"))
+
+    def lose(context: SimContext) -> None:
+        context.monitored("link", *lost)
+
+    def give_back(context: SimContext) -> None:
+        context.monitored("link", *back)
+
+    return _fault(FaultKind.NETWORK, lost[0], lose, give_back, float(rng.uniform(1.5, 3.0)))
+
+
+def _memory(rng: np.random.Generator) -> CatalogFault:
+    def fill(context: SimContext) -> None:
+        context.monitored("host", "memory", "0.01")
+
+    def free(context: SimContext) -> None:
+        context.monitored("host", "memory", "0.6")
+
+    return _fault(FaultKind.MEMORY, "", fill, free, float(rng.uniform(1.5, 3.0)))
+
+
+# Supply rails: battery -> EPOS; 12 V -> stabiliser, fan; M4-ATX -> computer, 5 V -> servos, electronics -> lidar, hubs
 
 
 def _rail_12v(rng: np.random.Generator) -> CatalogFault:
     def lose(context: SimContext) -> None:
         context.command("stabiliser", "power off")
-        context.set_temperature(HOT)
+        context.monitored("host", "temperature", str(HOT))
 
     def give(context: SimContext) -> None:
         context.command("stabiliser", "power on")
-        context.set_temperature(COOL)
+        context.monitored("host", "temperature", str(COOL))
 
     return _fault(FaultKind.RAIL_12V, "", lose, give, _hold(rng))
 
@@ -412,6 +471,27 @@ def _hubs(rng: np.random.Generator, kind: FaultKind, hubs: tuple[str, ...]) -> C
         return context.return_hubs(*hubs)
 
     return _fault(kind, where, lose, give_back, _hold(rng), must_stop=True)
+
+
+def _computer_power(rng: np.random.Generator, hubs: tuple[str, ...]) -> CatalogFault:
+    """The computer's supply (M4-ATX) fails: computer, hubs, lidar and servos are dead, motor and stabiliser are not.
+
+    The time the computer takes to start is not simulated: the fault ends with its hubs enumerated and a new daemon.
+    """
+
+    async def lose(context: SimContext) -> None:
+        context.lose_hubs(*hubs)
+        context.robot.world.supply_servos(context.clock.now(), on=False)
+        if context.power is not None:
+            await context.power.cut()
+
+    async def give_back(context: SimContext) -> None:
+        context.robot.world.supply_servos(context.clock.now(), on=True)
+        await context.return_hubs(*hubs, enumerated=True)
+        if context.power is not None:
+            context.power.give()
+
+    return _fault(FaultKind.COMPUTER_POWER, "", lose, give_back, _hold(rng), must_stop=True)
 
 
 def _battery_off(rng: np.random.Generator) -> CatalogFault:
@@ -447,7 +527,12 @@ class FaultInjector:
         self._context = context
         self._period = config.period
         self._rng = np.random.default_rng(config.seed)
-        self._catalog = FaultCatalog(context.devices, records=context.disk is not None)
+        self._catalog = FaultCatalog(
+            context.devices,
+            context.robot.monitored,
+            records=context.disk is not None,
+            restarts=context.power is not None,
+        )
         self._report = report
 
     async def run(self) -> None:

@@ -17,12 +17,15 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_sim.faults import FaultCatalog, FaultKind
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.observer import Observer, Violation
-from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.random_drill import DEADMAN, Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
@@ -42,7 +45,8 @@ def demo() -> SimulatedTruckConfig:
 
 
 def catalog_of(config: SimulatedTruckConfig) -> FaultCatalog:
-    return FaultCatalog(config.devices, records=config.recorder is not None)
+    monitors, records = config.monitors.present(), config.recorder is not None
+    return FaultCatalog(config.devices, monitors, records=records, restarts=True)
 
 
 def test_random_faults_end_safely_and_leave_nothing_behind():
@@ -63,7 +67,8 @@ def test_one_seed_is_one_report():
 def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_not_without():
     assert set(catalog_of(full()).kinds) == set(FaultKind)
     missing = set(FaultKind) - set(catalog_of(demo()).kinds)
-    assert missing == {FaultKind.HUB_LOSS, FaultKind.RAIL_ELECTRONICS, FaultKind.RAIL_12V, FaultKind.ECHO}
+    hubs = {FaultKind.HUB_LOSS, FaultKind.RAIL_ELECTRONICS, FaultKind.COMPUTER_POWER}
+    assert missing == {*hubs, FaultKind.RAIL_12V, FaultKind.ECHO, FaultKind.NETWORK, FaultKind.MEMORY}
 
 
 def test_draws_are_the_seeds():
@@ -200,3 +205,41 @@ def test_a_configuration_can_let_faults_happen_by_themselves():
 
     told = run_virtual(main)
     assert told & {Reason.DEVICE_LOST, Reason.DEVICE_TIMEOUT, Reason.DEVICE_WRONG, Reason.DEVICE_FAULT}, told
+
+
+# The computer's supply
+
+
+def test_a_computer_that_loses_its_supply_stops_the_truck_and_starts_disarmed_on_the_same_world():
+    async def main(clock: VirtualClock) -> tuple[float, bool, GateMode, bool]:
+        config = with_overlay(full(), DEADMAN)
+        fault = fault_of(FaultKind.COMPUTER_POWER, config)
+        async with DrillTruck.running(config, clock) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            first, place = truck.rig.daemon, truck.rig.world.truth(clock.now())
+            truck.observer.begin(stops=True)
+            await apply(fault.start, truck.rig.context)
+            await clock.sleep(1.0)
+            assert truck.rig.daemon_ended
+            still, violations = truck.observer.standstill_after(), truck.observer.violations()
+            truck.observer.end_fault()
+            await apply(fault.end, truck.rig.context)
+            truck.listen()
+            assert await truck.until(lambda: not truck.blockers(), 15.0)
+            assert truck.gate is not None
+            mode, found = truck.gate.mode, truck.rig.world.truth(clock.now())
+            moved = math.dist((place.x, place.y), (found.x, found.y))
+            again = await truck.until(truck.drives, 15.0, Order.ARM)
+            assert truck.rig.daemon is not first
+            assert violations == truck.observer.violations() == ()
+            return still, moved < 0.2, mode, again
+
+    still, near, mode, again = run_virtual(main)
+    assert still <= 0.6
+    assert (near, mode, again) == (True, GateMode.DISARMED, True)
+
+
+def fault_of(kind: FaultKind, config: SimulatedTruckConfig) -> CatalogFault:
+    """A fault of the kind, as the catalog draws it."""
+    catalog, rng = catalog_of(config), np.random.default_rng(1)
+    return next(fault for fault in iter(lambda: catalog.draw(rng), None) if fault.kind is kind)

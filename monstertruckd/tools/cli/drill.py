@@ -20,6 +20,10 @@ def drill(
     count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
     config: SimulatedOption = FULL_CONFIG,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: all cores but one.")] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run it, such as tcp://HOST:8786."),
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Inject random faults into the emulated truck while it drives, and score its reactions.
@@ -30,7 +34,7 @@ def drill(
     from monstertruckd.tools.drill.random_drill import Drill, default_jobs
     from monstertruckd.tools.simulation.config import load_simulated
 
-    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs())
+    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs(), cluster)
     if json_output:
         print_json(report.as_json())
     else:
@@ -39,7 +43,7 @@ def drill(
         raise typer.Exit(1)
 
 
-def _run(drill: "Drill", jobs: int) -> "DrillReport":
+def _run(drill: "Drill", jobs: int, cluster: str | None) -> "DrillReport":
     finished = 0
     with progress("faults", drill.count) as done:
 
@@ -48,7 +52,7 @@ def _run(drill: "Drill", jobs: int) -> "DrillReport":
             finished += len(outcomes)
             done(finished)
 
-        return drill.run(jobs=jobs, report=show)
+        return drill.run(jobs=jobs, cluster=cluster, report=show)
 
 
 def _print(report: "DrillReport") -> None:

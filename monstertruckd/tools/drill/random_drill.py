@@ -1,13 +1,15 @@
 """Random drills: seeded faults of the catalog, one after another, on a truck that drives; judged by the observer.
 
 A drill consists of legs. Each leg has a truck and a virtual clock of its own and draws from its own stream of the
-seed, so that legs can run in parallel and still give the same report.
+seed, so that legs can run in parallel, here or on a cluster, and still give the same report.
 """
 
 import logging
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -15,12 +17,15 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
+from monstertruckd import __version__
+from monstertruckd.tools.drill.cluster import on_cluster
 from monstertruckd.tools.drill.observer import STOPS_WITHIN, Violation
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
@@ -150,6 +155,8 @@ class DrillLeg:
     seed: int
     number: int
     count: int
+    version: str = __version__
+    """Of the program; another one would give another report."""
 
 
 class Drill:
@@ -176,37 +183,63 @@ class Drill:
             for number, start in enumerate(starts)
         ]
 
-    def run(self, *, jobs: int = 1, report: Callable[[list[FaultOutcome]], None] = lambda _: None) -> DrillReport:
+    def run(
+        self,
+        *,
+        jobs: int = 1,
+        cluster: str | None = None,
+        report: Callable[[list[FaultOutcome]], None] = lambda _: None,
+    ) -> DrillReport:
         """Run all of it.
 
         Args:
             jobs: processes; 1 = this one alone.
-            report: called with the outcomes of each finished leg.
+            cluster: address of a dask scheduler, whose workers run it instead.
+            report: called with the outcomes of each leg, in the order of their numbers.
+
+        Raises:
+            InputError, NoAnswerError, WorkerError: see ``on_cluster``.
         """
         outcomes: list[FaultOutcome] = []
-        for part in self._parts(jobs):
-            report(part)
-            outcomes += part
+        with self._parts(jobs, cluster) as parts:
+            for part in parts:
+                report(part)
+                outcomes += part
         return DrillReport(self.seed, tuple(outcomes))
 
-    def _parts(self, jobs: int) -> Iterator[list[FaultOutcome]]:
+    @contextmanager
+    def _parts(self, jobs: int, cluster: str | None) -> Iterator[Iterator[list[FaultOutcome]]]:
         legs = self.legs()
-        if jobs == 1:
-            yield from map(run_leg, legs)
-            return
-        with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
-            yield from pool.map(run_leg, legs)
+        if cluster is not None:
+            with on_cluster(cluster, run_leg, legs) as parts:
+                yield parts
+        elif jobs == 1:
+            yield map(run_leg, legs)
+        else:
+            with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
+                yield pool.map(run_leg, legs)
+
+
+_ALONE: Final = threading.Lock()
+"""A leg silences the log of its process; a worker of a cluster may have several threads."""
 
 
 def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
-    """All faults of one leg, on the virtual clock."""
-    quiet = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        with TemporaryDirectory(prefix="monstertruck-") as folder:
-            return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
-    finally:
-        logging.disable(quiet)
+    """All faults of one leg, on the virtual clock.
+
+    Raises:
+        InputError: it comes from another version of the program.
+    """
+    if leg.version != __version__:
+        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
+    with _ALONE:
+        quiet = logging.root.manager.disable
+        logging.disable(logging.CRITICAL)
+        try:
+            with TemporaryDirectory(prefix="monstertruck-") as folder:
+                return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
+        finally:
+            logging.disable(quiet)
 
 
 class _LegRun:
@@ -216,7 +249,9 @@ class _LegRun:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number])
         base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
-        self._faults = _draw(FaultCatalog(base.devices, records=base.recorder is not None), leg.count, self._rng)
+        monitors, records = base.monitors.present(), base.recorder is not None
+        catalog = FaultCatalog(base.devices, monitors, records=records, restarts=True)
+        self._faults = _draw(catalog, leg.count, self._rng)
         records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
         recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None
         seed = int(self._rng.integers(2**31))
@@ -277,6 +312,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Fault
     reason = next((reason for report in truck.reports() for reason in _reasons(report)), None)
     ended = clock.now()
     await apply(fault.end, context)
+    truck.listen()
     await truck.until(lambda: not truck.blockers(), PATIENCE)
     recovered = (clock.now() - ended) / SECOND
     blockers = truck.blockers()

@@ -14,6 +14,7 @@ from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.daemon import Daemon
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -38,6 +39,15 @@ class DrillTruck:
         self.rig = rig
         self.clock = rig.clock
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
+        self._heard: Daemon | None = None
+        self.listen()
+
+    def listen(self) -> None:
+        """Listen to the rig's daemon where it is another one than before."""
+        rig = self.rig
+        if self._heard is rig.daemon:
+            return
+        self._heard = rig.daemon
         self.operator = LocalOperator(rig.daemon, rig.clock)
         queues = (rig.bus.subscribe(topic, fifo(1 << 16)) for topic in (topics.EVENT, topics.GATE, topics.HEALTH))
         self._reports = tuple(queues)

@@ -13,6 +13,7 @@ from monstertruck_runtime.threads import inline
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
+from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -47,19 +48,23 @@ class VirtualRig:
         )
         self.world = self.robot.world
         self.truth = TruthLog(self.world, clock)
-        by_path = {
-            role: port
-            for role, port in self.ports.items()
-            if not isinstance(config.devices.present()[role].port, UsbPortConfig)
-        }
-        self.daemon = Daemon(
-            config, clock, ports=by_path, computer=self.computer.computer(), tree=tree, seed=config.sim.seed
-        )
-        self.bus = self.daemon.bus
-        self.context = SimContext(config.sim, config.devices, self.robot, self.computer, clock, self.daemon.recorder)
-        """What faults act on."""
+        self._tree = tree
+        self._starts = 0
+        self.daemon = self._new_daemon()
         self._stop = asyncio.Event()
         self._daemon_task: asyncio.Task[None] | None = None
+
+    @property
+    def bus(self) -> Bus:
+        """Of the present daemon."""
+        return self.daemon.bus
+
+    @property
+    def context(self) -> SimContext:
+        """What faults act on."""
+        config = self.config
+        disk = self.daemon.recorder
+        return SimContext(config.sim, config.devices, self.robot, self.computer, self.clock, disk, power=self)
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["VirtualRig"]:
@@ -74,7 +79,7 @@ class VirtualRig:
         ]
         if (drill := self.config.sim.drill) is not None:
             around.append(asyncio.create_task(FaultInjector(self.context, drill).run(), name="faults"))
-        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
+        self._start_daemon()
         try:
             yield self
         finally:
@@ -86,6 +91,30 @@ class VirtualRig:
                 await asyncio.wait(around)
                 self._folder.cleanup()
 
+    # The computer's supply
+
+    async def cut(self) -> None:
+        """The daemon is gone at once; cables that lead to it must be dead before."""
+        assert self._daemon_task is not None
+        self._daemon_task.cancel()
+        await asyncio.wait([self._daemon_task])
+
+    def give(self) -> None:
+        """A new daemon on the same robot; what subscribed to the one before hears nothing of it."""
+        self.daemon = self._new_daemon()
+        self._start_daemon()
+
+    def _new_daemon(self) -> Daemon:
+        devices = self.config.devices.present()
+        by_path = {r: port for r, port in self.ports.items() if not isinstance(devices[r].port, UsbPortConfig)}
+        seed = self.config.sim.seed + self._starts
+        self._starts += 1
+        computer = self.computer.computer()
+        return Daemon(self.config, self.clock, ports=by_path, computer=computer, tree=self._tree, seed=seed)
+
+    def _start_daemon(self) -> None:
+        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
+
     @property
     def daemon_ended(self) -> bool:
         """Whether the daemon has ended, asked to or not."""
@@ -95,4 +124,5 @@ class VirtualRig:
         """Ask the daemon to end, as SIGTERM does, and wait until it has."""
         self._stop.set()
         assert self._daemon_task is not None
-        await self._daemon_task
+        if not self._daemon_task.cancelled():
+            await self._daemon_task

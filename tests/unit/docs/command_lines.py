@@ -47,6 +47,10 @@ INSTEAD = {
     "monstertruckd install-service --start": Instead(
         "monstertruckd install-service --start --root system --dry-run", SYSTEM
     ),
+    "monstertruckd install-service --upgrade": Instead(None, "needs a service; benchmarks/service.py boots one"),
+    "monstertruckd drill --count 10000 --cluster tcp://HOST:8786": Instead(
+        None, "needs a cluster; tests/daemon/test_drill_cluster.py starts one"
+    ),
     "monstertruckd uninstall-service": Instead("monstertruckd uninstall-service --root system --dry-run", SYSTEM),
     "monstertruckd doctor": Instead("monstertruckd doctor --root system", "looks at this computer", code=None),
     "monstertruckd usb --local": Instead("monstertruckd usb --local", "looks at this computer", code=None),
