@@ -61,16 +61,17 @@ def load_map(path: Path) -> WorldMap:
         InputError: file, key and expectation of whatever is wrong.
     """
     keys = _read_keys(path)
-    values, opaque = _read_image(path, path.parent / str(keys["image"]))
-    mode, negate = keys["mode"], bool(keys["negate"])
+    sums, opaque = _read_image(path, path.parent / str(keys["image"]))
+    mode, values = keys["mode"], np.arange(3 * 255 + 1) / 3.0
     if mode == "raw":
         darkness = np.where(values <= 100, values / 100.0, np.nan)
     else:
-        darkness = values / 255.0 if negate else (255.0 - values) / 255.0
-    cells = np.full(values.shape, UNKNOWN, dtype=np.int8)
-    cells[darkness > keys["occupied_thresh"]] = OCCUPIED
-    cells[darkness < keys["free_thresh"]] = FREE
-    if mode == "scale":
+        darkness = values / 255.0 if keys["negate"] else (255.0 - values) / 255.0
+    cell_of = np.full(values.shape, UNKNOWN, dtype=np.int8)
+    cell_of[darkness > keys["occupied_thresh"]] = OCCUPIED
+    cell_of[darkness < keys["free_thresh"]] = FREE
+    cells = cell_of[sums]
+    if mode == "scale" and opaque is not None:
         cells[~opaque] = UNKNOWN
     return WorldMap(np.flipud(cells), keys["resolution"], (keys["origin"][0], keys["origin"][1]))
 
@@ -142,13 +143,15 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
-def _read_image(source: Path, path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Grey values 0..255 and opacity, both (rows, columns), top row first."""
+def _read_image(source: Path, path: Path) -> tuple[NDArray[np.uint16], NDArray[np.bool_] | None]:
+    """Sums of the three colours, each 0..255, and opacity (None: all of it), both (rows, columns), top row first."""
     try:
         with Image.open(path) as image:
+            if image.mode in ("1", "L") and "transparency" not in image.info:
+                return np.asarray(image.convert("L"), np.uint16) * 3, None
             pixels = np.asarray(image.convert("RGBA"))
     except UnidentifiedImageError as error:
         raise InputError(f"{source}: image: {path} is not a known image format") from error
     except OSError as error:
         raise InputError(f"{source}: image: cannot read {path}: {error}") from error
-    return pixels[..., :3].mean(axis=-1), pixels[..., 3] > 0
+    return pixels[..., :3].sum(axis=-1, dtype=np.uint16), pixels[..., 3] > 0

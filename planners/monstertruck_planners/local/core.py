@@ -137,7 +137,7 @@ class LocalPlannerCore:
         search = search or HybridConfig(effort=config.effort)
         margins = dict.fromkeys((config.margin, 0.0))
         self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
-        self._primitives = self._planners[0].motion_model(RESOLUTIONS[0]).primitives
+        self._primitives = self._planners[0].motion_model(RESOLUTIONS[0], vehicle.crab_angle).primitives
 
     def begin(
         self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState

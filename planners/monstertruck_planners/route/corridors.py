@@ -69,9 +69,9 @@ def _fits_in_cell(
 @njit(cache=True)
 def close_narrow_gaps(
     field: FieldData, footprint: FootprintData, margin: float, cell_cost: NDArray[np.int16], factor: int, wide: float,
-    corridor: NDArray[np.bool_], checked: NDArray[np.bool_],
+    step: NDArray[np.int8], row: int, column: int, radius: float, checked: NDArray[np.bool_],
 ) -> int:  # fmt: skip
-    """Close the coarse cells of a corridor in which the footprint fits nowhere.
+    """Close the coarse cells round a way in which the footprint fits nowhere.
 
     Args:
         field: the fine grid.
@@ -80,7 +80,10 @@ def close_narrow_gaps(
         cell_cost: of the coarse cells, 0 = closed, see ``heuristic.cell_costs``; changed in place.
         factor: fine cells per coarse one, each way.
         wide: cells further than this from obstacles are taken to be open, m.
-        corridor: coarse cells to be checked.
+        step: see ``CostToGo``.
+        row: of the cell where the way begins.
+        column: the same.
+        radius: cells this near to the way are checked, cells.
         checked: those that have been; changed in place.
 
     Returns:
@@ -88,15 +91,21 @@ def close_narrow_gaps(
     """
     closed = 0
     rows, columns = cell_cost.shape
-    for row in range(rows):
-        for column in range(columns):
-            if not corridor[row, column] or checked[row, column]:
-                continue
-            checked[row, column] = True
-            if cell_cost[row, column] > 0 and not _fits_in_cell(field, footprint, margin, row, column, factor, wide):
-                cell_cost[row, column] = 0
-                closed += 1
-    return closed
+    span = int(radius)
+    while True:
+        for r in range(max(row - span, 0), min(row + span + 1, rows)):
+            for c in range(max(column - span, 0), min(column + span + 1, columns)):
+                if checked[r, c] or (r - row) ** 2 + (c - column) ** 2 > radius * radius:
+                    continue
+                checked[r, c] = True
+                if cell_cost[r, c] > 0 and not _fits_in_cell(field, footprint, margin, r, c, factor, wide):
+                    cell_cost[r, c] = 0
+                    closed += 1
+        k = step[row, column]
+        if k < 0:
+            return closed
+        row += NEIGHBOURS[k, 1]
+        column += NEIGHBOURS[k, 0]
 
 
 @njit(cache=True)

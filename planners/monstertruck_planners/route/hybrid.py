@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import FieldData
 from monstertruck_planners.route import heuristic, search
 from monstertruck_planners.route.api import (
     Budget,
@@ -33,7 +32,7 @@ from monstertruck_planners.route.hybrid_search import (
     SearchProblem,
     SearchRun,
 )
-from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.motion import MotionPath, cusps_of
 from monstertruck_planners.route.smoothing import EditablePath, choose_headings, current_segments, editable, shortcut
 from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
@@ -50,14 +49,14 @@ MAX_IDLE_ROUNDS = 12
 FINE_SHIFTS = (0.25, 0.1, 0.03, 0.01)
 """Shares of a stretch by which poses move in the final smoothing."""
 
-FINAL_SHARE = 0.1
-"""Of the budget, for the final smoothing."""
-
-CRAB_SHARE = 0.2
-"""Of the budget, for the final smoothing without and with translations."""
+FINAL_SHARE = 0.2
+"""Of the budget, for the final smoothing without and then with translations."""
 
 CUSPS_SHARE = 0.3
 """Of the budget, kept when routes with fewer cusps are looked for."""
+
+PLAIN_SHARE = 0.5
+"""Of the budget, kept when a route without translations is looked for and one with them is known."""
 
 ALTERNATIVE_DISTANCE = 2.5
 """Alternatives are this far from all known ways somewhere, turning radii."""
@@ -123,10 +122,9 @@ class HybridPlanner:
         self.vehicle = vehicle
         self.config = config or HybridConfig()
         self.reeds_shepp = vehicle.reeds_shepp(self.config)
-        self.table = heuristic.reeds_shepp_table(vehicle.crab_angle)
         self.footprint = vehicle.footprint.data()
         self.costs = RouteCosts.of(vehicle, self.config)
-        self._models = {resolution: self._motion_model(resolution) for resolution in RESOLUTIONS}
+        self._models: dict[tuple[Resolution, float], search.VehicleMotions] = {}
         self._narrower = [HybridPlanner(vehicle, narrow) for narrow in narrower_configs(self.config)]
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
@@ -163,22 +161,25 @@ class HybridPlanner:
 
     def free(self, route_map: RouteMap, path: MotionPath) -> bool:
         """Whether a path of the reference point is free of collisions."""
-        segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
-        field = route_map.field.data()
-        return bool(search.segments_free(field, self.footprint, model, path.start, segments, len(segments)))
+        start, segments = path.copied()
+        model, field = self.motion_model(RESOLUTIONS[0], 0.0), route_map.field.data()
+        return bool(search.segments_free(field, self.footprint, model, start, segments, len(segments)))
 
     def cost(self, route_map: RouteMap, path: MotionPath) -> float:
         """Cost of a path, m."""
-        segments, model = np.ascontiguousarray(path.segments), self.motion_model(RESOLUTIONS[0])
+        start, segments = path.copied()
         field, layer = route_map.field.data(), route_map.cost_layer(self.costs)
-        return route_cost(field, layer, model, path.start, segments)
+        return float(search.route_cost(field, layer, self.motion_model(RESOLUTIONS[0], 0.0), start, segments))
 
-    def motion_model(self, resolution: Resolution) -> search.VehicleMotions:
-        """The vehicle's limits and costs, with motion primitives of a resolution."""
-        return self._models.get(resolution) or self._motion_model(resolution)
+    def motion_model(self, resolution: Resolution, crab: float) -> search.VehicleMotions:
+        """The vehicle's limits and costs, with motion primitives of a resolution and translations up to an angle."""
+        key = (resolution, crab)
+        if key not in self._models:
+            self._models[key] = self._motion_model(resolution, crab)
+        return self._models[key]
 
-    def _motion_model(self, resolution: Resolution) -> search.VehicleMotions:
-        radius, crab = self.vehicle.radius, self.vehicle.crab_angle
+    def _motion_model(self, resolution: Resolution, crab: float) -> search.VehicleMotions:
+        radius = self.vehicle.radius
         length = resolution.primitive * radius
         primitives = [(s * length, k / radius, 0.0) for s in (1.0, -1.0) for k in (0.0, 1.0, -1.0, 0.5, -0.5)]
         if crab > 0.0:
@@ -191,12 +192,9 @@ class HybridPlanner:
         )  # fmt: skip
 
 
-def route_cost(
-    field: FieldData, layer: search.CostLayer, model: search.VehicleMotions, start: Array, segments: Array
-) -> float:
-    """Cost of a whole route, m."""
-    cost = search.segments_cost(field, layer, model, start, segments, len(segments), 0.0)
-    return float(cost + search.many_cusps_cost(model, 0, search.count_cusps(segments, len(segments), 0.0)))
+def holds_translations(segments: Array) -> bool:
+    """Whether some of a route's segments are driven at an angle to the heading."""
+    return bool((segments[:, 2] != 0.0).any())
 
 
 def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
@@ -223,24 +221,25 @@ class _PlanningRun:
         self.layer = route_map.cost_layer(planner.costs)
         self.factor, self.cell = route_map.coarse_factor, route_map.coarse_cell
         self.route_map = route_map
-        self.model = planner.motion_model(RESOLUTIONS[0])
+        self.crab = planner.vehicle.crab_angle
+        self.model = planner.motion_model(RESOLUTIONS[0], 0.0)
         self.random = np.random.default_rng(0)
         self.statistics: dict[str, float] = {"expanded": 0, "trials": 0, "kept": 0, "alternatives": 0}
         self.problem = SearchProblem(
-            self.field, self.footprint, self.layer, planner.table, self.start, self.goal,
-            self.config.heuristic_weight, budget, self.statistics,
+            self.field, self.footprint, self.layer, self.start, self.goal, self.config.heuristic_weight, budget,
+            self.statistics,
         )  # fmt: skip
 
     def route(self) -> RouteResult:
-        segments = self._direct()
-        direct = segments is not None
+        segments = self._direct(self.crab)
+        cheapest = segments is not None and self._is_cheapest(segments)
         if segments is None:
-            segments, reason, text = self._search(self._cost_to_go())
+            segments, reason, text = self._first_route((0.0, self.crab) if self.crab else (0.0,), self.attempt.reserve)
             if segments is None:
                 return RouteResult(reason, text=text, statistics=self._final_statistics())
         self.statistics["first_s"] = self.budget.elapsed
         self.statistics["first_length"] = float(np.abs(segments[:, 0]).sum())
-        if self.config.improve and not (direct and self._is_cheapest(segments)):
+        if self.config.improve and not cheapest:
             segments = self._improve(segments)
         path = MotionPath(self.start, segments, self.vehicle.steering, self.vehicle.reference)
         return RouteResult(Reason.OK, path, cost=self._cost(segments), statistics=self._final_statistics())
@@ -264,69 +263,86 @@ class _PlanningRun:
             cell_cost, self.cell, self._cell_of(self.goal), self._cell_of(self.start), overrun=overrun
         )
 
-    def _direct(self) -> Array | None:
-        """The best motion without obstacles, if it is free."""
-        segments = np.ascontiguousarray(self.planner.reeds_shepp.path(self.start, self.goal).segments)
+    def _first_route(self, crabs: tuple[float, ...], reserve: float) -> tuple[Array | None, Reason, str]:
+        """The direct motion without translations, or what the searches find with these crab angles."""
+        segments = self._direct(0.0)
+        return self._search(self._cost_to_go(), crabs, reserve) if segments is None else (segments, Reason.OK, "")
+
+    def _direct(self, crab: float) -> Array | None:
+        """The best motion without obstacles, with translations up to an angle, if it is free."""
+        reeds_shepp = replace(self.planner.reeds_shepp, crab_angle=crab)
+        _, segments = reeds_shepp.path(self.start, self.goal).copied()
         free = search.segments_free(self.field, self.footprint, self.model, self.start, segments, len(segments))
-        return np.array(segments) if free else None
+        return segments if free else None
 
     def _is_cheapest(self, segments: Array) -> bool:
         """Whether nothing could make the best motion without obstacles cheaper: they and the ground cost nothing.
 
         Backward metres that cost more may be avoided by longer arcs than such motions have.
         """
-        free = search.segments_cost(self.field, NO_COSTS, self.model, self.start, segments, len(segments), 0.0)
+        free = search.route_cost(self.field, NO_COSTS, self.model, self.start, segments)
         shortest = self.config.reverse_cost == 1.0 or segments[:, 0].min(initial=0.0) >= 0.0
         return shortest and self._cost(segments) <= free
 
-    def _search(self, to_go: heuristic.CostToGo) -> tuple[Array | None, Reason, str]:
-        """First route: a short coarse search, then gaps are measured, and a fine and the coarse one take turns."""
+    def _search(
+        self, to_go: heuristic.CostToGo, crabs: tuple[float, ...], reserve: float
+    ) -> tuple[Array | None, Reason, str]:
+        """First route: a short coarse search, then gaps are measured, and fine and coarse ones take turns.
+
+        Args:
+            to_go: ways to the goal.
+            crabs: greatest angles of translations that are searched with, in this order.
+            reserve: share of the budget that is kept.
+        """
         too_narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
         if not self._reachable(to_go):
             return too_narrow
-        coarse = self._search_run(to_go, RESOLUTIONS[0])
-        segments = coarse.run(FIRST_NODES, self.attempt.reserve) if self.attempt.first else None
+        coarse = [self._search_run(to_go, RESOLUTIONS[0], crab) for crab in crabs]
+        segments = coarse[0].run(FIRST_NODES, reserve) if self.attempt.first else None
         if segments is not None:
             return segments, Reason.OK, ""
         if self._close_narrow_gaps(to_go):
             to_go = self._cost_to_go()
             if not self._reachable(to_go):
                 return too_narrow
-            coarse = self._search_run(to_go, RESOLUTIONS[0])
-        fine = self._search_run(to_go, RESOLUTIONS[1], strokes=True)
-        segments = self._run_in_turns(fine, coarse, self.attempt.reserve)
-        if segments is None and fine.exhausted:
-            fine = self._search_run(self._cost_to_go(overrun=math.inf), RESOLUTIONS[2])
-            segments = fine.run(MAX_NODES, self.attempt.reserve)
+            coarse = [self._search_run(to_go, RESOLUTIONS[0], crab) for crab in crabs]
+        fine = [self._search_run(to_go, RESOLUTIONS[1], crab, strokes=True) for crab in crabs]
+        segments = self._run_in_turns(fine, coarse, reserve)
+        if segments is None and fine[-1].exhausted:
+            fine = [self._search_run(self._cost_to_go(overrun=math.inf), RESOLUTIONS[2], crabs[-1])]
+            segments = fine[0].run(MAX_NODES, reserve)
         if segments is not None:
             return segments, Reason.OK, ""
         # A search that is exhausted proves nothing: between its cells and headings there may be a way.
         return (
             None,
             Reason.ROUTE_TIMEOUT,
-            "no drivable way found" + (", all searches exhausted" if fine.exhausted else ""),
+            "no drivable way found" + (", all searches exhausted" if fine[-1].exhausted else ""),
         )
 
     def _search_run(
         self,
         to_go: heuristic.CostToGo,
         resolution: Resolution,
+        crab: float,
         goal_range: float = np.inf,
         max_cusps: int = MAX_RUNS - 1,
         *,
         strokes: bool = False,
     ) -> SearchRun:
         resolution = resolution.fitted(self.field, self.vehicle.radius)
-        model = self.planner.motion_model(resolution)._replace(max_cusps=max_cusps, strokes=strokes)
+        model = self.planner.motion_model(resolution, crab)._replace(max_cusps=max_cusps, strokes=strokes)
         return SearchRun(self.problem, model, to_go, resolution, goal_range)
 
-    def _run_in_turns(self, fine: SearchRun, coarse: SearchRun, reserve: float) -> Array | None:
+    def _run_in_turns(self, fine: list[SearchRun], coarse: list[SearchRun], reserve: float) -> Array | None:
+        """What the first of some searches finds, each of which is a fine and a coarse one."""
         count = FIRST_NODES
-        while self.budget.remaining() > reserve and not fine.exhausted:
-            for run in (fine, coarse):
-                segments = run.run(count, reserve)
-                if segments is not None:
-                    return segments
+        while self.budget.remaining() > reserve and not fine[-1].exhausted:
+            for pair in zip(fine, coarse, strict=True):
+                for run in pair:
+                    segments = run.run(count, reserve)
+                    if segments is not None:
+                        return segments
             count *= GROWTH
         return None
 
@@ -335,17 +351,17 @@ class _PlanningRun:
 
     def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
         """Close the narrow gaps on the shortest way, on the next one around these, and so on; False: there are none."""
-        corridor, checked = np.zeros(self.cell_cost.shape, np.bool_), np.zeros(self.cell_cost.shape, np.bool_)
+        checked = np.zeros(self.cell_cost.shape, np.bool_)
         # Without a margin to spare, gaps that may be just wide enough are left to the search.
         margin = self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
         wide = self.planner.costs.side + self.config.margin + NARROW
         any_closed = False
         for _ in range(GAP_ROUNDS):
             for width in (0.0, GAP_CORRIDOR / self.cell):
-                mark_corridor(corridor, to_go.step, *self._cell_of(self.start), width)
                 closed = close_narrow_gaps(
-                    self.field, self.footprint, margin, self.cell_cost, self.factor, wide, corridor, checked
-                )
+                    self.field, self.footprint, margin, self.cell_cost, self.factor, wide, to_go.step,
+                    *self._cell_of(self.start), width, checked,
+                )  # fmt: skip
                 if not closed and not width:
                     return any_closed
             any_closed = True
@@ -354,47 +370,53 @@ class _PlanningRun:
                 break
         return any_closed
 
-    def _improve(self, segments: Array) -> Array:
+    def _improve(self, first: Array) -> Array:
         """The best route found in the budget that is left.
 
-        Motions without translations are found in half the time: they come first, and what they give is kept unless
-        translations make it shorter.
+        Motions without translations are found in half the time: they come first, as for a vehicle that has no others,
+        and what they give is kept unless translations make it shorter. So these make no route longer.
         """
-        model = self.model
-        self.model = model._replace(crab=0.0)
+        segments = first
+        if holds_translations(first):
+            plain, _, _ = self._first_route((0.0,), PLAIN_SHARE)
+            segments = first if plain is None else plain
         segments = self._with_fewer_cusps(segments)
-        segments = self._improve_in_rounds(segments, CRAB_SHARE if model.crab > 0.0 else FINAL_SHARE)
+        segments = self._improve_in_rounds(segments)
         segments = self._polished(segments)
-        self.model = model
-        if model.crab > 0.0:
-            segments = min(self._polished(segments), segments, key=self._detours)
+        if self.crab > 0.0:
+            self.model = self.planner.motion_model(RESOLUTIONS[0], self.crab)
+            routes = [segments, first] if holds_translations(first) else [segments]
+            segments = min((segments, *map(self._polished, routes)), key=self._detours)
         return segments
 
-    def _detours(self, segments: Array) -> tuple[float, float]:
-        """Extra cost of many cusps; weighted metres."""
+    def _detours(self, segments: Array) -> tuple[int, float]:
+        """Cusps that cost extra; weighted metres."""
         backward, _, crab = self.model.weights
         metres = np.abs(segments[:, 0]) * np.where(segments[:, 0] < 0.0, backward, 1.0)
         metres *= np.where(segments[:, 2] != 0.0, crab, 1.0)
-        cusps = search.count_cusps(segments, len(segments), 0.0)
-        return search.many_cusps_cost(self.model, 0, cusps), float(metres.sum())
+        return max(cusps_of(segments) - self.config.free_cusps, 0), float(metres.sum())
 
     def _with_fewer_cusps(self, segments: Array) -> Array:
         """The route, or one with fewer cusps if there are so many that each costs extra."""
-        while (cusps := search.count_cusps(segments, len(segments), 0.0)) > self.config.free_cusps:
+        crabs = (0.0, self.crab) if holds_translations(segments) else (0.0,)
+        while (cusps := cusps_of(segments)) > self.config.free_cusps:
             to_go = self._cost_to_go()
-            fine, coarse = (self._search_run(to_go, RESOLUTIONS[k], max_cusps=cusps - 1, strokes=True) for k in (1, 0))
+            fine, coarse = (
+                [self._search_run(to_go, RESOLUTIONS[k], crab, max_cusps=cusps - 1, strokes=True) for crab in crabs]
+                for k in (1, 0)
+            )
             other = self._run_in_turns(fine, coarse, CUSPS_SHARE)
             if other is None:
                 break
             segments = other
         return segments
 
-    def _improve_in_rounds(self, segments: Array, reserve: float) -> Array:
-        """Smooth the best route and others in turn until nothing gains or only the reserve is left."""
+    def _improve_in_rounds(self, segments: Array) -> Array:
+        """Smooth the best route and others in turn until nothing gains or only the last share is left."""
         others = self._starts(segments)
         best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
-        while self.budget.remaining() > reserve and idle < MAX_IDLE_ROUNDS:
+        while self.budget.remaining() > FINAL_SHARE and idle < MAX_IDLE_ROUNDS:
             segments = next(others)
             mate = best if len(segments) else NO_SEGMENTS
             segments, other = self._smoothed(segments if len(segments) else best, mate, PROMISING * cost)
@@ -447,7 +469,7 @@ class _PlanningRun:
             self.statistics["kept"] += kept
 
     def _cost(self, segments: Array) -> float:
-        return route_cost(self.field, self.layer, self.model, self.start, segments)
+        return float(search.route_cost(self.field, self.layer, self.model, self.start, segments))
 
     def _best_chain(self, routes: list[Array]) -> Array:
         """Motions over places of some routes, ordered by their share of the way, with the best heading at each."""
@@ -487,5 +509,5 @@ class _PlanningRun:
             # From further off the expansion to the goal is not tried: it would leave the corridor.
             near = 3.0 * self.vehicle.radius
             inside = self._cost_to_go(np.where(corridor, self.cell_cost, np.int16(0)))
-            segments = self._search_run(inside, RESOLUTIONS[0], near).run(search.CHUNK)
+            segments = self._search_run(inside, RESOLUTIONS[0], 0.0, near).run(search.CHUNK)
             yield NO_SEGMENTS if segments is None else segments

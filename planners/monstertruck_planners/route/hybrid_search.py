@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData
 from monstertruck_planners.route.api import Budget
-from monstertruck_planners.route.heuristic import CostToGo, cell_ahead, cell_at, heuristic_cost
+from monstertruck_planners.route.heuristic import CostToGo, cell_ahead, cell_at, heuristic_cost, reeds_shepp_table
 from monstertruck_planners.route.motion import advance
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
 from monstertruck_planners.route.search import (
@@ -71,10 +71,10 @@ class Nodes(NamedTuple):
     """Shape (rows, columns, headings): number of the node in each cell plus one, 0 = none."""
     cell: float
     counts: IntArray
-    """Used nodes, open nodes, nodes expanded so far, the node before the goal."""
+    """Used nodes, open nodes, nodes expanded so far."""
 
 
-USED, OPEN, EXPANDED, LAST = 0, 1, 2, 3
+USED, OPEN, EXPANDED = 0, 1, 2
 
 
 @njit(cache=True)
@@ -129,7 +129,7 @@ def _expansion_target(
 def expand(
     field: FieldData, footprint: FootprintData, layer: CostLayer, to_go: CostToGo, table: NDArray[np.float32],
     model: VehicleMotions, goal: Array, nodes: Nodes, heuristic_weight: float, goal_range: float, count: int,
-) -> int:  # fmt: skip
+) -> tuple[int, Array]:  # fmt: skip
     """Expand up to ``count`` nodes.
 
     Args:
@@ -146,13 +146,13 @@ def expand(
         count: see above.
 
     Returns:
-        RUNNING, FOUND (the goal is reached from the node ``counts[LAST]``) or EXHAUSTED.
+        RUNNING, FOUND or EXHAUSTED; if FOUND the segments from start to goal, else none.
     """
     segments, best, scratch, target = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3)), np.empty(3)
-    primitive = np.empty((1, 3))
+    primitive, nothing = np.empty((1, 3)), np.empty((0, 3))
     for _ in range(count):
         if nodes.counts[OPEN] == 0 or nodes.counts[USED] >= len(nodes.cost):
-            return EXHAUSTED
+            return EXHAUSTED, nothing
         n = nodes.items[0]
         nodes.counts[OPEN] = drop(nodes.keys, nodes.items, nodes.counts[OPEN])
         if nodes.closed[n]:
@@ -165,8 +165,7 @@ def expand(
             many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
             few = cusps + count_cusps(segments, many, direction) <= model.max_cusps
             if few and segments_free(field, footprint, model, pose, segments, many):
-                nodes.counts[LAST] = n
-                return FOUND
+                return FOUND, _trace(field, footprint, model, goal, nodes, n)
         for i in range(len(model.expansion_lengths)):
             distance = model.expansion_lengths[i]
             if not _expansion_target(field, to_go, pose[0], pose[1], distance, model.radius, target):
@@ -196,7 +195,7 @@ def expand(
                 end = 1.0 if primitive[0, 0] > 0.0 else -1.0
                 _open_node(field, to_go, table, model, goal, nodes, heuristic_weight,
                            x, y, yaw, cost + step_cost, n, i, end, cusps + more)  # fmt: skip
-    return RUNNING
+    return RUNNING, nothing
 
 
 @njit(cache=True)
@@ -215,15 +214,17 @@ def _write_primitive(
 
 
 @njit(cache=True)
-def _trace(field: FieldData, footprint: FootprintData, model: VehicleMotions, goal: Array, nodes: Nodes) -> Array:
-    """Segments of the solution at ``counts[LAST]``, from the start to the goal."""
+def _trace(
+    field: FieldData, footprint: FootprintData, model: VehicleMotions, goal: Array, nodes: Nodes, last_node: int
+) -> Array:
+    """Segments from the start over a node, from which the goal is reached directly, to the goal."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
-    depth, n = 1, nodes.counts[LAST]
+    depth, n = 1, last_node
     while nodes.parent[n] >= 0:
         depth += 1
         n = nodes.parent[n]
     chain = np.empty(depth, np.int64)
-    n = nodes.counts[LAST]
+    n = last_node
     for i in range(depth - 1, -1, -1):
         chain[i] = n
         n = nodes.parent[n]
@@ -278,8 +279,6 @@ class SearchProblem:
     field: FieldData
     footprint: FootprintData
     layer: CostLayer
-    table: NDArray[np.float32]
-    """See ``reeds_shepp_table``."""
     start: Array
     goal: Array
     """Poses, shape (3,)."""
@@ -306,14 +305,10 @@ class SearchRun:
         goal_range: float = np.inf,
     ) -> None:  # fmt: skip
         self._problem, self._model, self._to_go, self._goal_range = problem, model, to_go, goal_range
-        self._nodes = _allocate(problem.field, resolution.cell * model.radius, resolution.headings)
+        self._table = reeds_shepp_table(model.crab)
+        self._nodes = _allocate(problem.field, resolution.cell * model.radius, resolution.headings, problem.start)
         self.exhausted = False
         """Whether no node is left to expand."""
-        x, y, yaw = problem.start
-        _open_node(
-            problem.field, to_go, problem.table, model, problem.goal, self._nodes, problem.heuristic_weight,
-            x, y, yaw, 0.0, -1, EXPANSION, 0.0, 0,
-        )  # fmt: skip
 
     def run(self, count: int, reserve: float = 0.0) -> Array | None:
         """Expand about ``count`` more nodes, while more than ``reserve`` of the budget is left.
@@ -323,28 +318,32 @@ class SearchRun:
         """
         problem, nodes = self._problem, self._nodes
         first = int(nodes.counts[EXPANDED])
-        status = EXHAUSTED if self.exhausted else RUNNING
+        status, segments = EXHAUSTED if self.exhausted else RUNNING, None
         while status == RUNNING and problem.budget.remaining() > reserve:
             before = int(nodes.counts[EXPANDED])
             if before - first >= count:
                 break
-            status = expand(
-                problem.field, problem.footprint, problem.layer, self._to_go, problem.table, self._model,
+            status, segments = expand(
+                problem.field, problem.footprint, problem.layer, self._to_go, self._table, self._model,
                 problem.goal, nodes, problem.heuristic_weight, self._goal_range, CHUNK,
             )  # fmt: skip
             expanded = int(nodes.counts[EXPANDED]) - before
             problem.budget.work += expanded
             problem.statistics["expanded"] += expanded
         self.exhausted = status == EXHAUSTED
-        return _trace(problem.field, problem.footprint, self._model, problem.goal, nodes) if status == FOUND else None
+        return segments if status == FOUND else None
 
 
-def _allocate(field: FieldData, cell: float, headings: int) -> Nodes:
-    """Memory for the nodes of a search."""
+def _allocate(field: FieldData, cell: float, headings: int, start: Array) -> Nodes:
+    """Memory for the nodes of a search, of which the start is the first."""
     n = MAX_NODES
     rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
-    return Nodes(
+    nodes = Nodes(
         np.empty((n, 3)), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64),
         np.empty(n, np.bool_), np.empty(n), np.empty(n, np.int64),
-        np.zeros((rows, columns, headings), np.int32), cell, np.zeros(4, np.int64),
+        np.zeros((rows, columns, headings), np.int32), cell, np.array([1, 1, 0]),
     )  # fmt: skip
+    nodes.pose[0], nodes.parent[0], nodes.action[0] = start, -1, EXPANSION
+    for zero in (nodes.cost, nodes.direction, nodes.cusps, nodes.closed, nodes.keys, nodes.items):
+        zero[0] = 0
+    return nodes

@@ -144,7 +144,11 @@ class MotionPath:
     @property
     def cusps(self) -> int:
         """Changes between forward and backward."""
-        return int(np.count_nonzero(np.diff(np.sign(self.segments[:, 0]))))
+        return cusps_of(self.segments)
+
+    def copied(self) -> tuple[Array, Array]:
+        """Start and segments as arrays that may be written to, the only kind that the searches are compiled for."""
+        return self.start.copy(), self.segments.copy()
 
     @property
     def greatest_curvature(self) -> float:
@@ -220,6 +224,11 @@ class MotionPath:
             steering=tuple(self.steering[i] for i in samples.segment.tolist()) if self.steering else (),  # type: ignore[misc]
             name=name,
         )
+
+
+def cusps_of(segments: Array) -> int:
+    """Changes between forward and backward in segments, shape (n, 3), none of which has no length."""
+    return int(np.count_nonzero(np.diff(np.sign(segments[:, 0]))))
 
 
 def moved(poses: Array, ahead: float) -> Array:

@@ -496,7 +496,7 @@ class ReedsShepp:
 
     def path(self, start: ArrayLike, goal: ArrayLike) -> MotionPath:
         """Best motion from one pose to another."""
-        a, b = _poses(start)[0], _poses(goal)[0]
+        a, b = _poses(start)[0].copy(), _poses(goal)[0].copy()
         segments = _best_segments(a, b, self.radius, self.crab_angle, self.weights)
         return MotionPath(a, segments, self.steering, self.reference)
 

@@ -194,6 +194,14 @@ def segments_cost(
 
 
 @njit(cache=True)
+def route_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, start: Array, segments: Array) -> float:
+    """Cost of a whole route, m."""
+    count = len(segments)
+    cost = segments_cost(field, layer, model, start, segments, count, 0.0)
+    return cost + many_cusps_cost(model, 0, count_cusps(segments, count, 0.0))
+
+
+@njit(cache=True)
 def free_length(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, segment: Array, longest: float
 ) -> float:

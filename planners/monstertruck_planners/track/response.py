@@ -87,15 +87,15 @@ class ResponseEstimator:
         self._geometry = geometry
         self._fade = 1.0 - 1.0 / memory
         self._rate = rate
-        dead_times = CELL * np.arange(DEAD_TIMES)
-        self._dead_times, self._lags = np.broadcast_arrays(dead_times, lags[:, None])
-        self._totals = self._dead_times + self._lags
-        self._prior = 0.5 * ((self._totals - EXPECTED[0]) / EXPECTED[1]) ** 2
+        dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(CELL * np.arange(DEAD_TIMES), lags[:, None]))
+        totals = dead_times + by_lag
+        self._prior = 0.5 * ((totals - EXPECTED[0]) / EXPECTED[1]) ** 2
         self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in lags.tolist()]
-        shape = self._totals.shape
-        self._xx: Array = np.zeros(shape)
-        self._xy: Array = np.zeros(shape)
-        self._xd: Array = np.zeros(shape)
+        self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
+        """Of the candidates; weighted and summed up they are the estimate's moments."""
+        self._by_x: Array = np.zeros((3, len(totals)))
+        """Sums of the predicted turns' products with themselves, the measured turns and the ways, by candidate."""
+        self._products = np.empty_like(self._by_x)
         self._yy = self._yd = self._dd = self._count = 0.0
         self._samples = 0
         self._variance = NOISE**2
@@ -148,7 +148,7 @@ class ResponseEstimator:
         first, last = self._at(before[0]), self._at(t)
         if first is None or last is None:
             return False
-        x = np.asarray(0.5 * (before[2] + speed) * (last - first))
+        x = 0.5 * (before[2] + speed) * (last - first)
         if float(x.max() - x.min()) < TELLING:
             return False
         self._learn(x, wrap_angle(yaw - before[1]), 0.5 * (before[2] + speed) * (t - before[0]))
@@ -174,20 +174,22 @@ class ResponseEstimator:
             self._end += 1
 
     def _at(self, t: float) -> Array | None:
-        """The sums at ``t`` less each dead time, shape (lags, dead times); None if that is before the history."""
+        """The sums at ``t`` less each dead time, by candidate; None if that is before the history."""
         cells = (t - self._begin) / CELL + EARLY
         i = math.floor(cells)
         if i < DEAD_TIMES or i >= self._end:
             return None
         after = min(i + 1, self._end - 1)
         low, high = (self._history[:, j - DEAD_TIMES + 1 : j + 1][:, ::-1] for j in (i, after))
-        return low + (cells - i) * (high - low)
+        return np.ravel(low + (cells - i) * (high - low))
 
     def _learn(self, x: Array, y: float, way: float) -> None:
-        fade = self._fade
-        self._xx = fade * self._xx + x * x
-        self._xy = fade * self._xy + x * y
-        self._xd = fade * self._xd + x * way
+        fade, products = self._fade, self._products
+        np.multiply(x, x, out=products[0])
+        np.multiply(x, y, out=products[1])
+        np.multiply(x, way, out=products[2])
+        self._by_x *= fade
+        self._by_x += products
         self._yy = fade * self._yy + y * y
         self._yd = fade * self._yd + y * way
         self._dd = fade * self._dd + way * way
@@ -196,18 +198,18 @@ class ResponseEstimator:
 
     def _judged(self) -> ResponseEstimate:
         by_gain, by_trim = self._variance / GAIN**2, self._variance / TRIM**2
-        xx, xy, dd = self._xx + by_gain, self._xy + by_gain, self._dd + by_trim
-        gained = (dd * xy**2 - 2 * self._xd * xy * self._yd + xx * self._yd**2) / (xx * dd - self._xd**2)
-        left = self._yy + by_gain - gained
-        least = float(left.min())
-        self._variance = (least + BELIEVED * NOISE**2) / (self._count + BELIEVED)
-        cost = (left - least) / (2 * self._variance * CORRELATED) + self._prior
-        weights = np.exp(float(cost.min()) - cost)
-        weights /= weights.sum()
-        response = Response(float((weights * self._dead_times).sum()), float((weights * self._lags).sum()))
-        spreads = (self._totals - response.total, self._dead_times - response.dead_time)
-        deviations = [math.sqrt(float((weights * spread**2).sum())) for spread in spreads]
-        return ResponseEstimate(response, deviations[0], deviations[1], self._samples)
+        (xx, xy, xd), dd = self._by_x, self._dd + by_trim
+        xx, xy = xx + by_gain, xy + by_gain
+        explained = (xy * (dd * xy - 2 * self._yd * xd) + self._yd**2 * xx) / (xx * dd - xd * xd)
+        most = float(explained.max())
+        self._variance = (self._yy + by_gain - most + BELIEVED * NOISE**2) / (self._count + BELIEVED)
+        cost = (most - explained) / (2 * self._variance * CORRELATED) + self._prior
+        moments = (self._powers @ np.exp(float(cost.min()) - cost)).tolist()
+        dead_time, lag, dead_time_squared, total_squared = (moment / moments[0] for moment in moments[1:])
+        response = Response(dead_time, lag)
+        variances = total_squared - response.total**2, dead_time_squared - dead_time**2
+        total_deviation, dead_time_deviation = (math.sqrt(max(variance, 0.0)) for variance in variances)
+        return ResponseEstimate(response, total_deviation, dead_time_deviation, self._samples)
 
 
 STEP: Final = 0.05

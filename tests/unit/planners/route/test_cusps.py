@@ -51,13 +51,18 @@ def test_cusps_beyond_a_few_cost_extra():
     assert costs == pytest.approx([0.0, 0.4, 0.9, 2.4])
 
 
-def test_both_axles_make_no_route_longer():
-    front = replace(TRUCK, crab_angle=0.0, radius=1.04 * TRUCK.radius, steering="front")
-    where = ground((2.0, 0.0, 2.3, 2.6), (3.8, 1.4, 4.1, 4.0))
-    config = HybridConfig(effort=30_000)
-    for goal in ((5.2, 1.0, 0.0), (5.0, 3.0, math.pi), (3.0, 2.0, math.pi / 2)):
-        lengths = [HybridPlanner(v, config).plan(where, (1.0, 1.0, 0.0), goal).path.length for v in (TRUCK, front)]
-        assert lengths[0] <= lengths[1]
+ROOMS = ((2.0, 0.0, 2.3, 2.6), (3.8, 1.4, 4.1, 4.0))
+POSTS = tuple((x, y, x + 0.25, y + 0.25) for x in (1.6, 3.0, 4.4) for y in (0.6, 1.9, 3.0))
+
+
+@pytest.mark.parametrize("effort", [3000, 30_000])
+@pytest.mark.parametrize("blocks", [ROOMS, POSTS, ()], ids=["rooms", "posts", "open"])
+def test_both_axles_make_no_route_longer(blocks, effort):
+    front = replace(TRUCK, crab_angle=0.0, steering="front")
+    where, config = ground(*blocks), HybridConfig(effort=effort)
+    for goal in ((5.3, 1.0, 0.0), (5.2, 2.7, math.pi), (2.7, 2.0, math.pi / 2), (1.2, 1.6, 0.4)):
+        both, plain = (HybridPlanner(v, config).plan(where, (1.0, 1.0, 0.0), goal) for v in (TRUCK, front))
+        assert both.path.length <= plain.path.length + 1e-9
 
 
 def test_an_exhausted_search_is_no_proof():
@@ -78,14 +83,14 @@ def test_a_search_keeps_to_the_greatest_number_of_cusps():
     ends = check_endpoints(where, CAR, start, goal, 0.05, 0.09, 0.0)
     budget = Budget(1.0, None, 5000)
     problem = SearchProblem(
-        where.field.data(), planner.footprint, where.cost_layer(planner.costs), planner.table, ends.start, ends.goal,
-        2.0, budget, {"expanded": 0},
+        where.field.data(), planner.footprint, where.cost_layer(planner.costs), ends.start, ends.goal, 2.0, budget,
+        {"expanded": 0},
     )  # fmt: skip
     cell_cost, cell = where.cell_costs(planner.costs), where.coarse_cell
     places = [cell_at(where.field.data(), cell, *pose[:2]) for pose in (goal, start)]
     found = {}
     for most in (0, 1, 63):
-        model = planner.motion_model(RESOLUTIONS[0])._replace(max_cusps=most)
+        model = planner.motion_model(RESOLUTIONS[0], 0.0)._replace(max_cusps=most)
         run = SearchRun(problem, model, cost_to_go(cell_cost, cell, *places), RESOLUTIONS[0])
         segments = run.run(5000)
         found[most] = count_cusps(segments, len(segments), 0.0)
