@@ -19,6 +19,7 @@ from monstertruck_kinematics.elementary import (
     Real,
     atan,
     clip,
+    interpolated,
     require_finite,
     require_within,
     smaller,
@@ -212,15 +213,15 @@ class Reach:
         forth_f, forth_r = np.linspace(low_f, high_f, self._POINTS), np.linspace(low_r, high_r, self._POINTS)
         stay = np.ones(self._POINTS)
 
-        def curve(front: Array, rear: Array) -> tuple[Array, Array]:
+        def curve(front: Array, rear: Array) -> tuple[list[float], list[float]]:
             angles = axles.angles(front, rear)
             curvature = np.maximum.accumulate(geometry.curvature(*angles))
-            return curvature, geometry.sideslip(*angles)
+            return curvature.tolist(), geometry.sideslip(*angles).tolist()
 
         # From the tightest curve to the right to the tightest to the left, past the crab to the right and to the left.
         self._right = curve(np.append(low_f * stay, forth_f), np.append(forth_r[::-1], low_r * stay))
         self._left = curve(np.append(forth_f, high_f * stay), np.append(high_r * stay, forth_r[::-1]))
-        self.curvatures = float(self._right[0][0]), float(self._right[0][-1])
+        self.curvatures = self._right[0][0], self._right[0][-1]
         """Tightest to the right (negative) and to the left, 1/m."""
 
     def limited(self, front: float, rear: float) -> tuple[float, float]:
@@ -230,7 +231,7 @@ class Reach:
         """
         wanted, slip = self._geometry.curvature(front, rear), self._geometry.sideslip(front, rear)
         curvature = clip(wanted, *self.curvatures)
-        low, high = (float(np.interp(curvature, *curve)) for curve in (self._right, self._left))
+        low, high = interpolated(curvature, *self._right), interpolated(curvature, *self._left)
         kept = clip(slip, low, high)
         if curvature == wanted and kept == slip:
             return front, rear

@@ -25,7 +25,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, Final, Literal
 
 from monstertruck_kinematics.axles import FULL, Axles, IdealAxles, LinkedAxles, Range, Reach, TurnDeficit
@@ -266,6 +266,12 @@ def _require_way(vx: float, vy: float, wz: float, bicycle: FourWheelSteering) ->
         raise KinematicsError(f"vx is {vx:.6g}, vy is {vy:.6g}, wz is {wz:.6g}: this body cannot {what}")
 
 
+@lru_cache(maxsize=8)
+def _drive_secants(bicycle: FourWheelSteering, front: float, rear: float) -> tuple[float, float]:
+    """Kept, for the gate asks several times in every tick for the speeds at the same angles."""
+    return bicycle.drive_secants(front, rear)
+
+
 @dataclass(frozen=True)
 class TruckChassis(Chassis):
     """The truck: one motor that turns with the mean of four wheels, two steered axles.
@@ -275,7 +281,8 @@ class TruckChassis(Chassis):
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
         """Speed at the motor for the base's speed."""
-        return (self.bicycle.drive_speed(speed, front, rear),)
+        travel, wheels = _drive_secants(self.bicycle, front, rear)
+        return (speed / travel * wheels,)
 
     def input_speeds(self, shaft_speeds: Speeds, *angles: float) -> Speeds:
         """The base's speed along its direction of travel."""

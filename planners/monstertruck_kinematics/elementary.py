@@ -3,7 +3,9 @@
 Floats go through ``math`` (fast enough for a control tick), arrays through numpy.
 """
 
+import bisect
 import math
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -147,6 +149,21 @@ def polynomial(coefficients: tuple[float, ...], x: Real) -> Real:
     for coefficient in coefficients[1:]:
         value = value * x + coefficient
     return value
+
+
+def interpolated(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Straight lines between points (as ``np.interp`` for one value, without its cost).
+
+    Args:
+        x: where; beyond the ends the end's value is taken.
+        xs: not decreasing.
+        ys: as many.
+    """
+    i = bisect.bisect_right(xs, x)
+    if i == 0 or i == len(xs):
+        return ys[max(i - 1, 0)]
+    slope = (ys[i] - ys[i - 1]) / (xs[i] - xs[i - 1])
+    return slope * (x - xs[i - 1]) + ys[i - 1]
 
 
 def require_finite(name: str, x: Real) -> None:

@@ -215,9 +215,13 @@ class FourWheelSteering:
         Proportional to ``speed``: divide by ``drive_speed(1.0, front, rear)`` for the inverse.
         """
         require_finite("speed", speed)
+        travel, wheels = self.drive_secants(front, rear)
+        return speed / travel * wheels
+
+    def drive_secants(self, front: Real, rear: Real) -> tuple[Real, Real]:
+        """``drive_speed`` is the speed over the first (of the sideslip) times the second (mean of the axle angles)."""
         tan_f, tan_r = self._tangents(front, rear)
-        vx = speed / secant(self.tan_sideslip(tan_f, tan_r))
-        return vx * (0.5 * (secant(tan_f) + secant(tan_r)))
+        return secant(self.tan_sideslip(tan_f, tan_r)), 0.5 * (secant(tan_f) + secant(tan_r))
 
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
         """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37."""

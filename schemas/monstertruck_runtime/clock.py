@@ -161,7 +161,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Seconds until the next timer that is not cancelled; None without one."""
         while self._timers and self._timers[0].handle.cancelled():
             heapq.heappop(self._timers)
-        return self._timers[0].when - self.time() if self._timers else None
+        return self._timers[0].when - self.instant / SECOND if self._timers else None
 
     def jump(self, seconds: float) -> None:
         """Advance by ``seconds``.
@@ -207,18 +207,35 @@ class _VirtualSelector(selectors.DefaultSelector):
     def __init__(self, loop: VirtualLoop) -> None:
         super().__init__()
         self._loop = loop
+        self._files = 0
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        """Watch one more file."""
+        key = super().register(fileobj, events, data)
+        self._files += 1
+        return key
+
+    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
+        """Watch one file less."""
+        key = super().unregister(fileobj)
+        self._files -= 1
+        return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Events of files; without any, an idle loop's time jumps."""
         loop = self._loop
         idle, wait = timeout is None, loop.next_timer()
         events: list[tuple[selectors.SelectorKey, int]] = []
-        if loop.woken or len(self.get_map()) > 1 or (idle and wait is None):
+        if loop.woken or self._files > 1 or (idle and wait is None):
             loop.woken = False
             events = super().select(timeout if wait is None else 0)
-        if idle and wait is not None and not events and wait > 0:
+        if wait is None:
+            return events
+        if idle and not events and wait > 0:
             loop.jump(wait)
-        loop.fire()
+            wait = 0.0
+        if wait < 1 / SECOND:
+            loop.fire()
         return events
 
 

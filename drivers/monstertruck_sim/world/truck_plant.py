@@ -255,8 +255,8 @@ class TruckPlant:
         vx, vy, wz = self._twist
         true = (vx - before[0]) / dt - wz * vy, (vy - before[1]) / dt + wz * vx
         share = 1.0 - exp(-dt / _FELT)
-        forward, left = (felt + share * (now - felt) for felt, now in zip(self.acceleration, true, strict=True))
-        self.acceleration = forward, left
+        forward, left = self.acceleration
+        self.acceleration = forward + share * (true[0] - forward), left + share * (true[1] - left)
 
     def _move(self, dt: float) -> None:
         config, steering, wheels = self.config, self._steering, self._wheel_speeds
