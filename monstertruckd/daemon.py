@@ -34,7 +34,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalRequest
+from monstertruck_schemas.req import AccessRole, GoalRequest
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
@@ -252,8 +252,8 @@ class Daemon:
         async def versions(_: dict[str, Any]) -> dict[str, Any]:
             return dict(running_versions())
 
-        rpc.register("config", config)
-        rpc.register("versions", versions)
+        rpc.register("config", config, AccessRole.OBSERVER)
+        rpc.register("versions", versions, AccessRole.OBSERVER)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
         gate_rpc.register(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None

@@ -1,16 +1,74 @@
-"""Who may do what over Zenoh, derived from the topic table.
+"""Who may do what over Zenoh.
+
+Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>`` only that
+certificate's requests arrive. What the name may ask for is its grant, which the daemon looks up. So a source that asks
+for too much is answered, while one that uses another's name is not heard.
 
 Groups out of the robot may only leave it and requests may only enter it, so that no other peer can forge the robot's
 state to the others. A rule covers a declaration only if it contains the whole declared key expression.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, Final
 
+from monstertruck_schemas.req import AccessRole, ControlRequest, Order, Request, Role
 from monstertruck_schemas.topics import KEY_ROOT, TOPICS, Writer, alive_key, rpc_key
+
+ANONYMOUS: Final = "anonymous"
+"""Source of requests whose key names none."""
 
 _SIDE_CHANNEL = "@adv/**"
 """Below a retained topic's key: history of its publisher; ``**`` alone never matches a part with an @."""
+_DESCRIPTIONS: Final = ("topics", "schema/**")
+"""Calls that say nothing of their caller: what the keys and their contents mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """What one source may do."""
+
+    role: AccessRole
+    rank: Role
+    """Highest priority it may claim."""
+
+    def capped(self, role: Role) -> Role:
+        """``role``, or the rank if that is lower."""
+        order = list(Role)
+        return max(role, self.rank, key=order.index)
+
+
+EVERYTHING: Final = Grant(AccessRole.ENGINEER, Role.ESTOP)
+OBSERVING: Final = Grant(AccessRole.OBSERVER, Role.STATION)
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """Who sent a request or a call, as its key says."""
+
+    source: str
+    grant: Grant
+
+    def may(self, needed: AccessRole) -> bool:
+        """Whether its role covers ``needed``."""
+        return self.grant.role.covers(needed)
+
+    def refusal(self, needed: AccessRole) -> str:
+        """Why it may not do what takes ``needed``."""
+        hint = "; the key names no source" if self.source == ANONYMOUS else ""
+        return f"{self.source} has the role {self.grant.role}, this takes {needed}{hint}"
+
+
+def owner_of(source: str) -> str:
+    """Name on the certificate of a source: programs of one owner call themselves ``owner:anything``."""
+    return source.partition(":")[0]
+
+
+def role_needed(request: Request) -> AccessRole:
+    """What a request takes; the emergency stop is everybody's."""
+    estop = isinstance(request, ControlRequest) and request.order is Order.ESTOP
+    return AccessRole.OBSERVER if estop else AccessRole.PILOT
 
 
 def out_groups() -> tuple[str, ...]:
@@ -23,26 +81,27 @@ def in_groups() -> tuple[str, ...]:
     return tuple(dict.fromkeys(topic.group for topic in TOPICS if topic.writer is Writer.OUTSIDE))
 
 
-def access_rules(
-    robot: str, pilots: Sequence[str] | None = None, observers: Sequence[str] | None = None
-) -> dict[str, Any]:
+def access_rules(robot: str, owners: Iterable[str] | None = None) -> dict[str, Any]:
     """Zenoh ``access_control`` section for ``robot``.
+
+    The rules know no variables: each certificate has rules, a subject and a policy of its own.
 
     Args:
         robot: name of the robot.
-        pilots: certificate common names that may see, ask and request; None = everybody who can connect.
-        observers: certificate common names that may only see.
+        owners: common names of the certificates that may see, and ask under their own name; None = everybody who can
+            connect may, under any name.
     """
     seen = [f"{KEY_ROOT}/{robot}/{group}/**" for group in out_groups()]
     history = [f"{KEY_ROOT}/{robot}/{group}/*/{_SIDE_CHANNEL}" for group in out_groups()]
-    asked = [rpc_key(robot, "**")]
-    requested = [f"{KEY_ROOT}/{robot}/{group}/**" for group in in_groups()]
-    see = [
+    descriptions = [rpc_key(robot, name) for name in _DESCRIPTIONS]
+    requests = [f"{KEY_ROOT}/{robot}/{group}/**" for group in in_groups()]
+    calls = [rpc_key(robot, "**")]
+    common = [
         _rule(
             "see-in",
             "ingress",
             ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "query"],
-            [*seen, *history, alive_key(robot)],
+            [*seen, *history, *descriptions, alive_key(robot)],
         ),
         _rule(
             "see-out",
@@ -50,29 +109,38 @@ def access_rules(
             ["put", "delete", "liveliness_token", "declare_queryable", "reply"],
             [*seen, *history, alive_key(robot)],
         ),
+        _rule("requests-out", "egress", ["declare_subscriber"], requests),
+        _rule("calls-out", "egress", ["declare_queryable", "reply"], calls),
     ]
-    steer = [
-        _rule("request-in", "ingress", ["put"], requested),
-        _rule("request-out", "egress", ["declare_subscriber"], requested),
-        _rule("ask-in", "ingress", ["query"], asked),
-        _rule("ask-out", "egress", ["declare_queryable", "reply"], asked),
-    ]
-    subjects: list[dict[str, Any]] = (
-        [{"id": "pilots"}]
-        if pilots is None
-        else [{"id": "pilots", "link_protocols": ["tls"], "cert_common_names": list(pilots)}]
-    )
-    policies = [{"rules": [rule["id"] for rule in (*see, *steer)], "subjects": ["pilots"]}]
-    if observers:
-        subjects.append({"id": "observers", "link_protocols": ["tls"], "cert_common_names": list(observers)})
-        policies.append({"rules": [rule["id"] for rule in see], "subjects": ["observers"]})
+    if owners is None:
+        own = {"everybody": _own("everybody", requests, calls)}
+        subjects: list[dict[str, Any]] = [{"id": "everybody"}]
+    else:
+        own = {owner: _own(owner, *_keys_of(robot, owner)) for owner in owners}
+        subjects = [{"id": owner, "link_protocols": ["tls"], "cert_common_names": [owner]} for owner in own]
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": [*see, *steer],
+        "rules": [*common, *chain.from_iterable(own.values())],
         "subjects": subjects,
-        "policies": policies,
+        "policies": [
+            {"rules": [rule["id"] for rule in (*common, *rules)], "subjects": [owner]} for owner, rules in own.items()
+        ],
     }
+
+
+def _keys_of(robot: str, owner: str) -> tuple[list[str], list[str]]:
+    """Keys of the requests and of the calls of an owner's programs."""
+    sources = (owner, f"{owner}:$*")
+    requests = [f"{KEY_ROOT}/{robot}/{group}/{source}/**" for group in in_groups() for source in sources]
+    return requests, [rpc_key(robot, "*", source) for source in sources]
+
+
+def _own(owner: str, requests: list[str], calls: list[str]) -> list[dict[str, Any]]:
+    return [
+        _rule(f"request-{owner}", "ingress", ["put"], requests),
+        _rule(f"call-{owner}", "ingress", ["query"], calls),
+    ]
 
 
 def _rule(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The way in for requests: judged in the sender's thread, then one at a time onto the loop.
 
 Even in another thread a decoder holds the interpreter while it runs, so what may be decoded is bounded by size, by rate
-and by a look at the bytes. Every topic waits in a queue of its own: a flood of one delays no other.
+and by a look at the bytes. Every topic waits in a queue of its own, and every source has a rate of its own: a flood of
+one delays no other.
 """
 
 import threading
@@ -16,8 +17,9 @@ from monstertruck_runtime.threads import ThreadHop
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, Order
+from monstertruck_schemas.req import ControlRequest, Order, Request
 from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic
+from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
 DEPTH: Final = 64
@@ -26,6 +28,11 @@ DEPTH: Final = 64
 MAX_VALUES: Final = 16_384
 MAX_MARKS: Final = 512
 """Commas, and brackets, braces and quotes, of one request: many small objects would take tens of milliseconds."""
+
+MAX_SOURCES: Final = 64
+"""Sources of one topic whose rates are known; the one heard least recently is dropped for a new one."""
+TOGETHER: Final = 5.0
+"""All sources of a topic together may send so many times what one may: names can be invented."""
 
 _RANKS: Final = {Order.ESTOP: 2, Order.STOP: 1}
 """Where orders have to be dropped, these are the last to go."""
@@ -38,7 +45,7 @@ class Limit:
     size: int = 2048
     """Bytes of one request."""
     rate: float | None = 5.0
-    """Requests a second, in bursts of as many; None = any number."""
+    """Requests a second of one source, in bursts of as many; None = any number."""
 
 
 LIMITS: Final = {
@@ -50,6 +57,45 @@ LIMITS: Final = {
 fits."""
 
 
+class Refusals:
+    """Reports refused requests as events, at most once a second: a flood of garbage must not become one of events.
+
+    To be made on the loop.
+
+    Args:
+        bus: where the events go.
+        clock: time.
+        reporter: who reports.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, reporter: str) -> None:
+        self._clock = clock
+        self._reporter = reporter
+        self._event = bus.event_sink()
+        self._lock = threading.Lock()
+        self._reported = -SECOND
+        self._count = 0
+        self._reports: ThreadHop[tuple[Reason, str, str, int]] = ThreadHop(self._report, 1, lambda _: None)
+
+    def add(self, reason: Reason, source: str, text: str) -> None:
+        """One request of ``source`` was refused; callable from any thread."""
+        with self._lock:
+            now = self._clock.now()
+            self._count += 1
+            if now - self._reported < SECOND:
+                return
+            self._reported, count, self._count = now, self._count, 0
+        self._reports.put((reason, source, text, count))
+
+    def close(self) -> None:
+        """Report nothing more."""
+        self._reports.close()
+
+    def _report(self, refusal: tuple[Reason, str, str, int]) -> None:
+        reason, source, text, count = refusal
+        self._event(reason, Severity.WARNING, self._reporter, text, by=source, count=count)
+
+
 class Intake:
     """Takes in the requests of one topic; to be made on the loop.
 
@@ -58,80 +104,90 @@ class Intake:
         bus: where the requests go.
         clock: time.
         guard: runs what happens on the loop, so that a bug does not vanish there.
-        source: who reports refusals.
+        reporter: who reports refusals.
     """
 
     def __init__(
-        self, topic: Topic[Any], bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], source: str
+        self, topic: Topic[Any], bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], reporter: str
     ) -> None:
         self.topic = topic
         self._limit = LIMITS.get(topic.name, Limit())
         self._clock = clock
-        self._source = source
-        self._event = bus.event_sink()
         self._lock = threading.Lock()
-        self._budget = self._limit.rate or 0.0
-        self._spent_at = clock.now()
-        self._reported = -SECOND
-        self._refused = 0
+        self._budgets: dict[str, _Budget] = {}
+        self._together = _Budget((self._limit.rate or 0.0) * TOGETHER, clock.now())
+        self._refusals = Refusals(bus, clock, reporter)
         self._requests: ThreadHop[Message] = ThreadHop(
             lambda request: guard(lambda: bus.inject(topic, request)), DEPTH, bus.add_drops, _rank
         )
-        self._refusals: ThreadHop[tuple[Reason, str, int]] = ThreadHop(self._report, 1, lambda _: None)
 
-    def take(self, size: int, read: Callable[[], bytes]) -> None:
+    def take(self, sender: Sender, size: int, read: Callable[[], bytes]) -> None:
         """Judge, decode and queue one request; callable from any thread.
 
         Args:
+            sender: whose it is, whatever the request says.
             size: bytes it has.
             read: gets them.
         """
-        name, limit = self.topic.name, self._limit
+        name, limit, source = self.topic.name, self._limit, sender.source
         if size > limit.size:
-            self._refuse(Reason.BAD_INPUT, f"{name}: request of {size} bytes, at most {limit.size} are taken")
+            text = f"{name}: request of {size} bytes, at most {limit.size} are taken"
+            self._refusals.add(Reason.BAD_INPUT, source, text)
             return
-        if limit.rate is not None and not self._within(limit.rate):
-            self._refuse(Reason.MESSAGES_DROPPED, f"{name}: more than {limit.rate:g} requests a second")
+        if not self.charge(source):
+            self._refusals.add(Reason.MESSAGES_DROPPED, source, f"{name}: more than {limit.rate:g} requests a second")
             return
         data = read()
         if data.count(b",") > MAX_VALUES or sum(map(data.count, (b"[", b"{", b'"'))) > MAX_MARKS:
-            self._refuse(Reason.BAD_INPUT, f"{name}: request of too many parts")
+            self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request of too many parts")
             return
         try:
             request = wire.decode(self.topic, data)
         except InputError as error:
-            self._refuse(Reason.BAD_INPUT, str(error))
-        else:
-            self._requests.put(request)
+            self._refusals.add(Reason.BAD_INPUT, source, str(error))
+            return
+        assert isinstance(request, Request)
+        if not sender.may(needed := role_needed(request)):
+            self._refusals.add(Reason.NOT_PERMITTED, source, f"{name}: {sender.refusal(needed)}")
+            return
+        said = {"source": source, "role": sender.grant.capped(request.role)}
+        self._requests.put(request.model_copy(update=said))
+
+    def charge(self, source: str) -> bool:
+        """Count one request of ``source``; False if it has sent too many. Callable from any thread."""
+        rate = self._limit.rate
+        if rate is None:
+            return True
+        with self._lock:
+            now = self._clock.now()
+            budget = self._budgets.pop(source, None) or _Budget(rate, now)
+            if len(self._budgets) >= MAX_SOURCES:
+                del self._budgets[next(iter(self._budgets))]
+            self._budgets[source] = budget
+            return budget.spend(now, rate) and self._together.spend(now, rate * TOGETHER)
 
     def close(self) -> None:
         """Discard what waits and everything to come."""
         self._requests.close()
         self._refusals.close()
 
-    def _within(self, rate: float) -> bool:
-        with self._lock:
-            now = self._clock.now()
-            self._budget = min(self._budget + (now - self._spent_at) / SECOND * rate, rate)
-            self._spent_at = now
-            if self._budget < 1.0:
-                return False
-            self._budget -= 1.0
-            return True
 
-    def _refuse(self, reason: Reason, text: str) -> None:
-        """Report at most once a second: a flood of garbage must not become one of events."""
-        with self._lock:
-            now = self._clock.now()
-            self._refused += 1
-            if now - self._reported < SECOND:
-                return
-            self._reported, count, self._refused = now, self._refused, 0
-        self._refusals.put((reason, text, count))
+@dataclass(slots=True)
+class _Budget:
+    """Requests that may come at once; as many as come in a second at the greatest rate."""
 
-    def _report(self, refusal: tuple[Reason, str, int]) -> None:
-        reason, text, count = refusal
-        self._event(reason, Severity.WARNING, self._source, text, count=count)
+    left: float
+    at: int
+    """When it was true, ns."""
+
+    def spend(self, now: int, rate: float) -> bool:
+        """Take one; False if there is none."""
+        self.left = min(self.left + (now - self.at) / SECOND * rate, rate)
+        self.at = now
+        if self.left < 1.0:
+            return False
+        self.left -= 1.0
+        return True
 
 
 def _rank(request: Message) -> int:

@@ -1,7 +1,11 @@
-"""Remote calls: named coroutine handlers that take and return JSON objects."""
+"""Remote calls: named coroutine handlers that take and return JSON objects.
+
+Handlers find the caller under ``source`` and the priority it may claim under ``role``, whatever the payload said.
+"""
 
 import json
 import logging
+from contextlib import suppress
 from typing import Any
 
 from monstertruck_runtime import wire
@@ -9,7 +13,9 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Handler
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import AccessRole, Role
 from monstertruck_schemas.topics import TOPICS
+from monstertruckd.bus.access import Sender
 
 log = logging.getLogger(__name__)
 
@@ -26,9 +32,10 @@ class Rpc:
         self._clock = clock
         self._deadline = deadline
         self._handlers: dict[str, Handler] = {}
+        self._needed: dict[str, AccessRole] = {}
 
-    def register(self, name: str, handler: Handler) -> None:
-        """Serve ``name`` by ``handler``.
+    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more.
 
         Raises:
             RuntimeError: the name is taken.
@@ -37,13 +44,14 @@ class Rpc:
             msg = f"rpc {name} is registered twice"
             raise RuntimeError(msg)
         self._handlers[name] = handler
+        self._needed[name] = role
 
     def serves(self, name: str) -> bool:
         """Whether a handler is registered."""
         return name in self._handlers
 
     async def call(self, name: str, payload: dict[str, Any]) -> dict[str, Any]:
-        """Run one handler.
+        """Run one handler, whoever calls.
 
         Raises:
             NotFoundError: no such name; the text lists those there are.
@@ -63,13 +71,22 @@ class Rpc:
             msg = f"rpc {name} did not end within {self._deadline} s"
             raise NoAnswerError(msg) from None
 
-    async def answer(self, name: str, payload: bytes) -> tuple[bool, bytes]:
+    async def answer(self, sender: Sender, name: str, payload: bytes) -> tuple[bool, bytes]:
         """Serve one call from outside: JSON in, (success, JSON) out; never raises, a handler's bug is logged.
 
         A failure is ``{"reason": ..., "text": ...}``.
+
+        Args:
+            sender: who calls, by the key.
+            name: of the call.
+            payload: JSON object.
         """
+        needed = self._needed.get(name, AccessRole.OBSERVER)
+        if not sender.may(needed):
+            return False, failure(Reason.NOT_PERMITTED, f"{name}: {sender.refusal(needed)}")
         try:
-            return True, json.dumps(await self.call(name, _parse(payload)), allow_nan=False).encode()
+            answer = await self.call(name, _of_sender(sender, _parse(payload)))
+            return True, json.dumps(answer, allow_nan=False).encode()
         except TruckError as error:
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
             return False, failure(reason, str(error))
@@ -97,6 +114,14 @@ def topic_rows(robot: str) -> list[dict[str, Any]]:
         }
         for topic in TOPICS
     ]
+
+
+def _of_sender(sender: Sender, payload: dict[str, Any]) -> dict[str, Any]:
+    """The payload with the source and the role that its sender has; a role that is none is left to the handler."""
+    said = {**payload, "source": sender.source}
+    with suppress(KeyError, ValueError):
+        said["role"] = sender.grant.capped(Role(payload["role"])).value
+    return said
 
 
 def _parse(payload: bytes) -> dict[str, Any]:

@@ -1,61 +1,160 @@
 """Where and how the robot is reachable over Zenoh."""
 
+import ipaddress
 import json
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from monstertruck_runtime.endpoints import host_of, local_endpoint, protocol_of
 from monstertruck_schemas.base import Schema
-from monstertruckd.bus.access import access_rules
+from monstertruck_schemas.req import AccessRole, Role
+from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, owner_of
 
 HANG_UP_US: Final = 2_000_000
 """A station to which an answer, or another one's message that must not be lost, does not get through in this time is
 hung up on. Zenoh's own 5 s are long for those whose requests wait behind it; a large map takes its time, too."""
+
+LOCAL_SESSIONS: Final = 16
+"""Places of the robot's own command line."""
+
+OwnerName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-][A-Za-z0-9_.@-]{0,31}$")]
+"""Common name of a certificate: one part of a key, without the colon that begins the name of one of its programs."""
+Owners = Annotated[tuple[OwnerName, ...], Field(strict=False)]
 
 
 class TlsConfig(Schema):
     """Mutual TLS for ``tls/...`` endpoints; identities are the common names of the clients' certificates."""
 
     ca: Path
-    """Certificate of the authority that signed all others."""
+    """Certificates of the authorities, or of the single stations, that are let in."""
     certificate: Path
     """The robot's own certificate; must name every address a client dials."""
     key: Path
     """Its private key."""
-    pilots: tuple[str, ...] = Field(min_length=1)
+    pilots: Owners = ()
     """Common names that may see, ask and drive."""
-    observers: tuple[str, ...] = ()
-    """Common names that may only see."""
+    observers: Owners = ()
+    """Common names that may see, and order an emergency stop."""
+    engineers: Owners = ()
+    """Common names that may change settings and calibration, besides all a pilot may."""
+    ranks: dict[OwnerName, Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]] = {}
+    """Highest priority a name may claim; station where it is not given."""
+    pilots_ca: Path | None = None
+    """Like ``ca``, of pilots and engineers only: who is let in at ``listen_pilots``."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = (*self.pilots, *self.observers, *self.engineers)
+        if not self.pilots and not self.engineers:
+            raise ValueError("tls: expected a name in pilots or engineers: nobody could drive")
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"tls: {', '.join(twice)}: expected one role each")
+        if unknown := sorted(set(self.ranks) - set(names)):
+            raise ValueError(f"tls.ranks: {', '.join(unknown)}: expected names of pilots, observers or engineers")
+        return self
+
+    def grants(self) -> dict[str, Grant]:
+        """What each name may do."""
+        roles = (
+            (AccessRole.PILOT, self.pilots),
+            (AccessRole.OBSERVER, self.observers),
+            (AccessRole.ENGINEER, self.engineers),
+        )
+        return {name: Grant(role, self.ranks.get(name, Role.STATION)) for role, names in roles for name in names}
 
 
 class ZenohConfig(Schema):
-    """The robot's Zenoh session; the default is reachable from this machine only."""
+    """The robot's Zenoh sessions; the default is reachable from this machine only."""
 
     mode: Literal["router", "peer"] = "router"
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints stations connect to."""
+    listen_pilots: tuple[str, ...] = ()
+    """``tls/...`` endpoints of a session of its own, whose places observers cannot take from pilots and engineers."""
+    local_socket: bool = True
+    """A session of its own on a Unix socket for the robot's own command line; nobody on a network takes its places."""
     connect: tuple[str, ...] = ()
     """Routers of a fleet to connect to; tried again for ever."""
     tls: TlsConfig | None = None
+    insecure: bool = False
+    """Allow endpoints on a network without TLS: anybody there may drive the truck."""
     access_control: bool = False
     """Refuse forged state from everybody who can connect; always on with ``tls``. Subscribers must then ask for
     one group (``mt/truck/state/**``): wider expressions get nothing."""
     max_sessions: int = Field(default=64, ge=1)
+    """Stations that may be connected at once; the same number again at ``listen_pilots``."""
     gather_seconds: float = Field(default=0.04, ge=0, le=0.1)
     """Messages of regular topics (1 Hz and more) leave for network and log together, each about this late
     at most; 0: at once."""
 
+    @property
+    def open_endpoints(self) -> tuple[str, ...]:
+        """Endpoints at which anybody on a network may ask for everything."""
+        return tuple(endpoint for endpoint in self.listen if _open_to_network(endpoint))
 
-def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> str:
-    """Zenoh's own JSON configuration of the robot's session, or of a client that looks whom it would meet.
+    @model_validator(mode="after")
+    def _guarded(self) -> Self:
+        if self.open_endpoints and not self.insecure:
+            raise ValueError(
+                f"zenoh.listen: {', '.join(self.open_endpoints)}: anybody on the network could drive the truck; "
+                "expected tls/... endpoints with zenoh.tls (monstertruckd security init), or zenoh.insecure: true"
+            )
+        tls = [end for end in (*self.listen, *self.listen_pilots) if protocol_of(end) == "tls"]
+        if tls and self.tls is None:
+            raise ValueError(f"zenoh: {', '.join(tls)} needs zenoh.tls")
+        plain = [end for end in self.listen_pilots if protocol_of(end) != "tls"]
+        if self.listen_pilots and (plain or self.tls is None or self.tls.pilots_ca is None):
+            raise ValueError("zenoh.listen_pilots: expected tls/... endpoints, and zenoh.tls.pilots_ca")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """One Zenoh session of the robot: its own endpoints and places; what a source may do that comes in by it."""
+
+    listen: tuple[str, ...]
+    places: int
+    """Sessions of others that may be open at once."""
+    connect: tuple[str, ...] = ()
+    ca: Path | None = None
+    """Who is let in; None = everybody who reaches it."""
+    grants: dict[str, Grant] | None = None
+    """By name on the certificate; None = everything to everybody."""
+    guarded: bool = False
+    """Whether forged state is refused."""
+
+    def grant(self, source: str) -> Grant:
+        """What a source may do that comes in here."""
+        return EVERYTHING if self.grants is None else self.grants.get(owner_of(source), OBSERVING)
+
+
+def doors(config: ZenohConfig) -> list[Door]:
+    """The sessions of a robot; the first one is that of all stations and of the fleet."""
+    tls = config.tls
+    guarded = config.access_control or tls is not None
+    grants = None if tls is None else tls.grants()
+    found = [Door(config.listen, config.max_sessions, config.connect, None if tls is None else tls.ca, grants, guarded)]
+    if config.listen_pilots and tls is not None and grants is not None:
+        driving = {name: grant for name, grant in grants.items() if grant.role.covers(AccessRole.PILOT)}
+        found.append(Door(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded))
+    if config.local_socket and (local := local_endpoint(config.listen)) is not None:
+        found.append(Door((local,), LOCAL_SESSIONS, guarded=guarded))
+    return found
+
+
+def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool = False) -> str:
+    """Zenoh's own JSON configuration of one of the robot's sessions, or of a client that looks whom it would meet.
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
     No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
     transport: dict[str, Any] = {
-        "unicast": {"max_sessions": config.max_sessions},
+        "unicast": {"max_sessions": door.places},
         "shared_memory": {"enabled": False},
         "link": {
             "tx": {
@@ -71,16 +170,16 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
     }
     session: dict[str, Any] = {
         "mode": "client" if probe else config.mode,
-        "listen": {"endpoints": () if probe else config.listen, "exit_on_failure": True},
-        "connect": {"endpoints": config.connect, "timeout_ms": 500, "exit_on_failure": probe},
+        "listen": {"endpoints": () if probe else door.listen, "exit_on_failure": True},
+        "connect": {"endpoints": door.connect, "timeout_ms": 500, "exit_on_failure": probe},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "adminspace": {"enabled": False},
         "transport": transport,
     }
-    if config.tls is not None:
+    if config.tls is not None and door.ca is not None:
         transport["link"]["tls"] = {
-            "root_ca_certificate": str(config.tls.ca),
+            "root_ca_certificate": str(door.ca),
             "listen_certificate": str(config.tls.certificate),
             "listen_private_key": str(config.tls.key),
             "connect_certificate": str(config.tls.certificate),
@@ -88,7 +187,18 @@ def session_config(robot: str, config: ZenohConfig, *, probe: bool = False) -> s
             "enable_mtls": True,
             "close_link_on_expiration": True,
         }
-        session["access_control"] = access_rules(robot, config.tls.pilots, config.tls.observers)
-    elif config.access_control:
-        session["access_control"] = access_rules(robot)
+    if door.guarded:
+        owners: Iterable[str] | None = door.grants
+        session["access_control"] = access_rules(robot, owners)
     return json.dumps(session)
+
+
+def _open_to_network(endpoint: str) -> bool:
+    """Whether an endpoint asks for no certificate and is reached from other machines."""
+    if protocol_of(endpoint) in ("tls", "unixsock-stream", "serial"):
+        return False
+    host = host_of(endpoint)
+    try:
+        return not ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"

@@ -7,9 +7,10 @@ Opening and closing block, so a thread does them.
 import asyncio
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -17,17 +18,30 @@ from zenoh import ext
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.endpoints import UNIX, make_private
 from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
-from monstertruck_schemas.topics import CAMERA, MAP, MAP_TILES, TOPICS, Topic, Writer, alive_key, rpc_key
-from monstertruckd.bus.intake import Intake
+from monstertruck_schemas.req import AccessRole, Order
+from monstertruck_schemas.topics import (
+    CAMERA,
+    KEY_ROOT,
+    MAP,
+    MAP_TILES,
+    TOPICS,
+    Topic,
+    Writer,
+    alive_key,
+    rpc_key,
+    sender_in,
+)
+from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
+from monstertruckd.bus.intake import Intake, Refusals
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
-from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
+from monstertruckd.bus.zenoh_config import Door, ZenohConfig, doors, session_config
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +55,8 @@ MAX_WAITING_CALLS = 64
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
+Call = tuple[zenoh.Query, Door]
+"""A question, and where it came in."""
 
 _SCHEMA_PREFIX = "schema/"
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
@@ -69,8 +85,8 @@ class ZenohBridge:
         self._config = config
         self._clock = clock
         self._rpc = rpc
-        self._session: zenoh.Session | None = None
-        rpc.register("topics", self._topics)
+        self._sessions: list[tuple[Door, zenoh.Session]] = []
+        rpc.register("topics", self._topics, AccessRole.OBSERVER)
 
     async def open(self) -> None:
         """Claim endpoints and name; ``run`` does it too, a daemon may do it first to fail early.
@@ -79,14 +95,12 @@ class ZenohBridge:
             BusyError: an endpoint is in use, or another daemon already runs this robot.
             ConfigError: Zenoh refuses the configuration.
         """
-        if self._session is None:
+        if not self._sessions:
             await in_thread(self._open)
 
     async def close(self) -> None:
         """Give endpoints and name back; ``run`` does it too."""
-        session, self._session = self._session, None
-        if session is not None:
-            await in_thread(session.close)
+        await in_thread(self._close)
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled.
@@ -97,10 +111,9 @@ class ZenohBridge:
         """
         try:
             await self.open()
-            assert self._session is not None
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             guard = partial(_guarded, failed)
-            publishers = await in_thread(partial(self._declare_publishers, self._session))
+            publishers = await in_thread(self._declare_publishers)
             tap = self._bus.tap(
                 partial(self._send, publishers, failed),
                 (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE),
@@ -108,80 +121,128 @@ class ZenohBridge:
             try:
                 async with asyncio.TaskGroup() as calls:
                     with ExitStack() as inputs:
-                        intakes = [
-                            inputs.enter_context(closing(Intake(topic, self._bus, self._clock, guard, self.name)))
+                        intakes = {
+                            topic.name: inputs.enter_context(
+                                closing(Intake(topic, self._bus, self._clock, guard, self.name))
+                            )
                             for topic in TOPICS
                             if topic.writer is Writer.OUTSIDE
-                        ]
+                        }
+                        refusals = inputs.enter_context(closing(Refusals(self._bus, self._clock, self.name)))
                         active: set[asyncio.Task[None]] = set()
-                        queries: ThreadHop[zenoh.Query] = inputs.enter_context(
+                        queries: ThreadHop[Call] = inputs.enter_context(
                             closing(
                                 ThreadHop(
-                                    lambda query: guard(partial(self._serve, query, calls, active)),
+                                    lambda call: guard(partial(self._serve, *call, calls, active)),
                                     MAX_WAITING_CALLS,
                                     self._bus.add_drops,
                                 )
                             )
                         )
-                        with await in_thread(partial(self._declare_inputs, self._session, intakes, queries)):
-                            ready()
-                            await failed
+                        for token in await in_thread(partial(self._declare_inputs, intakes, refusals, queries)):
+                            inputs.enter_context(token)
+                        ready()
+                        await failed
             finally:
                 tap.close()
         finally:
             await self.close()
 
     def _open(self) -> None:
-        where = ", ".join(self._config.listen)
         try:
-            session = zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config)))
+            for door in doors(self._config):
+                self._sessions.append((door, self._open_door(door)))
+                if door.connect and self._runs_elsewhere(door):
+                    msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(door.connect)}"
+                    raise BusyError(msg)
+        except BaseException:
+            self._close()
+            raise
+
+    def _close(self) -> None:
+        while self._sessions:
+            _, session = self._sessions.pop()
+            session.close()  # type: ignore[no-untyped-call]
+
+    def _open_door(self, door: Door) -> zenoh.Session:
+        where = ", ".join(door.listen)
+        sockets = [Path(endpoint.removeprefix(UNIX)) for endpoint in door.listen if endpoint.startswith(UNIX)]
+        try:
+            for path in sockets:
+                make_private(path.parent)
+            session = zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config, door)))
+            for path in sockets:
+                path.chmod(0o660)
         except zenoh.ZError as error:
             text = _SOURCE_PLACE.sub("", str(error))
-            if "in use" in text:
+            if "in use" in text or "EAGAIN" in text:
                 msg = f"{where} is in use: another daemon is running here"
                 raise BusyError(msg) from error
             msg = f"zenoh cannot open {where}: {text}"
             raise ConfigError(msg) from error
-        if self._config.connect and self._runs_elsewhere():
-            session.close()  # type: ignore[no-untyped-call]
-            msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(self._config.connect)}"
-            raise BusyError(msg)
-        self._session = session
+        except OSError as error:
+            msg = f"zenoh cannot open {where}: {error}"
+            raise ConfigError(msg) from error
+        return session
 
-    def _runs_elsewhere(self) -> bool:
+    def _runs_elsewhere(self, door: Door) -> bool:
         """Ask the fleet's routers as a client: its link is complete when it is open, a router's is not."""
+        config = session_config(self._robot, self._config, door, probe=True)
         try:
-            with zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config, probe=True))) as probe:
+            with zenoh.open(zenoh.Config.from_json5(config)) as probe:
                 return any(reply.ok for reply in probe.liveliness().get(alive_key(self._robot), timeout=1.0))
         except zenoh.ZError:  # none of them is up
             return False
 
-    def _declare_publishers(self, session: zenoh.Session) -> dict[str, Put]:
-        """Put functions by topic name."""
+    def _declare_publishers(self) -> dict[str, tuple[Put, ...]]:
+        """Put functions of all sessions, by topic name."""
         return {
-            topic.name: _publisher(session, topic, topic.key(self._robot))
+            topic.name: tuple(_publisher(session, topic, topic.key(self._robot)) for _, session in self._sessions)
             for topic in TOPICS
             if topic.writer is not Writer.OUTSIDE
         }
 
     def _declare_inputs(
-        self, session: zenoh.Session, intakes: Sequence[Intake], queries: ThreadHop[zenoh.Query]
-    ) -> zenoh.LivelinessToken:
-        """Subscribers and queryables; last the token that says so, which lives as long as its object."""
+        self, intakes: Mapping[str, Intake], refusals: Refusals, queries: ThreadHop[Call]
+    ) -> list[zenoh.LivelinessToken]:
+        """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
-        for intake in intakes:
-            key = intake.topic.key(self._robot)
-            session.declare_subscriber(key, partial(_on_request, intake), allowed_origin=remote)
-        for topic in TOPICS:
-            key = topic.key(self._robot)
-            if topic.retained:
-                session.declare_queryable(key, partial(self._on_get, topic, key), allowed_origin=remote)
-        session.declare_queryable(rpc_key(self._robot, "**"), partial(_on_call, queries), allowed_origin=remote)
-        return session.liveliness().declare_token(alive_key(self._robot))
+        tokens = []
+        for door, session in self._sessions:
+            for group in in_groups():
+                # One for all requests, so that a put to many keys comes once.
+                session.declare_subscriber(
+                    f"{KEY_ROOT}/{self._robot}/{group}/**",
+                    partial(self._on_request, door, intakes, refusals),
+                    allowed_origin=remote,
+                )
+            for topic in TOPICS:
+                key = topic.key(self._robot)
+                if topic.retained:
+                    session.declare_queryable(key, partial(self._on_get, topic, key), allowed_origin=remote)
+            session.declare_queryable(
+                rpc_key(self._robot, "**"), partial(_on_call, door, queries), allowed_origin=remote
+            )
+            tokens.append(session.liveliness().declare_token(alive_key(self._robot)))
+        return tokens
+
+    def _on_request(self, door: Door, intakes: Mapping[str, Intake], refusals: Refusals, sample: zenoh.Sample) -> None:
+        key, payload = str(sample.key_expr), sample.payload
+        found = sender_in(self._robot, key)
+        name, source = found if found is not None else ("", None)
+        if name in intakes:
+            intakes[name].take(_sender(door, source), len(payload), payload.to_bytes)
+            return
+        source = (*key.split("/")[3:4], "")[0]
+        for intake in intakes.values():
+            if sample.key_expr.intersects(intake.topic.key(self._robot)):
+                intake.charge(source)
+        text = f"{key}: expected {KEY_ROOT}/{self._robot}/req/<source>/ and one of {', '.join(map(_last, intakes))}"
+        refusals.add(Reason.BAD_INPUT, source, text)
 
     def _send(
         self,
-        publishers: dict[str, Put],
+        publishers: dict[str, tuple[Put, ...]],
         failed: "asyncio.Future[None]",
         topic: Topic[Any],
         _message: Message,
@@ -189,7 +250,8 @@ class ZenohBridge:
         _at: int,
     ) -> None:
         try:
-            publishers[topic.name](data)
+            for put in publishers[topic.name]:
+                put(data)
         except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine
             if not failed.done():
                 failed.set_exception(bug)
@@ -201,24 +263,24 @@ class ZenohBridge:
             if (newest := self._bus.newest(topic)) is not None:
                 query.reply(key, wire.encode(topic, newest), encoding=wire.encoding(topic))
 
-    def _serve(self, query: zenoh.Query, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
-        name = str(query.key_expr).removeprefix(rpc_key(self._robot, ""))
+    def _serve(self, query: zenoh.Query, door: Door, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
+        key = str(query.key_expr)
+        name, source = sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
         if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
             _refuse(query, Reason.BUSY, "too many calls at once")
             return
-        task = calls.create_task(self._answer(query))
+        task = calls.create_task(self._answer(query, name, _sender(door, source)))
         active.add(task)
         task.add_done_callback(active.discard)
 
-    async def _answer(self, query: zenoh.Query) -> None:
+    async def _answer(self, query: zenoh.Query, name: str, sender: Sender) -> None:
         with query:
             key = str(query.key_expr)
-            name = key.removeprefix(rpc_key(self._robot, ""))
             # A reply waits for room in the queue of a station that reads nothing: in a thread.
             if not self._rpc.serves(name) and await in_thread(partial(self._reply_schemas, query)):
                 return
             payload = b"" if query.payload is None else query.payload.to_bytes()
-            success, data = await self._rpc.answer(name, payload)
+            success, data = await self._rpc.answer(sender, name, payload)
             if success:
                 await in_thread(partial(query.reply, key, data, encoding="application/json"))
             else:
@@ -239,17 +301,20 @@ class ZenohBridge:
         return {"topics": topic_rows(self._robot)}
 
 
-def _on_request(intake: Intake, sample: zenoh.Sample) -> None:
-    payload = sample.payload
-    intake.take(len(payload), payload.to_bytes)
+def _sender(door: Door, source: str | None) -> Sender:
+    return Sender(ANONYMOUS, OBSERVING) if source is None else Sender(source, door.grant(source))
 
 
-def _on_call(queries: ThreadHop[zenoh.Query], query: zenoh.Query) -> None:
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+def _on_call(door: Door, queries: ThreadHop[Call], query: zenoh.Query) -> None:
     size = 0 if query.payload is None else len(query.payload)
     if size > MAX_CALL:
         _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
     else:
-        queries.put(query)
+        queries.put((query, door))
 
 
 def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:

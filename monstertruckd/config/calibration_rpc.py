@@ -13,6 +13,7 @@ from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, with_values
@@ -77,7 +78,7 @@ def register(
         await offload(lambda: with_values(config, [result], "result"))
         path = await offload(lambda: store.save(result, real_time()))
         saved = (await offload(lambda: store.load(path))).results[result.wizard]
-        answer = tell(path, f"{result.wizard} calibrated", payload.get("by"))
+        answer = tell(path, f"{result.wizard} calibrated", payload.get("source"))
         return answer | {"result": saved.model_dump(mode="json")}
 
     async def undo(payload: dict[str, Any]) -> dict[str, Any]:
@@ -87,11 +88,11 @@ def register(
             raise InputError(f"wizard: expected one of {known}, got {payload.get('wizard')!r}")
         at_rest()
         path = await offload(lambda: store.undo(wizard, real_time()))
-        return tell(path, f"calibration of {wizard} undone", payload.get("by"))
+        return tell(path, f"calibration of {wizard} undone", payload.get("source"))
 
-    rpc.register(SHOW, show)
-    rpc.register(SAVE, save)
-    rpc.register(UNDO, undo)
+    rpc.register(SHOW, show, AccessRole.OBSERVER)
+    rpc.register(SAVE, save, AccessRole.ENGINEER)
+    rpc.register(UNDO, undo, AccessRole.ENGINEER)
 
 
 def _result(payload: Any) -> Result:

@@ -191,7 +191,7 @@ class Gate:
 
     def planner_request(self, request: DriveRequest, now: int) -> Reason:
         """Take a drive request of the robot's own planners; returns as ``request`` does."""
-        return self._consider(request, now, self._sources.accept_planner_request(request), inside=True)
+        return self._consider(request, now, self._sources.accept_planner_request(request, now), inside=True)
 
     def _consider(self, request: DriveRequest, now: int, accepted: Reason, *, inside: bool) -> Reason:
         if accepted is not Reason.OK:

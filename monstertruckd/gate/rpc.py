@@ -13,7 +13,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import RpcRegistry
 from monstertruck_runtime.requests import parse_request
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, Order
+from monstertruck_schemas.req import AccessRole, ControlRequest, Order
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import GATE, REQ_CONTROL
 from monstertruckd.bus.local import Bus
@@ -44,7 +44,8 @@ def register(rpc: RpcRegistry, bus: Bus, clock: Clock) -> None:
         clock: time.
     """
     for order in Order:
-        rpc.register(order.value, partial(_carry_out, bus, clock, order))
+        role = AccessRole.OBSERVER if order is Order.ESTOP else AccessRole.PILOT
+        rpc.register(order.value, partial(_carry_out, bus, clock, order), role)
 
 
 async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, Any]) -> dict[str, Any]:

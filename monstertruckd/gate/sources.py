@@ -3,6 +3,7 @@
 Rules:
 
 - A request is valid only with this run's nonce and a sequence number above the newest one of its source and kind.
+- While the lease of a source runs, no other program takes over its name.
 - A request that may set the truck in motion must carry the stamp of a recent gate state: it cannot have waited long in
   a queue then. The stamp is of the robot's own clock, so no other clock has to be trusted.
 - Operators send from outside, the tracker from inside; a tracker on another machine only if the configuration names it.
@@ -83,8 +84,8 @@ class Sources:
         self.nonce = nonce
         self._config = config
         self._planner_requests = Sequences()
-        self._requests = Sequences()
-        self._orders = Sequences()
+        self._requests = Sequences(config.max_request_age)
+        self._orders = Sequences(config.max_request_age)
         self._drive: dict[Key, Source] = {}
         self._min_rank = 0
         self._released: set[Key] | None = None
@@ -96,19 +97,21 @@ class Sources:
             request.role is Role.TRACKER and request.source in self._config.remote_trackers
         ):
             return Reason.BAD_ROLE
-        alive = {source.request.source for source in self.live(now) if not source.inside}
-        reason = self._requests.accept(request, self.nonce, alive)
+        alive = {source.request.source: source.request for source in self.live(now) if not source.inside}
+        if request.source in alive and alive[request.source].instance != request.instance:
+            return Reason.BUSY
+        reason = self._requests.accept(request, self.nonce, now, alive)
         return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
-    def accept_planner_request(self, request: DriveRequest) -> Reason:
+    def accept_planner_request(self, request: DriveRequest, now: int) -> Reason:
         """OK, or why a drive request of the robot's own planners is refused."""
         if request.role is not Role.TRACKER:
             return Reason.BAD_ROLE
-        return self._planner_requests.accept(request, self.nonce)
+        return self._planner_requests.accept(request, self.nonce, now)
 
     def accept_order(self, request: ControlRequest, now: int) -> Reason:
         """OK, or why an order is refused."""
-        reason = self._orders.accept(request, self.nonce)
+        reason = self._orders.accept(request, self.nonce, now)
         if reason is Reason.OK and request.order in STARTING:
             reason = freshness(request, now, self._config.max_request_age)
         return reason

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import secrets
 import socket
 import stat
 import threading
@@ -50,6 +51,7 @@ from monstertruck_schemas.topics import (
     REQ_CONTROL,
     REQ_DRIVE,
     REQ_PATH,
+    SOURCE_NAME,
     Topic,
     Writer,
     alive_key,
@@ -76,6 +78,21 @@ class ClientTls(Schema):
     """Certificate of the authority that signed the robot's."""
     certificate: Path
     key: Path
+
+    def owner(self) -> str:
+        """Common name of the certificate.
+
+        Raises:
+            InputError: the file holds no certificate with one.
+        """
+        from cryptography import x509  # noqa: PLC0415 - only for certificates
+        from cryptography.x509.oid import NameOID  # noqa: PLC0415
+
+        try:
+            certificate = x509.load_pem_x509_certificate(self.certificate.read_bytes())
+            return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        except (OSError, ValueError, IndexError) as error:
+            raise InputError(f"{self.certificate}: expected a certificate with a common name: {error}") from None
 
 
 def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
@@ -149,11 +166,15 @@ class TruckClient(Operator):
     Args:
         robot: name in the keys ``mt/<robot>/...``.
         endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``.
-        source: this program's name in requests; default ``user@host:pid``.
+        source: this program's name in requests; default ``user@host:pid``. With a certificate it is the common name,
+            or that with a colon and anything behind it, which is the default: requests under other names never arrive.
         role: of its requests; decides their priority.
         clock: time of stamps and deadlines; robots do not trust it.
         timeout: seconds to wait for the link and for answers.
         tls: certificate files for ``tls/...`` endpoints; None = those of ``station_tls``.
+
+    Raises:
+        InputError: the source cannot be part of a key.
     """
 
     def __init__(
@@ -169,7 +190,10 @@ class TruckClient(Operator):
     ) -> None:
         self.robot = robot
         self.endpoint = endpoint
-        self.source = source or _default_source()
+        self._named = source is not None
+        self.source = source or f"{_user()}:{os.getpid()}"
+        if not SOURCE_NAME.fullmatch(self.source):
+            raise InputError(f"source {self.source!r}: expected letters, digits and . _ : - @, but no @ first")
         self.role = role
         self._clock = clock or WallClock()
         self._timeout = timeout
@@ -180,6 +204,7 @@ class TruckClient(Operator):
         self._asking = asyncio.Lock()
         # Must also grow from one run of this program to the next.
         self._seq = (self._clock.now() + self._clock.real_offset()) // 1000
+        self._instance = secrets.token_hex(8)
         self._overtaking = 0
         """Stops and emergency stops ordered so far."""
 
@@ -188,7 +213,7 @@ class TruckClient(Operator):
 
         Raises:
             NotFoundError: nothing answers there, or a file of the certificate is missing.
-            NotPermittedError: others may read the certificate's key.
+            NotPermittedError: others may read the certificate's key, or the source is not the certificate's.
         """
         try:
             await in_thread(self._open)
@@ -283,7 +308,7 @@ class TruckClient(Operator):
         return answer
 
     async def _call(self, rpc: str, payload: dict[str, Any], timeout: float | None) -> bytes:
-        replies = await self._get(rpc_key(self.robot, rpc), json.dumps(payload), timeout)
+        replies = await self._get(rpc_key(self.robot, rpc, self.source), json.dumps(payload), timeout)
         if not replies:
             raise self._absent()
         return _payload(replies[0])
@@ -373,7 +398,7 @@ class TruckClient(Operator):
         # Requests overtake everything else on the link, and an order is never dropped for lack of room.
         driving = topic.name == REQ_DRIVE.name
         self._open_session().put(
-            topic.key(self.robot),
+            topic.key(self.robot, self.source),
             wire.encode(topic, message),
             encoding=wire.encoding(topic),
             congestion_control=zenoh.CongestionControl.DROP if driving else zenoh.CongestionControl.BLOCK,
@@ -414,6 +439,7 @@ class TruckClient(Operator):
             "lease": lease,
             "nonce": "" if state is None else state.nonce,
             "gate_stamp": None if state is None else state.stamp,
+            "instance": self._instance,
         }
 
     # Zenoh
@@ -427,12 +453,23 @@ class TruckClient(Operator):
         tls = self._tls
         if tls is None and self.endpoint.startswith("tls/"):
             tls = station_tls()
+        if tls is not None:
+            self._take_name(tls.owner())
         config = session_config(self.endpoint, self._timeout, tls)
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             msg = f"no robot answers at {self.endpoint} within {self._timeout} s"
             raise NotFoundError(msg) from error
+
+    def _take_name(self, owner: str) -> None:
+        if not self._named:
+            self.source = f"{owner}:{_host()}-{os.getpid()}"[:64]
+        elif self.source.partition(":")[0] != owner:
+            raise NotPermittedError(
+                f"source {self.source!r}: the certificate is that of {owner!r}; expected this name, or one that begins "
+                f"with {owner}:"
+            )
 
     def _open_session(self) -> zenoh.Session:
         if self._session is None:
@@ -514,9 +551,18 @@ def _refusal(data: bytes) -> TruckError:
     return RequestRefusedError(reason, text) if kind is None else kind(text)
 
 
-def _default_source() -> str:
+def _user() -> str:
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without a name
         user = str(os.getuid())
-    return re.sub(r"[^A-Za-z0-9_.@:-]", "-", f"{user}@{socket.gethostname()}")[:56] + f":{os.getpid()}"
+    return f"{_plain(user)}@{_host()}"[:56]
+
+
+def _host() -> str:
+    return _plain(socket.gethostname())
+
+
+def _plain(name: str) -> str:
+    """What of a name may be in a key."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", name)

@@ -7,6 +7,7 @@ from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import AccessRole
 from monstertruck_schemas.topics import Topic, Writer
 
 M = TypeVar("M", bound=Message)
@@ -94,6 +95,6 @@ Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 class RpcRegistry(Protocol):
     """Where handlers of remote calls are registered."""
 
-    def register(self, name: str, handler: Handler) -> None:
-        """Serve ``name`` by ``handler``."""
+    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more."""
         ...

@@ -4,6 +4,7 @@ The gate and the planners check requests by the same rules, whether they come by
 """
 
 import json
+import math
 from collections.abc import Collection, Coroutine
 from typing import Any, Final, Protocol, TypeVar
 
@@ -26,6 +27,12 @@ OPERATORS: Final = frozenset({Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
 
 MAX_SOURCES: Final = 64
 """Sources kept for each kind of request; the least recent one is dropped for a new one."""
+
+MEMORY: Final = 2.0
+"""Seconds for which a sequence number counts at least."""
+
+MAX_GAP: Final = 2**32
+"""Greatest step of a source's numbers while its lease runs: nanoseconds may be counted."""
 
 OVERTAKING: Final = frozenset({Order.ESTOP, Order.STOP})
 """Orders that are published on ``req/control`` first: a topic waits for no other call."""
@@ -101,31 +108,45 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
 
 
 class Sequences:
-    """Newest sequence number of each source of one kind of requests."""
+    """Newest sequence number of each source of one kind of requests.
 
-    def __init__(self) -> None:
-        self._newest: dict[str, int] = {}
+    A number counts only while a request may be on its way, for an older one is refused for its gate stamp: so one of
+    2^62 under somebody's name does not lock the owner of the name out.
 
-    def accept(self, request: Request, nonce: str, keep: Collection[str] = ()) -> Reason:
+    Args:
+        max_age: greatest age of a request's gate stamp, s.
+    """
+
+    def __init__(self, max_age: float = math.inf) -> None:
+        self._memory = max(max_age, MEMORY) * SECOND
+        self._newest: dict[str, tuple[int, int]] = {}
+        """Number, and when it was accepted, ns."""
+
+    def accept(self, request: Request, nonce: str, now: int, keep: Collection[str] = ()) -> Reason:
         """OK, or why the request does not belong to this run; an accepted sequence number is not accepted again.
 
         Args:
             request: what was asked.
             nonce: what it must carry.
-            keep: sources that must not be dropped; if all places are theirs, a new one is refused.
+            now: ns.
+            keep: sources whose lease runs. They are not dropped (if all places are theirs, a new one is refused), and
+                their numbers make no leaps.
         """
         source = request.source
         if request.nonce != nonce:
             return Reason.BAD_NONCE
-        if request.seq <= self._newest.get(source, -1):
+        newest, at = self._newest.get(source, (-1, 0))
+        if request.seq <= newest and now - at <= self._memory:
             return Reason.BAD_SEQUENCE
+        if source in keep and source in self._newest and abs(request.seq - newest) > MAX_GAP:
+            return Reason.BUSY
         if source not in self._newest and len(self._newest) >= MAX_SOURCES:
             oldest = next((name for name in self._newest if name not in keep), None)
             if oldest is None:
                 return Reason.BUSY
             del self._newest[oldest]
         self._newest.pop(source, None)
-        self._newest[source] = request.seq
+        self._newest[source] = request.seq, now
         return Reason.OK
 
 
@@ -145,7 +166,7 @@ def refusal(request: Request, gate: GateState | None, sequences: Sequences, now:
         now: ns.
         max_age: greatest age of its gate stamp, s; None for a request that moves nothing.
     """
-    reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce)
+    reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce, now)
     if reason is Reason.OK and max_age is not None:
         reason = freshness(request, now, max_age)
     if reason is Reason.OK and request.role not in OPERATORS:

@@ -1,8 +1,8 @@
 """Messages of the ``req`` group, the only way into the robot.
 
-Every request names its source and role, carries the robot's nonce (published in ``state/gate``, new at
-every start, so that no recorded request can move another run), a sequence number that must grow for each
-source, and a lease: the time for which the request stands without a newer one. Trust in clocks is not needed.
+The key of every request names its source. The request has a role, carries the robot's nonce (published in
+``state/gate``, new at every start, so that no recorded request can move another run), a sequence number that must grow
+for each source, and a lease: the time for which the request stands without a newer one. Trust in clocks is not needed.
 """
 
 import math
@@ -25,11 +25,27 @@ class Role(StrEnum):
     TRACKER = "tracker"
 
 
+class AccessRole(StrEnum):
+    """What a source may ask for; each may do all that those before it may."""
+
+    OBSERVER = "observer"
+    """See everything, and order an emergency stop."""
+    PILOT = "pilot"
+    """Drive, give orders and goals."""
+    ENGINEER = "engineer"
+    """Change settings and calibration."""
+
+    def covers(self, needed: "AccessRole") -> bool:
+        """Whether this role may do what takes ``needed``."""
+        roles = list(AccessRole)
+        return roles.index(self) >= roles.index(needed)
+
+
 class Request(Message):
     """Header of every request."""
 
     source: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.@:-]+$")]
-    """Name of the asking program or person, shown to everybody."""
+    """Name of the asking program or person, shown to everybody; the daemon replaces it by the one in the key."""
     role: Role
     lease: Annotated[float, Field(gt=0, le=2.0)]
     """Seconds this request stands; the gate caps it by its own limit for the role."""
@@ -38,6 +54,8 @@ class Request(Message):
     gate_stamp: Nanoseconds | None = None
     """Stamp of the newest ``state/gate`` its sender had, on the robot's clock: what may set the truck in motion must
     carry a recent one, so that a request that was long on its way moves nothing."""
+    instance: Annotated[str, Field(max_length=32)] | None = None
+    """Random name of this run of the sender's program: while its lease runs, no other program takes over its source."""
 
 
 NEUTRAL = 1e-3

@@ -45,6 +45,9 @@ M = TypeVar("M", bound=Message)
 
 KEY_ROOT: Final = "mt"
 
+SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_.:-][A-Za-z0-9_.@:-]{0,63}")
+"""Names that are one chunk of a key: a first @ would hide it from wildcards."""
+
 
 class Writer(StrEnum):
     """Who may publish a topic; the bus refuses everybody else."""
@@ -85,9 +88,14 @@ class Topic(Generic[M]):
         """Name of the wire schema."""
         return self.foxglove or f"monstertruck.{self.model.__name__}"
 
-    def key(self, robot: str) -> str:
-        """Zenoh key expression of this topic on ``robot``."""
-        return f"{KEY_ROOT}/{robot}/{self.name}"
+    def key(self, robot: str, source: str = "*") -> str:
+        """Zenoh key expression of this topic on ``robot``; of a request, that of one source or of all.
+
+        A request ``req/drive`` of ``ann`` travels on ``mt/<robot>/req/ann/drive``.
+        """
+        group, _, name = self.name.partition("/")
+        parts = (group, source, name) if self.writer is Writer.OUTSIDE else (group, name)
+        return "/".join((KEY_ROOT, robot, *parts))
 
     def fresh_for(self) -> float:
         """Seconds for which a message counts; +inf for topics without a limit."""
@@ -282,9 +290,32 @@ def topics_of(group: str) -> Iterator[Topic[Message]]:
     return (topic for topic in TOPICS if topic.group == group)
 
 
-def rpc_key(robot: str, name: str) -> str:
-    """Key of a queryable."""
-    return f"{KEY_ROOT}/{robot}/rpc/{name}"
+def rpc_key(robot: str, name: str, source: str | None = None) -> str:
+    """Key of a remote call by ``source``; None = a call that says nothing of its caller."""
+    key = f"{KEY_ROOT}/{robot}/rpc/{name}"
+    return key if source is None else f"{key}/{source}"
+
+
+def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
+    """What is asked for with ``key``, and by whom: the opposite of ``Topic.key`` and ``rpc_key``.
+
+    Returns:
+        Name of a request's topic or of a call, and the source, None where the key has none. None for other keys: those
+        with wildcards, and names that no key may hold.
+    """
+    head, parts = key.split("/")[:2], key.split("/")[2:]
+    if head != [KEY_ROOT, robot] or not all(map(SOURCE_NAME.fullmatch, parts)):
+        return None
+    match parts:
+        case ["req", source, name]:
+            return f"req/{name}", source
+        case ["req", name]:
+            return f"req/{name}", None
+        case ["rpc", name, source]:
+            return name, source
+        case ["rpc", name]:
+            return name, None
+    return None
 
 
 def alive_key(robot: str) -> str:

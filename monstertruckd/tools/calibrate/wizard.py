@@ -148,5 +148,5 @@ async def calibrate(
     if wizard.room:
         panel.say(f"room: {wizard.room}")
     result = await wizard.run(WizardContext(truck, panel, clock, config, known))
-    saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "by": truck.source})
+    saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])

@@ -216,7 +216,7 @@ def _undo(name: "WizardName", call: _Call) -> None:
 
         async def ask(clock: "Clock") -> dict[str, Any]:
             async with _client(call.robot, call.endpoint, clock) as client:
-                return await client.call(UNDO, {"wizard": name, "by": client.source})
+                return await client.call(UNDO, {"wizard": name, "source": client.source})
 
         file = run_wall(ask)["file"]
     if call.json_output:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from monstertruck_runtime.endpoints import nearest
 from monstertruck_runtime.errors import InputError
 
 ENDPOINT = "tcp/127.0.0.1:7447"
@@ -49,7 +50,14 @@ def complete_config(incomplete: str) -> list[str]:
 
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.")]
 EndpointOption = Annotated[
-    str, typer.Option("--endpoint", "-e", help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT.")
+    str,
+    typer.Option(
+        "--endpoint",
+        "-e",
+        help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT. A daemon on this machine is reached by its Unix "
+        "socket, whose places are not those of stations.",
+        callback=nearest,
+    ),
 ]
 ConfigOption = Annotated[
     Path,

@@ -88,7 +88,7 @@ class GoalService:
         self._setup, self._config, self._clock = setup, setup.config, clock
         self._in, self._out, self._max_age = inputs, outputs, max_age
         self._place, self._deformation = actor, deformation
-        self._sequences = {"goal": Sequences(), "goal_control": Sequences()}
+        self._sequences = {"goal": Sequences(max_age), "goal_control": Sequences(max_age)}
         self._goal: GoalRun | None = None
         self._number = 0
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)

@@ -96,7 +96,7 @@ class PathService:
         self._out = out
         self._events = events
         self._max_age = max_age
-        self._sequences = Sequences()
+        self._sequences = Sequences(max_age)
 
     async def run(self, ready: Ready) -> None:
         """Publish, then serve requests until cancelled."""

@@ -15,10 +15,11 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.req import AccessRole, ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
-from monstertruckd.bus.intake import DEPTH, LIMITS, Intake
+from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
+from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_SOURCES, Intake
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
 
@@ -55,6 +56,9 @@ def path(poses: int, seq: int = 1) -> bytes:
     return wire.encode(REQ_PATH, PathRequest(**HEADER, seq=seq, path=route))
 
 
+ANN = Sender("ann", EVERYTHING)
+
+
 class Entrance:
     """A bus with the intakes of all topics, used from a thread while the loop is busy elsewhere."""
 
@@ -67,12 +71,12 @@ class Entrance:
             for topic in (REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH)
         }
 
-    def send(self, *requests: tuple[Topic[Any], bytes]) -> None:
+    def send(self, *requests: tuple[Topic[Any], bytes], sender: Sender = ANN) -> None:
         """All of them arrive before the loop gets a turn."""
 
         def run() -> None:
             for topic, data in requests:
-                self.intakes[topic.name].take(len(data), lambda data=data: data)
+                self.intakes[topic.name].take(sender, len(data), lambda data=data: data)
 
         thread = threading.Thread(target=run)
         thread.start()
@@ -187,7 +191,7 @@ async def test_what_cannot_be_an_array_is_refused_like_any_bad_input():
 async def test_what_is_too_large_is_not_even_read():
     entrance = Entrance()
     for topic, size in ((REQ_DRIVE, 2049), (REQ_CONTROL, 2049), (REQ_GOAL, 2049), (REQ_PATH, 131_073)):
-        entrance.intakes[topic.name].take(size, lambda: pytest.fail("read"))
+        entrance.intakes[topic.name].take(ANN, size, lambda: pytest.fail("read"))
         await entrance.settle()
         event = await entrance.events.next()
         assert event.reason is Reason.BAD_INPUT
@@ -226,3 +230,53 @@ async def test_after_closing_nothing_comes_in():
     entrance.send((REQ_CONTROL, order(Order.ARM)))
     await entrance.settle()
     assert got == []
+
+
+async def test_the_source_is_that_of_the_key_and_the_rank_that_of_the_grant():
+    entrance = Entrance()
+    got: list[DriveRequest] = []
+    entrance.bus.listen(REQ_DRIVE, got.append)
+    data = drive(1).replace(b'"station"', b'"gamepad"')
+    for grant in (EVERYTHING, Grant(AccessRole.PILOT, Role.KEYBOARD)):
+        entrance.send((REQ_DRIVE, data), sender=Sender("bob", grant))
+        await entrance.settle()
+    assert [(request.source, request.role) for request in got] == [("bob", Role.GAMEPAD), ("bob", Role.KEYBOARD)]
+
+
+async def test_observers_order_an_emergency_stop_and_nothing_else():
+    entrance = Entrance()
+    got: list[Message] = []
+    for topic in (REQ_CONTROL, REQ_DRIVE, REQ_GOAL):
+        entrance.bus.listen(topic, got.append)
+    bob = Sender("bob", OBSERVING)
+    others = [(REQ_CONTROL, order(what)) for what in Order if what is not Order.ESTOP]
+    entrance.send(*others, (REQ_DRIVE, drive(1)), (REQ_GOAL, goal(1)), sender=bob)
+    await entrance.settle()
+    assert got == []
+    event = await entrance.events.next()
+    assert event.reason is Reason.NOT_PERMITTED
+    assert event.text == "req/control: bob has the role observer, this takes pilot"
+    entrance.send((REQ_CONTROL, order(Order.ESTOP)), sender=bob)
+    await entrance.settle()
+    assert [(request.order, request.source) for request in got] == [(Order.ESTOP, "bob")]
+
+
+async def test_a_flood_of_one_source_costs_no_other_its_rate():
+    entrance = Entrance()
+    got: list[str] = []
+    entrance.bus.listen(REQ_GOAL, lambda request: got.append(request.source))
+    entrance.send(*[(REQ_GOAL, goal(seq)) for seq in range(50)], sender=Sender("eve", EVERYTHING))
+    entrance.send((REQ_GOAL, goal(1)))
+    await entrance.settle()
+    assert got.count("ann") == 1
+    assert got.count("eve") <= 6
+
+
+async def test_invented_names_are_bounded_together():
+    entrance = Entrance()
+    got: list[str] = []
+    entrance.bus.listen(REQ_GOAL, lambda request: got.append(request.source))
+    for number in range(3 * MAX_SOURCES):
+        entrance.send((REQ_GOAL, goal(1)), sender=Sender(f"eve{number}", EVERYTHING))
+    await entrance.settle()
+    assert 25 <= len(got) <= 40

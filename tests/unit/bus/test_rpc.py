@@ -8,8 +8,12 @@ import pytest
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import AccessRole, Role
 from monstertruck_schemas.topics import TOPICS
+from monstertruckd.bus.access import EVERYTHING, Grant, Sender
 from monstertruckd.bus.rpc import Rpc, topic_rows
+
+ANN = Sender("ann", EVERYTHING)
 
 
 async def echo(payload):
@@ -67,7 +71,7 @@ def test_failures_are_answered_with_their_reason(raised, reason):
             raise raised
 
         rpc.register("fail", fail)
-        return await rpc.answer("fail", b"")
+        return await rpc.answer(ANN, "fail", b"")
 
     success, data = run_virtual(main)
     assert not success
@@ -80,7 +84,7 @@ def test_payloads_that_are_no_json_object_are_refused(payload: bytes):
     async def main(clock: VirtualClock) -> tuple[bool, bytes]:
         rpc = Rpc(clock)
         rpc.register("echo", echo)
-        return await rpc.answer("echo", payload)
+        return await rpc.answer(ANN, "echo", payload)
 
     success, data = run_virtual(main)
     assert not success
@@ -94,3 +98,32 @@ def test_the_topic_table_as_json():
     assert scan["key"] == "mt/rover/sensor/scan"
     assert scan["schema"] == "foxglove.LaserScan"
     assert json.loads(json.dumps(rows)) == rows
+
+
+@pytest.mark.parametrize("needed", AccessRole)
+@pytest.mark.parametrize("has", AccessRole)
+def test_a_caller_needs_the_role_of_the_call(needed: AccessRole, has: AccessRole):
+    async def main(clock: VirtualClock) -> tuple[bool, bytes]:
+        rpc = Rpc(clock)
+        rpc.register("echo", echo, needed)
+        return await rpc.answer(Sender("bob", Grant(has, Role.STATION)), "echo", b"{}")
+
+    success, data = run_virtual(main)
+    assert success == has.covers(needed)
+    if not success:
+        text = f"echo: bob has the role {has}, this takes {needed}"
+        assert json.loads(data) == {"reason": "not_permitted", "text": text}
+
+
+@pytest.mark.parametrize(
+    ("role", "passed"), [("gamepad", "keyboard"), ("station", "station"), ("king", "king"), (7, 7)]
+)
+def test_handlers_get_the_source_of_the_key_and_no_higher_rank_than_granted(role: object, passed: object):
+    async def main(clock: VirtualClock) -> tuple[bool, bytes]:
+        rpc = Rpc(clock)
+        rpc.register("echo", echo)
+        sender = Sender("bob", Grant(AccessRole.PILOT, Role.KEYBOARD))
+        return await rpc.answer(sender, "echo", json.dumps({"source": "ann", "role": role}).encode())
+
+    _, data = run_virtual(main)
+    assert json.loads(data)["echo"] == {"source": "bob", "role": passed}

@@ -4,12 +4,14 @@ import asyncio
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from monstertruck_runtime.client import TLS_VARIABLE, ClientTls, TruckClient, station_tls
-from monstertruck_runtime.errors import NotFoundError, NotPermittedError, TruckError
+from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas.req import AccessRole
 from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot
@@ -57,17 +59,32 @@ async def test_who_may_do_what(tmp_path: Path):
 
     async with running_robot(endpoint, tls=server) as robot:
         robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        callers: list[str] = []
+
+        async def take(payload: dict[str, Any]) -> dict[str, Any]:
+            callers.append(payload["source"])
+            return gate_state(2).model_dump(mode="json")
+
+        robot.rpc.register("arm", take)
+        robot.rpc.register("estop", take, AccessRole.OBSERVER)
         requests = robot.bus.subscribe(REQ_DRIVE, fifo(10))
         async with client("ann") as ann, client("bob") as bob, client("eve") as eve:
             assert await ann.get_retained(GATE) == gate_state(1)
             assert (await ann.call("topics"))["topics"]
             assert await bob.get_retained(GATE) == gate_state(1)
             assert [await each.alive() for each in (ann, bob, eve)] == [True, True, False]
-            with pytest.raises(TruckError):
-                await bob.call("topics")
+            assert (await bob.call("topics"))["topics"]
+            with pytest.raises(RequestRefusedError, match="arm: bob has the role observer, this takes pilot"):
+                await bob.arm()
+            await bob.estop()
             with pytest.raises(NotFoundError):
                 await eve.get_retained(GATE)
             await bob.drive(9.0, 0.0)
+            ann.source = "bob"  # under another's name nothing arrives
+            await ann.drive(9.0, 0.0)
+            with pytest.raises(NotFoundError):
+                await ann.call("topics")
+            ann.source = "ann"
             await ann.drive(0.5, 0.0)
             async with asyncio.timeout(3):
                 request = await requests.next()
@@ -76,6 +93,7 @@ async def test_who_may_do_what(tmp_path: Path):
             async with TruckClient(endpoint=endpoint.replace("tls/", "tcp/"), timeout=0.3):
                 pass
     assert request.source == "ann"
+    assert callers == ["bob"]
     assert requests.latest is request
 
 
@@ -91,6 +109,10 @@ async def test_a_command_finds_the_stations_certificate_by_itself(tmp_path: Path
     async with running_robot(endpoint, tls=server) as robot, TruckClient(endpoint=endpoint, timeout=1.0) as client:
         robot.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
         assert await client.get_retained(GATE) == gate_state(1)
+        assert client.source.startswith("ann:")
+        with pytest.raises(NotPermittedError, match="the certificate is that of 'ann'"):
+            async with TruckClient(endpoint=endpoint, source="bob"):
+                pass
 
 
 def test_a_certificate_that_is_missing_or_open_to_others_is_refused(tmp_path: Path):

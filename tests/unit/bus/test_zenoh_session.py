@@ -20,12 +20,12 @@ from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.req import DriveRequest, GoalRequest, Role
 from monstertruck_schemas.state import Grid
-from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, TOPICS, Writer
+from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, TOPICS, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.bus.zenoh_config import ZenohConfig, session_config
+from monstertruckd.bus.zenoh_config import ZenohConfig, doors, session_config
 from monstertruckd.bus.zenoh_session import MAX_CALL, ZenohBridge
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
@@ -60,6 +60,9 @@ def drive_request(seq: int) -> DriveRequest:
     return DriveRequest(
         stamp=1, received=1, seq=seq, source="a", role=Role.STATION, lease=0.5, nonce="n", speed=1.0, front=0.0
     )
+
+
+HEADER = {"stamp", "received", "seq", "source", "role", "lease", "nonce"}
 
 
 async def eventually(condition, seconds: float = 3.0) -> None:
@@ -143,7 +146,7 @@ async def test_requests_come_in_typed_and_stamped_by_the_robot():
         box = robot.bus.subscribe(REQ_DRIVE, fifo(1000))
         with raw_session(robot.endpoint) as station:
             for seq in range(60):
-                put(station, "mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(seq)))
+                put(station, "mt/truck/req/ann/drive", wire.encode(REQ_DRIVE, drive_request(seq)))
             async with asyncio.timeout(3):
                 got = [await box.next() for _ in range(60)]
     assert [request.seq for request in got] == list(range(60))
@@ -165,8 +168,8 @@ async def test_bad_requests_become_one_event_a_second(payload: bytes, text: str)
         box = robot.bus.subscribe(REQ_DRIVE, fifo(10))
         with raw_session(robot.endpoint) as station:
             for _ in range(20):
-                put(station, "mt/truck/req/drive", payload)
-            put(station, "mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+                put(station, "mt/truck/req/ann/drive", payload)
+            put(station, "mt/truck/req/ann/drive", wire.encode(REQ_DRIVE, drive_request(1)))
             async with asyncio.timeout(3):
                 await box.next()
             async with asyncio.timeout(3):
@@ -175,7 +178,7 @@ async def test_bad_requests_become_one_event_a_second(payload: bytes, text: str)
     assert event.source == "zenoh"
     assert text in event.text
     assert event.seq == 0
-    assert event.values == {"count": 1}
+    assert event.values == {"by": "ann", "count": 1}
     assert robot.events.latest is not None
     assert robot.events.latest.seq <= 2  # not 20
 
@@ -185,12 +188,42 @@ async def test_state_put_by_others_never_enters_the_bus():
         box = robot.bus.subscribe(POSE, fifo(10))
         with raw_session(robot.endpoint) as station:
             put(station, "mt/truck/state/pose", wire.encode(POSE, odometry(1)))
-            put(station, "mt/truck/req/unknown", b"x")
-            put(station, "mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+            put(station, "mt/truck/req/ann/drive", wire.encode(REQ_DRIVE, drive_request(1)))
             async with asyncio.timeout(3):
                 await robot.bus.subscribe(REQ_DRIVE, fifo(1)).next()
     assert box.latest is None
     assert robot.events.latest is None
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["req/ann/unknown", "req/ann", "req/**", "req/ann/**", "req/*/drive", "**", "req/ann/drive/x"],
+)
+async def test_a_put_to_a_wildcard_or_an_unknown_key_is_told_and_taken_by_nobody(key: str):
+    async with running_robot() as robot:
+        box = robot.bus.subscribe(REQ_DRIVE, fifo(1))
+        with raw_session(robot.endpoint) as station:
+            put(station, f"mt/truck/{key}", wire.encode(REQ_DRIVE, drive_request(1)))
+            async with asyncio.timeout(3):
+                event = await robot.events.next()
+    assert box.latest is None
+    assert event.reason is Reason.BAD_INPUT
+    assert event.text.startswith(f"mt/truck/{key}: expected mt/truck/req/<source>/ and one of drive, control,")
+    assert event.values["by"] == (*key.split("/")[1:2], "")[0]
+
+
+async def test_wildcard_puts_use_up_what_their_sender_may_send():
+    async with running_robot() as robot:
+        got: list[str] = []
+        robot.bus.listen(REQ_GOAL, lambda request: got.append(request.source))
+        with raw_session(robot.endpoint) as station:
+            for _ in range(20):
+                put(station, "mt/truck/req/ann/**", b"x")
+            for source in ("ann", "bob"):
+                goal = GoalRequest(**drive_request(1).model_dump(include=HEADER), goal=Pose2D(x=0.0, y=0.0, yaw=0.0))
+                put(station, f"mt/truck/req/{source}/goal", wire.encode(REQ_GOAL, goal))
+            await eventually(lambda: got)
+    assert got == ["bob"]
 
 
 async def test_schemas_are_served_in_their_own_encoding():
@@ -216,11 +249,11 @@ async def test_a_slow_call_does_not_hold_up_others_and_too_many_are_refused():
         robot.rpc.register("wait", wait)
 
         def ask(name: str) -> str:
-            (reply,) = list(station.get(f"mt/truck/rpc/{name}", timeout=2.0))
+            (reply,) = list(station.get(f"mt/truck/rpc/{name}/ann", timeout=2.0))
             return "ok" if reply.ok else json.loads(reply.err.payload.to_bytes())["reason"]
 
         with raw_session(robot.endpoint) as station:
-            waiting = [station.get("mt/truck/rpc/wait", timeout=2.0) for _ in range(16)]
+            waiting = [station.get("mt/truck/rpc/wait/ann", timeout=2.0) for _ in range(16)]
             refused = await asyncio.to_thread(ask, "topics")
             release.set()
             assert await asyncio.to_thread(lambda: [bool(next(iter(w)).ok) for w in waiting]) == [True] * 16
@@ -265,7 +298,7 @@ async def test_one_robot_name_is_run_once_on_a_network():
 
 async def test_an_endpoint_that_cannot_be_opened_is_a_config_error():
     with pytest.raises(ConfigError, match=r"zenoh cannot open tcp/203\.0\.113\.1:7447") as caught:
-        async with running_robot("tcp/203.0.113.1:7447"):
+        async with running_robot("tcp/203.0.113.1:7447", insecure=True):
             pass
     assert "cargo" not in str(caught.value)
 
@@ -323,7 +356,7 @@ async def test_a_bug_behind_the_bridge_ends_the_service(monkeypatch: pytest.Monk
     task = asyncio.create_task(bridge.run(ready.set))
     await ready.wait()
     with raw_session(endpoint) as station:
-        put(station, "mt/truck/req/drive", wire.encode(REQ_DRIVE, drive_request(1)))
+        put(station, "mt/truck/req/ann/drive", wire.encode(REQ_DRIVE, drive_request(1)))
         await asyncio.wait([task], timeout=3)
     with pytest.raises(ExceptionGroup) as caught:
         await task
@@ -355,7 +388,7 @@ async def test_access_control_stops_forgers_but_no_one_else():
 
 
 def test_discovery_is_off_and_the_default_is_this_machine_only():
-    config = json.loads(session_config("truck", ZenohConfig()))
+    config = json.loads(session_config("truck", ZenohConfig(), doors(ZenohConfig())[0]))
     assert config["listen"]["endpoints"] == ["tcp/127.0.0.1:7447"]
     assert config["scouting"]["multicast"]["enabled"] is False
     assert config["scouting"]["gossip"]["enabled"] is False

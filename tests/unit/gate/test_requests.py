@@ -90,7 +90,7 @@ def test_the_source_heard_least_recently_is_forgotten_first():
 
 def test_a_source_whose_lease_runs_is_not_forgotten():
     rig = Rig().driving(source="ann")
-    seq = 10**6
+    seq = 1000
     rig.drive(source="ann", seq=seq)
     for i in range(2 * MAX_SOURCES):
         last = rig.drive(source=f"junk{i}", lease=0.25)
@@ -357,3 +357,33 @@ def test_a_blocked_truck_says_why_it_does_not_move():
     rig.silent = {"attitude"}
     rig.tick(14)
     assert rig.drive() is Reason.ATTITUDE_STALE
+
+
+def test_a_name_whose_lease_runs_is_not_taken_over():
+    rig = Rig().driving(source="ann", instance="a")
+    for other in ("b", None):
+        assert rig.drive(source="ann", instance=other) is Reason.BUSY
+    assert rig.drive(source="ann", instance="a", seq=2**62) is Reason.BUSY
+    assert rig.drive(source="ann", instance="a") is Reason.OK
+    rig.driver = None
+    rig.tick(round(50 * 0.3))  # its lease has expired
+    assert rig.drive(source="ann", instance="b") is Reason.OK
+
+
+@pytest.mark.parametrize("kind", ["drive", "order"])
+def test_a_huge_sequence_number_locks_its_source_out_for_no_longer_than_requests_may_be_late(kind):
+    rig = Rig().armed()
+
+    def ask(**more):
+        rig.driver = None
+        return (
+            rig.drive(source="ann", speed=0.0, **more)
+            if kind == "drive"
+            else rig.order(Order.ARM, source="ann", **more)
+        )
+
+    assert ask(seq=2**62) is Reason.OK
+    assert ask() is Reason.BAD_SEQUENCE
+    rig.tick(round(50 * 2.1))
+    rig.order(Order.ARM, source="bob")
+    assert ask() is Reason.OK

@@ -7,7 +7,17 @@ import pytest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import BY_NAME, TOPICS, Topic, TopicTable, Writer, alive_key, rpc_key, topics_of
+from monstertruck_schemas.topics import (
+    BY_NAME,
+    TOPICS,
+    Topic,
+    TopicTable,
+    Writer,
+    alive_key,
+    rpc_key,
+    sender_in,
+    topics_of,
+)
 from tests.plugin_kit import install
 
 __all__ = ["install"]
@@ -21,7 +31,9 @@ def test_names_are_unique_and_in_a_known_group():
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_rows(topic: Topic[Message]):
     assert topic.doc
-    assert topic.key("truck") == f"mt/truck/{topic.name}"
+    name = topic.name.replace("req/", "req/*/")
+    assert topic.key("truck") == f"mt/truck/{name}"
+    assert topic.key("truck", "ann") == f"mt/truck/{name.replace('*', 'ann')}"
     assert issubclass(topic.model, Message)
     assert topic.rate is None or topic.rate > 0
     if topic.rate is not None and topic.stale_after is not None:
@@ -87,6 +99,7 @@ def test_another_distribution_adds_a_topic(install):
 
 def test_keys_beside_topics():
     assert rpc_key("truck", "topics") == "mt/truck/rpc/topics"
+    assert rpc_key("truck", "topics", "ann") == "mt/truck/rpc/topics/ann"
     assert alive_key("truck") == "mt/truck/alive"
 
 
@@ -109,3 +122,25 @@ def test_reasons_have_stable_exit_codes_and_texts():
 def test_a_topic_of_another_distribution_that_the_recorder_could_not_write_is_refused(changes, complaint):
     row = dataclasses.replace(topics.COMPASS, name="sensor/sonar", **changes)
     assert complaint in (topics.BY_NAME.fault(row) or "")
+
+
+@pytest.mark.parametrize(
+    ("key", "found"),
+    [
+        ("mt/truck/req/ann/drive", ("req/drive", "ann")),
+        ("mt/truck/req/ann@laptop:12/control", ("req/control", "ann@laptop:12")),
+        ("mt/truck/req/control", ("req/control", None)),
+        ("mt/truck/rpc/arm/ann", ("arm", "ann")),
+        ("mt/truck/rpc/arm", ("arm", None)),
+        ("mt/rover/req/ann/drive", None),
+        ("mt/truck/req/**", None),
+        ("mt/truck/req/*/drive", None),
+        ("mt/truck/req/ann:$*/drive", None),
+        ("mt/truck/req/@ann/drive", None),
+        ("mt/truck/req/" + 65 * "a" + "/drive", None),
+        ("mt/truck/rpc/schema/state/pose", None),
+        ("mt/truck/state/pose", None),
+    ],
+)
+def test_the_sender_is_read_from_the_key(key, found):
+    assert sender_in("truck", key) == found

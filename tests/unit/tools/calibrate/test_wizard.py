@@ -84,7 +84,7 @@ def test_the_result_is_saved_by_the_daemon_at_the_end():
         return context.fit("scale", lambda: RESULT)
 
     assert run(steps, panel, truck) == (RESULT.model_copy(update={"date": DATE}), "0001.json")
-    assert truck.calls == [("calibration_save", {"result": RESULT.model_dump(mode="json"), "by": "test"})]
+    assert truck.calls == [("calibration_save", {"result": RESULT.model_dump(mode="json"), "source": "test"})]
     assert panel.said == ["battery: test", "room: a table", "computing: scale"]
 
 

@@ -71,7 +71,8 @@ def test_the_network_link(tmp_path: Path):
 @pytest.mark.parametrize("listen", ["tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "udp/[::]:7447"])
 def test_a_truck_open_to_everybody_fails(listen: str, tmp_path: Path):
     assert bad(see(tmp_path / "a", access)) == {}
-    found = see(tmp_path / "b", access, lambda emulated: emulated.change(zenoh={"listen": (listen,)}))["access"]
+    opened = {"listen": (listen,), "insecure": True}
+    found = see(tmp_path / "b", access, lambda emulated: emulated.change(zenoh=opened))["access"]
     assert (found.level, found.reason) == (Level.FAIL, Reason.LINK_OPEN)
     assert listen in found.seen
 

@@ -1,0 +1,87 @@
+"""Endpoints of Zenoh, such as ``tcp/127.0.0.1:7447``, and the Unix socket of a daemon on the same machine."""
+
+import os
+import socket
+import stat
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+SERVICE_FOLDER: Final = Path("/run/monstertruckd")
+"""Where the service keeps its sockets."""
+LOCAL_HOSTS: Final = ("127.0.0.1", "localhost", "::1")
+UNIX: Final = "unixsock-stream/"
+
+
+def protocol_of(endpoint: str) -> str:
+    """Protocol of an endpoint, e.g. ``tcp``."""
+    return endpoint.partition("/")[0]
+
+
+def host_of(endpoint: str) -> str:
+    """Host or address of an endpoint, without the brackets of IPv6."""
+    return _address(endpoint).rpartition(":")[0].removeprefix("[").removesuffix("]").partition("%")[0]
+
+
+def port_of(endpoint: str) -> int | None:
+    """Port of an endpoint; None if it has none."""
+    port = _address(endpoint).rpartition(":")[2]
+    return int(port) if port.isdecimal() else None
+
+
+def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where a daemon keeps its sockets: the folder that systemd made for it, or one of its user's own."""
+    if given := environment.get("RUNTIME_DIRECTORY"):
+        return Path(given.partition(":")[0])
+    runtime = environment.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / "monstertruckd" if runtime else Path(f"/tmp/monstertruckd-{os.getuid()}")  # noqa: S108
+
+
+def local_endpoint(listen: Iterable[str], environment: Mapping[str, str] = os.environ) -> str | None:
+    """Unix socket of a daemon that listens there, named after the first port; None without a port."""
+    port = next((port for endpoint in listen if (port := port_of(endpoint))), None)
+    return None if port is None else f"{UNIX}{runtime_folder(environment)}/{port}.sock"
+
+
+def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
+    """The Unix socket of the daemon behind a TCP endpoint of this machine, where there is one that answers.
+
+    Its places are not those of stations, so it answers when all of them are taken.
+    """
+    port = port_of(endpoint)
+    if protocol_of(endpoint) != "tcp" or host_of(endpoint) not in LOCAL_HOSTS or port is None:
+        return endpoint
+    for folder in (runtime_folder(environment), SERVICE_FOLDER):
+        path = folder / f"{port}.sock"
+        if _answers(path):
+            return f"{UNIX}{path}"
+    return endpoint
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder for sockets; one that is there must be this user's own and nobody else's to write.
+
+    Raises:
+        OSError: it cannot be made, or others may put sockets into it.
+    """
+    folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & stat.S_IWOTH:
+        raise OSError(f"{folder}: expected a folder that only its owner may write, owned by user {os.getuid()}")
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(0.2)
+        try:
+            if path.parent != SERVICE_FOLDER and path.parent.lstat().st_uid != os.getuid():
+                return False
+            probe.connect(str(path))
+        except OSError:
+            return False
+    return True
+
+
+def _address(endpoint: str) -> str:
+    """Without protocol, metadata and configuration."""
+    return endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
