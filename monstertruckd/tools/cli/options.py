@@ -48,6 +48,11 @@ def complete_config(incomplete: str) -> list[str]:
     return sorted(str(file) for file in files if str(file).startswith(incomplete))
 
 
+def _nearest(endpoint: str) -> str:
+    """One parameter, for a callback of an option gets its value by position."""
+    return nearest(endpoint)
+
+
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.")]
 EndpointOption = Annotated[
     str,
@@ -56,7 +61,7 @@ EndpointOption = Annotated[
         "-e",
         help="Where the robot listens: tcp/HOST:PORT or tls/HOST:PORT. A daemon on this machine is reached by its Unix "
         "socket, whose places are not those of stations.",
-        callback=nearest,
+        callback=_nearest,
     ),
 ]
 ConfigOption = Annotated[
