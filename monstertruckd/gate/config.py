@@ -85,6 +85,24 @@ class ObstacleLimits(Schema):
     """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""
     crawl: Positive = 0.02
     """An allowed speed below this is a stop; driving on needs twice as much, m/s."""
+    seen: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Share of the beams in each sector of travel (10 degrees) that must see: measure a range, or meet nothing within
+    the lidar's range. A recorded URG-04LX has 0.95 to 1.0 of them, and less than half in one of 800 sectors."""
+    unseen_speed: Positive = 0.1
+    """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck."""
+    open_ground: bool = False
+    """Whether a scan without any range is believed: otherwise it counts as none, whatever its beams say."""
+
+
+class ShaftCheckConfig(Schema):
+    """When a driven shaft does not turn although it is commanded to."""
+
+    within: Positive = 0.6
+    """Seconds of it after which the truck stops."""
+    speed: Positive = 0.03
+    """Slower commands are not compared, m/s."""
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    """A shaft slower than this share of its command does not turn."""
 
 
 class GateConfig(Schema):
@@ -148,6 +166,12 @@ class GateConfig(Schema):
     tilt: TiltLimits = TiltLimits()
     turning: SteeringCheckConfig | None = SteeringCheckConfig()
     """Compass against steering, finds servos without supply; null = off."""
+    blocked: ShaftCheckConfig | None = ShaftCheckConfig()
+    """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
+    short_faults: Annotated[int, Field(ge=2)] = 4
+    """So many stops for stale sensors within ``short_faults_within`` disarm: the fault is no short one."""
+    short_faults_within: Positive = 10.0
+    """Seconds."""
     battery_low_speed: Positive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()

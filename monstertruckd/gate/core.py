@@ -10,6 +10,7 @@ source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING
 """
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -29,7 +30,7 @@ from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserS
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
-from monstertruckd.gate.sensors import Assessment, SensorMonitor, SteeringCheck
+from monstertruckd.gate.sensors import STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
 from monstertruckd.gate.sources import Source, Sources
 from monstertruckd.gate.states import EventLog, GateEvent, GateStateMachine
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
@@ -39,8 +40,20 @@ URGENT: Final = frozenset(
 )
 """These stop by quick stop, which overtakes queued commands; the others by the drive's ordinary ramp."""
 
-DISARMING: Final = frozenset({Reason.DRIVE_FAULT, Reason.BATTERY_CRITICAL, Reason.SERVICE_FAILED, Reason.STEERING_DEAD})
+DISARMING: Final = frozenset(
+    {
+        Reason.DRIVE_FAULT,
+        Reason.DEVICE_RESTARTED,
+        Reason.BATTERY_CRITICAL,
+        Reason.SERVICE_FAILED,
+        Reason.STEERING_DEAD,
+        Reason.SHAFT_BLOCKED,
+    }
+)
 """After these the truck must be armed again, however short they were."""
+
+HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND})
+"""Limits of the pace that allow none: the truck stands, and its driver keeps it."""
 
 
 class Decision(NamedTuple):
@@ -124,12 +137,15 @@ class Gate:
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
         self._steering_check = SteeringCheck(config.turning) if config.turning is not None and chassis.steered else None
-        self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check)
+        self._shaft_check = ShaftCheck(config.blocked) if config.blocked is not None else None
+        self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check, self._shaft_check)
         self._events = EventLog(config.event_interval)
         self._stops = StopLog(self._outages)
         self._states = GateStateMachine(self._events, latched=latched)
         self._known: dict[Reason, int] = {}
         """What stops or slows the truck, and since when (ns)."""
+        self._short_faults: deque[int] = deque()
+        """When the truck stopped for stale sensors since it was armed, ns."""
         self._ticked: int | None = None
         self._stalled_until = 0
         self._shut_down = False
@@ -165,6 +181,9 @@ class Gate:
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
         self._sensors.observe_drive(feedback, shaft)
+        if self._shaft_check is not None and self._states.active:
+            measured = self._chassis.drivetrain.speed(feedback.velocity)
+            self._shaft_check.observe(feedback, shaft, self._motion.shaft_speeds[shaft], measured)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the newest steering feedback."""
@@ -327,8 +346,9 @@ class Gate:
         limits = assessment.limits
         if self._states.holder is not None:
             self._limiter.update(now, dt, self._states.holder.request, limits)
-            if self._limiter.blocked and Reason.OBSTACLE_STOP not in self._known and not self._sensors.at_rest(now):
-                self._trip(now, self.mode, self._causes.causes([Reason.OBSTACLE_STOP], now, {}))
+            halts = [reason for reason in limits if reason in HALTS and reason not in self._known]
+            if halts and not self._sensors.at_rest(now):
+                self._trip(now, self.mode, self._causes.causes(halts, now, {}))
         else:
             self._limiter.halt()
         self._report(now, tuple(limits), assessment.values, always=False)
@@ -351,6 +371,8 @@ class Gate:
             own.append(Reason.TICK_STALLED)
         if self._steering_check is not None and self._steering_check.dead:
             own.append(Reason.STEERING_DEAD)
+        if self._shaft_check is not None and self._shaft_check.blocked is not None:
+            own.append(Reason.SHAFT_BLOCKED)
         return (*own, *assessment.blocks)
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
@@ -383,8 +405,21 @@ class Gate:
         return holder.neutral and self._motion.standing and self._sensors.at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
+        if not STALE_SENSORS.keys().isdisjoint(cause.reason for cause in causes):
+            self._count_short_fault(now)
         self._trip(now, GateMode.STOPPING, causes, ordered=ordered)
         self._states.stop(now, (cause.reason for cause in causes))
+
+    def _count_short_fault(self, now: int) -> None:
+        """Short faults let the driver go on; but not again and again."""
+        faults, config = self._short_faults, self._config
+        faults.append(now)
+        while now - faults[0] > config.short_faults_within * SECOND:
+            faults.popleft()
+        if len(faults) >= config.short_faults:
+            text = f"{len(faults)} stops for stale sensors within {config.short_faults_within:g} s: disarmed"
+            self._emit_transition(now, Reason.FAULTS_REPEAT, text)
+            self._states.disarm_at_rest = True
 
     def _trip(self, now: int, mode: GateMode, causes: list[Cause], *, ordered: bool = False) -> None:
         """Log a stop; to be called before the state changes."""
@@ -407,6 +442,9 @@ class Gate:
     def _disarm(self, now: int, text: str) -> None:
         if self._steering_check is not None:
             self._steering_check.reset()  # only driving can show whether it works again
+        if self._shaft_check is not None:
+            self._shaft_check.reset()
+        self._short_faults.clear()
         self._states.disarm(now, text)
 
     def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:

@@ -22,6 +22,7 @@ from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.sensors import SensorMonitor
+from monstertruckd.gate.visibility import Sectors, Visibility
 
 POSES: Final = 20
 """Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
@@ -61,8 +62,12 @@ class ObstacleGuard:
         self._config = config
         self._footprint = footprint
         self._scan_points = points
+        self._visibility = Visibility(footprint, points.mount, config.obstacle.seen)
+        self._keep = round(config.scan.stale_after * SECOND)
         self._points = np.empty((0, 2))
         self._stamp = 0
+        self.unseen: float | None = 0.0
+        """Seconds from the newest scan back to the one that saw the sectors of the newest ways; None = none did."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
@@ -73,7 +78,11 @@ class ObstacleGuard:
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
         points = self._scan_points.of(scan)
-        self._points = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
+        self._visibility.observe(scan, points)
+        near = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
+        age = self._visibility.age(self._points, scan.stamp)
+        # What was seen in a sector stays while the sector is not seen, until that is too old.
+        self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
         self._stamp = scan.stamp
         self._checked = None
 
@@ -86,19 +95,27 @@ class ObstacleGuard:
         rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in ways)
         if self._checked != rounded:
             self._checked = rounded
+            self._look(rounded)
             distances = (self._free_distance(*way) for way in rounded)
             self._free = min(distances) if len(self._points) else math.inf
         return self._free
 
-    def _swept(self, x: int, y: int, turn: int) -> tuple[Array, Array]:
-        """Distances and poses along a way in steps of ``TWIST_STEP``; no corner moves further than the base would."""
+    def _look(self, ways: frozenset[tuple[int, int, int]]) -> None:
+        """Find how long ago all sectors of the ways were seen; those outside the lidar's field do not count."""
+        seen = np.concatenate([self._visibility.last_seen(self._sweep(*way)[2]) for way in ways])
+        oldest = int(seen.min(initial=self._stamp))
+        self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
+
+    def _swept(self, x: int, y: int, turn: int) -> tuple[Array, Array, Sectors]:
+        """Distances, poses and sectors of a way in steps of ``TWIST_STEP``; no corner moves further than the base."""
         vx, vy, wz = way = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
         corner = math.hypot(vx, vy) + abs(wz) * self._footprint.circumscribed_radius
         distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(corner, 1.0)))
-        return distances, swept_poses(way, distances)
+        poses = swept_poses(way, distances)
+        return distances, poses, self._visibility.travelled(poses)
 
     def _free_distance(self, x: int, y: int, turn: int) -> float:
-        distances, poses = self._sweep(x, y, turn)
+        distances, poses, _ = self._sweep(x, y, turn)
         contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)
         return math.inf if contact is None else float(distances[contact - 1])
 
@@ -115,7 +132,7 @@ class ObstacleGuard:
         return free < self._stopping(abs(speed), self._delay(now), self._config.deceleration)
 
     def _delay(self, now: int) -> float:
-        return max(now - self._stamp, 0) / SECOND + self._config.reaction
+        return max(now - self._stamp, 0) / SECOND + (self.unseen or 0.0) + self._config.reaction
 
     @staticmethod
     def _stopping(speed: float, delay: float, deceleration: float) -> float:
@@ -289,15 +306,22 @@ class CommandLimiter:
         self._sensors = sensors
         self.blocked = False
         """An obstacle ahead allows no motion."""
+        self.blind = False
+        """The lidar has not seen for too long where the truck is to go."""
         self.emergency = False
         """The obstacle is so near that only the quick stop avoids contact."""
         self.free: float | None = None
         """Distance the footprint can travel, m; None = no obstacle within the checked distance."""
 
+    @property
+    def unseen(self) -> float | None:
+        """See ``ObstacleGuard.unseen``."""
+        return self._obstacles.unseen
+
     def halt(self) -> None:
         """Command standstill and clear the obstacle state."""
         self._motion.halt()
-        self.blocked = self.emergency = False
+        self.blocked = self.blind = self.emergency = False
         self.free = None
 
     def update(self, now: int, dt: float, request: DriveRequest, limits: dict[Reason, float]) -> None:
@@ -347,6 +371,12 @@ class CommandLimiter:
             limits[Reason.OBSTACLE_STOP] = 0.0
         elif allowed < max(map(motion.pace, twists)):
             limits[Reason.OBSTACLE_SLOW] = allowed
+        unseen = self._obstacles.unseen
+        self.blind = unseen is None or unseen > self._config.scan.stale_after
+        if self.blind:
+            limits[Reason.LIDAR_BLIND] = 0.0
+        elif unseen:
+            limits[Reason.LIDAR_SLOW] = self._config.obstacle.unseen_speed
         measured = self._sensors.shaft_speeds(now)
         speed = max(motion.progress(measured, way) for way in ways) if measured else 0.0
         approaching = speed > self._config.standstill

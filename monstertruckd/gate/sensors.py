@@ -21,6 +21,7 @@ from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import (
+    VALID_BEAM,
     Attitude,
     Battery,
     BatteryLevel,
@@ -30,7 +31,7 @@ from monstertruck_schemas.sensor import (
     SteeringFeedback,
 )
 from monstertruck_schemas.topics import Topic
-from monstertruckd.gate.config import GateConfig, SensorLimit, SteeringCheckConfig, TiltLimits
+from monstertruckd.gate.config import GateConfig, SensorLimit, ShaftCheckConfig, SteeringCheckConfig, TiltLimits
 
 STALE_TOPICS: Final[Mapping[Topic[Any], Reason]] = {
     topics.SCAN: Reason.SCAN_STALE,
@@ -107,6 +108,7 @@ class SensorMonitor:
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
         self._failed: tuple[str, ...] = ()
+        self._restarted = False
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
         self._critical = _critical(config, steered=chassis.steered)
@@ -117,8 +119,11 @@ class SensorMonitor:
         """Steering angles by the newest steering feedback, rad."""
 
     def observe_scan(self, scan: LaserScan) -> bool:
-        """Take a scan; False if it is not valid, by its age or by the tilt of its plane."""
+        """Take a scan; False if it is not valid: by its age, the tilt of its plane, or without a single range."""
         valid = self._valid(scan, Reason.SCAN_STALE)
+        if valid and not (self._config.obstacle.open_ground or (scan.codes == VALID_BEAM).any()):
+            valid = False
+            self._refused[Reason.SCAN_STALE] = Measurement(name="beams with a range", value=0.0, limit=1.0)
         if valid and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
             valid = False
             self._refused[Reason.SCAN_STALE] = Measurement(
@@ -157,6 +162,10 @@ class SensorMonitor:
             if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
                 self._lost[stale] = max(service.since, self._lost.get(stale, -1))
                 self._speed = None
+        self._restarted = any(
+            service.reason is Reason.DEVICE_RESTARTED and self._services.get(service.name) is Reason.DRIVE_STALE
+            for service in table.services
+        )
         self._failed = tuple(
             service.name
             for service in table.services
@@ -241,6 +250,8 @@ class SensorMonitor:
                 values["drive_fault_code"] = drive.fault_code
         if values:
             blocks.append(Reason.DRIVE_FAULT)
+        if self._restarted:
+            blocks.append(Reason.DEVICE_RESTARTED)
         if self._failed:
             blocks.append(Reason.SERVICE_FAILED)
         fresh = self._all_fresh(now)
@@ -393,3 +404,53 @@ class SteeringCheck:
         self.difference = measured - commanded
         allowed = self._config.tolerance + self._config.share * max(abs(commanded), abs(measured))
         self.dead |= abs(self.difference) > allowed
+
+
+class ShaftCheck:
+    """Compares each driven shaft's speed with its command; ``blocked`` stays until ``reset``.
+
+    A blocked shaft draws current up to the controller's limit and heats motor and clutch, and the controller reports
+    no fault.
+
+    Args:
+        config: time and tolerance.
+    """
+
+    def __init__(self, config: ShaftCheckConfig) -> None:
+        self._config = config
+        self._since: dict[int, int] = {}
+        """Since when each shaft has not turned, ns."""
+        self._current: dict[int, float] = {}
+        """Newest measured current of each, A."""
+        self.blocked: int | None = None
+        """The shaft that does not turn."""
+
+    def reset(self) -> None:
+        """Start over."""
+        self._since.clear()
+        self.blocked = None
+
+    def observe(self, feedback: DriveFeedback, shaft: int, commanded: float, measured: float) -> None:
+        """Take feedback of a shaft.
+
+        Args:
+            feedback: the message.
+            shaft: which.
+            commanded: wheel speed over ground, m/s.
+            measured: same.
+        """
+        if feedback.current is not None:
+            self._current[shaft] = feedback.current
+        limits = self._config
+        asked = feedback.mode is DriveMode.ENABLED and abs(commanded) >= limits.speed
+        if not asked or measured * math.copysign(1.0, commanded) >= limits.share * abs(commanded):
+            self._since.pop(shaft, None)
+            return
+        since = self._since.setdefault(shaft, feedback.received)
+        if self.blocked is None and feedback.received - since >= limits.within * SECOND:
+            self.blocked = shaft
+
+    @property
+    def current(self) -> float | None:
+        """Newest measured current of the blocked shaft, A."""
+        return None if self.blocked is None else self._current.get(self.blocked)

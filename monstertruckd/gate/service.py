@@ -256,7 +256,7 @@ class GateService:
                 front=output.front,
                 rear=output.rear,
                 **servo_fields(output.servos, "_servo"),
-                deadman=Reason.DRIVE_STALE not in output.reasons,
+                deadman=output.mode is not GateMode.ESTOPPED and Reason.DRIVE_STALE not in output.reasons,
             )
         )
         self._mark_latch(output.mode)

@@ -16,7 +16,7 @@ from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter
-from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, SteeringCheck
+from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, ShaftCheck, SteeringCheck
 from monstertruckd.gate.sources import Source
 
 GATE: Final = "gate"
@@ -40,15 +40,22 @@ class CauseBuilder:
         sensors: newest samples.
         limiter: obstacle state.
         check: compass against steering; None = not checked.
+        shafts: commanded against measured speeds of the driven shafts; None = not checked.
     """
 
     def __init__(
-        self, config: GateConfig, sensors: SensorMonitor, limiter: CommandLimiter, check: SteeringCheck | None
+        self,
+        config: GateConfig,
+        sensors: SensorMonitor,
+        limiter: CommandLimiter,
+        check: SteeringCheck | None,
+        shafts: ShaftCheck | None,
     ) -> None:
         self._config = config
         self._sensors = sensors
         self._limiter = limiter
         self._check = check
+        self._shafts = shafts
         self.pause = 0.0
         """Newest excessive pause between two ticks, s."""
         self._measurements: Mapping[Reason, Callable[[int], Iterator[Measurement]]] = {
@@ -58,6 +65,8 @@ class CauseBuilder:
             Reason.TICK_STALLED: self._stall,
             Reason.STEERING_DEAD: self._turn,
             Reason.OBSTACLE_STOP: self._obstacle,
+            Reason.LIDAR_BLIND: self._unseen,
+            Reason.SHAFT_BLOCKED: self._blocked_shaft,
         }
 
     def causes(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
@@ -147,6 +156,13 @@ class CauseBuilder:
         age = _age(self._sensors.scan, now)
         keep = self._config.obstacle.ahead
         yield Measurement(name="free distance", value=self._limiter.free, unit="m", limit=keep, age=age)
+
+    def _blocked_shaft(self, _now: int) -> Iterator[Measurement]:
+        if self._shafts is not None:
+            yield Measurement(name="motor current", value=self._shafts.current, unit="A")
+
+    def _unseen(self, _now: int) -> Iterator[Measurement]:
+        yield Measurement(name="unseen", value=self._limiter.unseen, unit="s", limit=self._config.scan.stale_after)
 
 
 def _age(message: Message | None, now: int) -> float | None:

@@ -73,6 +73,12 @@ class DeviceLostError(DeviceError):
     reason = Reason.DEVICE_LOST
 
 
+class DeviceRestartedError(DeviceLostError):
+    """The device restarted while its link stayed up: what it was told is forgotten."""
+
+    reason = Reason.DEVICE_RESTARTED
+
+
 class DeviceTimeoutError(DeviceError):
     """The device did not answer in time."""
 

@@ -49,6 +49,7 @@ class Reason(StrEnum):
     DEVICE_FAULT = "device_fault", 24, "device reports a fault of its own"
     DEVICE_MISMATCH = "device_mismatch", 25, "device's parameters differ from the configuration"
     DEVICE_BUSY = "device_busy", 26, "port is held by another process"
+    DEVICE_RESTARTED = "device_restarted", 27, "device restarted by itself: it lost its supply"
     DEVICE_READY = "device_ready", 0, "device is up"
 
     # Gate
@@ -81,6 +82,10 @@ class Reason(StrEnum):
     STEERING_DEAD = "steering_dead", 66, "the truck does not turn as it is steered"
     IMPOSSIBLE_MOTION = "impossible_motion", 67, "this body cannot move like that"
     SERVO_LIMIT = "servo_limit", 68, "a steering servo is at the end of its range: less steering than requested"
+    LIDAR_SLOW = "lidar_slow", 70, "the lidar does not see where the truck is to go: speed limited"
+    LIDAR_BLIND = "lidar_blind", 71, "the lidar has not seen for too long where the truck is to go"
+    SHAFT_BLOCKED = "shaft_blocked", 72, "a driven shaft does not turn although it is commanded to"
+    FAULTS_REPEAT = "faults_repeat", 73, "short faults come again and again"
     WEAKENED = "weakened", 77, "configured less safe than by default"
     ARMED = "armed", 0, "armed"
     DRIVING = "driving", 0, "driving"
@@ -94,6 +99,7 @@ class Reason(StrEnum):
     PATH_LOST = "path_lost", 84, "truck is too far from its path"
     CUSP_MISSED = "cusp_missed", 85, "the truck came to rest too far from where its path changes direction"
     RESPONSE_DIFFERS = "response_differs", 86, "the axles answer later or sooner than configured"
+    CLOCK_DRIFT = "clock_drift", 87, "a sensor's clock and the computer's run apart"
     RESPONSE_AGREES = "response_agrees", 0, "the axles answer as configured again"
 
     # Localisation and mapping
@@ -119,7 +125,7 @@ class Reason(StrEnum):
     OVER_CURRENT = "over_current", 101, "a USB port drew too much current"
     AUTOSUSPEND = "autosuspend", 102, "the kernel may suspend a USB device in use"
     PORT_MOVED = "port_moved", 103, "a device was plugged into another port than configured"
-    SLOW_LINK = "slow_link", 104, "the latency of an FTDI adapter cannot be lowered"
+    SLOW_LINK = "slow_link", 104, "a device's link is slow"
     PORT_CYCLED = "port_cycled", 105, "a USB port was switched off and on"
 
     # The truck's supply, host and network

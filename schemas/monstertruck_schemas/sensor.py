@@ -29,7 +29,8 @@ class LaserScan(Message):
     ranges: Float64Array
     """Shape (n,), m; +inf where the beam has no valid return (see ``codes``)."""
     codes: UInt8Array
-    """Shape (n,); 255 = valid, otherwise the sensor's own error code (devices' manual)."""
+    """Shape (n,): ``VALID_BEAM``, a code up to ``NO_ECHO`` where the sensor saw nothing within its range, or another
+    code of the sensor's own (its manual) where it does not know."""
     tilt: Annotated[float, Field(ge=0)] | None = None
     """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = not measured."""
 
@@ -41,6 +42,8 @@ class LaserScan(Message):
 
 VALID_BEAM = 255
 """``LaserScan.codes`` value of a beam that measured a range."""
+NO_ECHO = 2
+"""Greatest ``LaserScan.codes`` value of a beam that met nothing within the sensor's range."""
 
 
 class Vector3(Schema):

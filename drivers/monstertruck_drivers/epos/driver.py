@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, ObjectError, read_identity
+from monstertruck_drivers.epos.exchange import ATTEMPTS, RECENT, Exchanger, ObjectError, read_identity
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
@@ -23,8 +23,8 @@ from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceFaultError,
-    DeviceLostError,
     DeviceMismatchError,
+    DeviceRestartedError,
     DeviceTimeoutError,
     ProtocolError,
     WrongDeviceError,
@@ -131,6 +131,10 @@ DISABLE_TIME = 0.04
 """Seconds of ``SAFE_DEADLINE`` kept for the last exchange."""
 REENABLE_LIMIT = 0.3
 """Seconds after which running again from a quick stop goes the long way, through power stage off."""
+SLOW_EXCHANGE = 0.03
+"""Median duration of exchanges, s, from which on the link is slow: at 38400 baud they take 10 to 13 ms."""
+QUICK_EXCHANGE = 0.02
+"""And from which on it is not."""
 GOAL_LIMIT = 2.0
 """Seconds after which a controller that does not follow its commands is reported."""
 
@@ -169,6 +173,8 @@ class EposDriver:
         """Instants of the fault resets of the last ``fault_reset_window``."""
         self.reported_fault: int | None = None
         """Fault that was reported and is still there."""
+        self.mark: int | None = None
+        """Value of ``od.MARK`` while the controller has not restarted; None = it takes none."""
         self._port = port
         self._quiet_until = 0
 
@@ -176,7 +182,8 @@ class EposDriver:
         """One session, from the stop of a motor that may still turn to the stop at its end.
 
         Raises:
-            DeviceLostError: nothing plugged in; the link went down; the controller restarted.
+            DeviceLostError: nothing plugged in; the link went down.
+            DeviceRestartedError: the controller restarted.
             PortBusyError: another process holds the port.
             WrongDeviceError: something else answers.
             DeviceMismatchError: motor or encoder data contradict the configuration.
@@ -209,6 +216,11 @@ class _Session:
         self._sign = sign(driver.config)
         self._counts_per_turn = 1
         self._state = State.UNKNOWN
+        """As the statusword said it, and as commanded since."""
+        self._reported = State.UNKNOWN
+        """As the statusword said it."""
+        self._doubtful = False
+        """An exchange failed: the controller may have restarted."""
         self._sent_rpm: int | None = None
         """Target in the controller; None = not known."""
         self._rpm = 0
@@ -225,6 +237,7 @@ class _Session:
         self._goal = State.UNKNOWN
         self._goal_since = 0
         self._late_reported = False
+        self._slow = False
         self._status_due = 0
         self._current_due = 0
         self._reset_due = 0
@@ -239,9 +252,11 @@ class _Session:
         identity = await read_identity(self._line)
         identity.check(self._config)
         self._counts_per_turn = identity.counts_per_turn(self._config)
-        self._state = state_of(await self._line.read(od.STATUSWORD, ATTEMPTS))
+        self._state = self._reported = state_of(await self._line.read(od.STATUSWORD, ATTEMPTS))
         if self._state not in POWERED:
             self._driver.odometer.restart()
+        await self._line.shorten_silence()
+        await self._check_mark(ATTEMPTS)
         await self._prepare()
         self._tell(
             Reason.DEVICE_READY, Severity.INFO, f"EPOS, software 0x{identity.software:04X}", **identity.as_values()
@@ -259,6 +274,30 @@ class _Session:
             if self._line.strange and not self._line.acknowledged:
                 raise WrongDeviceError(f"no EPOS, sends {self._line.strange[:20]!r}: {error}") from error
             raise
+
+    async def _check_mark(self, attempts: int = 1) -> None:
+        """Notice a controller that restarted, by the mark that it lost, and mark it anew.
+
+        Args:
+            attempts: of each exchange.
+
+        Raises:
+            DeviceRestartedError: it did, while it was in use.
+        """
+        mark = self._driver.mark
+        try:
+            found = await self._line.read(od.MARK, attempts)
+            if found == mark:
+                return
+            await self._line.write(od.MARK, found + 1, attempts)
+            self._driver.mark = found + 1
+        except ObjectError:
+            return
+        if mark is not None:
+            self._driver.odometer.restart()
+            self._tell(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position goes on")
+            if self._reported not in OFF or self._want().goal is not State.SWITCH_ON_DISABLED:
+                raise DeviceRestartedError("the controller restarted")
 
     async def make_safe(self) -> None:
         """Brake, and switch the power stage off once the motor rests; gives up after ``SAFE_DEADLINE``."""
@@ -280,6 +319,7 @@ class _Session:
         while True:
             try:
                 await self._cycle()
+                self._judge_link()
                 if not told_ready and self._state not in FAULTED:
                     told_ready = True
                     ready()
@@ -288,13 +328,16 @@ class _Session:
                 failures += 1
                 if failures >= FAILURE_LIMIT:
                     raise
-                self._prepared = False  # it may have restarted
+                self._doubtful = True
                 await self._line.settle()
             else:
                 failures = 0
 
     async def _cycle(self) -> None:
-        await self._act(also_faster=True)
+        await self._act(also_faster=not self._doubtful)
+        if self._doubtful:
+            await self._check_mark()
+            self._doubtful = self._prepared = False
         _, raw = await self._read_row(od.VELOCITY_AVERAGED, od.POSITION)
         self._publish(raw, (self._line.began + self._line.ended) // 2)
         now = self._clock.now()
@@ -305,6 +348,19 @@ class _Session:
         elif now >= self._current_due:
             self._current_due = now + int(self._config.current_period * SECOND)
             self._current = await self._read(od.CURRENT) / 1000 * self._sign
+
+    def _judge_link(self) -> None:
+        """Report a link that has become slow, or quick again."""
+        durations = self._line.durations
+        if len(durations) < RECENT:
+            return
+        median = sorted(durations)[RECENT // 2] / SECOND
+        if median > SLOW_EXCHANGE and not self._slow:
+            text = f"answers take {median * 1000:.0f} ms: feedback comes too seldom to drive by"
+            self._tell(Reason.SLOW_LINK, Severity.WARNING, text, seconds=median)
+        elif median < QUICK_EXCHANGE and self._slow:
+            self._tell(Reason.SLOW_LINK, Severity.INFO, "answers come quickly again", seconds=median)
+        self._slow = median > (QUICK_EXCHANGE if self._slow else SLOW_EXCHANGE)
 
     async def _idle(self, until: int) -> None:
         """Wait for the next cycle; a command to stop is obeyed at once."""
@@ -384,11 +440,13 @@ class _Session:
 
     async def _look(self) -> None:
         """Read the power state and judge its changes."""
-        was, self._state = self._state, state_of(await self._read(od.STATUSWORD))
+        was, self._reported = self._reported, state_of(await self._read(od.STATUSWORD))
+        self._state = self._reported
         if self._state in OFF and was not in OFF:
             self._prepared = False
-        if was is State.ENABLED and self._state in OFF and not self._told_off:
-            raise DeviceLostError("the controller restarted")
+            await self._check_mark()
+            if was is State.ENABLED and not self._told_off:
+                raise DeviceRestartedError("the controller restarted")
         if self._state in FAULTED:
             await self._attend_fault()
         elif self._fault is not None:
@@ -482,7 +540,7 @@ class _Session:
         await self._control(Control.DISABLE_VOLTAGE)
         await self._control(Control.FAULT_RESET)
 
-    def _tell(self, reason: Reason, severity: Severity, text: str, **values: int | None) -> None:
+    def _tell(self, reason: Reason, severity: Severity, text: str, **values: float | None) -> None:
         self._driver.events(reason, severity, self._driver.name, text, **values)
 
 

@@ -17,7 +17,6 @@ from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, Fre
 from monstertruck_drivers.epos.protocol import (
     ANSWER,
     BAUD,
-    FRAME_TIMEOUT,
     MAX_WORDS,
     READY,
     REFUSED,
@@ -84,7 +83,9 @@ class EposEmulator:
         self._powered: asyncio.Timeout | None = None
         self._booted_at = 0
         self._silent = False
-        self._counts = dict.fromkeys(("busy", "refuse", "delay", "flip", "stray"), 0)
+        self._counts = dict.fromkeys(
+            ("busy", "refuse", "delay", "flip", "stray", "restart", "acknowledge", "length"), 0
+        )
         self._delay = 0.0
         self._long: tuple[bytes, bool] = (b"", False)
         self._faults: dict[str, tuple[str, Callable[..., None]]] = {
@@ -96,6 +97,9 @@ class EposEmulator:
             "delay": ("MILLISECONDS [COUNT]", self._inject_delay),
             "flip": ("COUNT", lambda n="1": self._count("flip", n)),
             "stray": ("COUNT", lambda n="1": self._count("stray", n)),
+            "acknowledge": ("COUNT", lambda n="1": self._count("acknowledge", n)),
+            "length": ("COUNT", lambda n="1": self._count("length", n)),
+            "restart": ("COUNT", lambda n="1": self._count("restart", n)),
             "silent": ("on|off", self._inject_silent),
             "line": ("on|off", lambda word: self.set_quick_stop_input(_flag(word))),
             "supply_limit": ("VOLTS", self._inject_supply_limit),
@@ -120,7 +124,9 @@ class EposEmulator:
 
         ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing. ``busy``,
         ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit, bytes
-        before acknowledges. ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
+        before acknowledges. ``acknowledge``, ``length`` ``[COUNT]``: acknowledges, and length bytes from the host,
+        damaged on the line. ``restart [COUNT]``: the supply fails for a moment before the next answers.
+        ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
         ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
         is left through power stage off only): ``on|off``.
         ``supply_limit VOLTS``: over-voltage above that.
@@ -226,6 +232,8 @@ class EposEmulator:
             return
         self._acknowledge(end)
         head = await self._within(end, 1)
+        if self._due("length"):
+            head = bytes((head[0] ^ 0x20,))
         body = head + await self._within(end, body_size(head[0]))
         try:
             request = decode_body(opcode, body)
@@ -244,6 +252,8 @@ class EposEmulator:
         await self._reply(end, reply)
 
     async def _reply(self, end: DeviceEnd, reply: Frame) -> None:
+        if self._due("restart"):
+            self.power_cycle()
         if self._due("delay"):
             await self._clock.sleep(self._delay)
         end.write(bytes((ANSWER,)))
@@ -260,14 +270,14 @@ class EposEmulator:
     def _acknowledge(self, end: DeviceEnd) -> None:
         if self._due("stray"):
             end.write(bytes((STRAY,)))
-        self._send(end, bytes((READY,)))
+        self._send(end, bytes((READY ^ 0x10 if self._due("acknowledge") else READY,)))
 
     def _send(self, end: DeviceEnd, data: bytes) -> None:
         end.write(data, TURN_AROUND)
 
     async def _within(self, end: DeviceEnd, count: int) -> bytes:
-        """Bytes of a frame; a pause of ``FRAME_TIMEOUT`` raises ``TimeoutError``."""
-        return await self._take(end, count, FRAME_TIMEOUT)
+        """Bytes of a frame; too long a pause raises ``TimeoutError``."""
+        return await self._take(end, count, self.firmware.frame_timeout)
 
     async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
         while len(self._inbox) < count:

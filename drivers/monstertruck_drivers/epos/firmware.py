@@ -23,6 +23,7 @@ DEFAULTS: dict[ObjectEntry, int] = {
     od.SENSOR_TYPE: 1,
     od.MODE: 1,
     od.MAX_VELOCITY: 25_000,
+    od.MARK: 1_000,
     od.ACCELERATION: 10_000,
     od.DECELERATION: 10_000,
     od.QUICK_STOP_DECELERATION: 10_000,
@@ -173,6 +174,11 @@ class Firmware:
     @staticmethod
     def _factory() -> dict[ObjectEntry, int]:
         return {entry: DEFAULTS.get(entry, 0) for entry in OBJECTS.values()}
+
+    @property
+    def frame_timeout(self) -> float:
+        """Seconds without a byte after which a half frame is forgotten."""
+        return self._values[od.RS232_TIMEOUT] / 1000
 
     # Objects
 

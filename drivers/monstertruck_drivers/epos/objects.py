@@ -74,6 +74,9 @@ VELOCITY_DEMAND = ObjectEntry("velocity demand", 0x606B, 0, 32, signed=True, acc
 VELOCITY = ObjectEntry("velocity actual", 0x606C, 0, 32, signed=True, access="ro")
 CURRENT = ObjectEntry("current actual", 0x6078, 0, 16, signed=True, access="ro")
 MAX_VELOCITY = ObjectEntry("maximal profile velocity", 0x607F, 0, 32)
+MARK = ObjectEntry("profile velocity", 0x6081, 0, 32)
+"""Of profile position mode, without effect in profile velocity mode: what is written here lasts until the controller
+restarts, so that a restart shows."""
 ACCELERATION = ObjectEntry("profile acceleration", 0x6083, 0, 32)
 DECELERATION = ObjectEntry("profile deceleration", 0x6084, 0, 32)
 QUICK_STOP_DECELERATION = ObjectEntry("quick stop deceleration", 0x6085, 0, 32)

@@ -1,5 +1,6 @@
 """The scanner as a service: one session streams scans until it is cancelled or lost."""
 
+from monstertruck_drivers.hokuyo_urg.clock_map import ClockMap
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
     Reply,
@@ -11,7 +12,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     scip1_scan_command,
     split_ranges,
 )
-from monstertruck_drivers.hokuyo_urg.session import ClockMap, Dialect, Parameters, ScipSession, Sensor
+from monstertruck_drivers.hokuyo_urg.session import Dialect, Parameters, ScipSession, Sensor
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
@@ -24,6 +25,12 @@ TRANSFER = 0.002
 """Seconds assumed from the last beam to the arrival where it cannot be measured."""
 GREATEST_2CHAR = 4.095
 """Metres; the most a two-character range can tell."""
+TOO_LATE = 0.3
+"""Seconds by which scans arrive later than at the start, from which on they are worth little."""
+LATE_FOR = 3.0
+"""Seconds of such scans after which the session starts anew, and with it the comparison of the clocks."""
+SLEW_PERIOD = 60.0
+"""Least seconds between two reports of clocks that run apart."""
 
 
 class HokuyoDriver:
@@ -57,13 +64,15 @@ class HokuyoDriver:
         self._clock = clock
         self._out = out
         self._events = events
+        self._slew_due = 0
+        self._late_since: int | None = None
 
     async def run(self, ready: Ready) -> None:
         """One session: wake, identify, compare clocks, stream; the laser is off when it ends.
 
         Raises:
             DeviceLostError: nothing plugged in, or unplugged.
-            DeviceTimeoutError: silence, or no good scan for ``stale_periods``.
+            DeviceTimeoutError: silence, no good scan for ``stale_periods``, or scans that arrive late for seconds.
             WrongDeviceError: another device answers.
             ProtocolError: too many damaged scans in a row, or answers against the protocol.
             DeviceFaultError: the sensor reports a hardware fault; it was reset once.
@@ -84,6 +93,9 @@ class HokuyoDriver:
     async def _stream(self, session: ScipSession, sensor: Sensor, ready: Ready) -> None:
         config, geometry = self._config, sensor.parameters
         anchor = await session.compare_clocks()
+        if anchor is None:
+            text = "refuses its time-adjust mode: the age of its scans is assumed, not measured"
+            self._tell(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
         mapping = ClockMap(round((_sweep(geometry) + TRANSFER) * SECOND), anchor)
         shape = (geometry.first_step, geometry.last_step, config.cluster)
         command = scan_command(config.scan_format, *shape, skip=config.skip)
@@ -129,10 +141,23 @@ class HokuyoDriver:
     def _stamp(self, mapping: ClockMap, block: ScanBlock, arrival: int) -> int:
         """The daemon's time at step 0, ns."""
         assert block.counter is not None  # SCIP 2.0
-        restarts = mapping.restarts
+        restarts, slews = mapping.restarts, mapping.slews
         stamp = mapping.stamp(block.counter, arrival)
         if mapping.restarts > restarts:
             self._tell(Severity.WARNING, "sensor's clock restarted", counter=block.counter)
+        if mapping.slews > slews and arrival >= self._slew_due:
+            self._slew_due = arrival + round(SLEW_PERIOD * SECOND)
+            text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
+            self._tell(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
+        if mapping.late < TOO_LATE * SECOND:
+            self._late_since = None
+        elif self._late_since is None:
+            self._late_since = arrival
+        elif arrival - self._late_since > LATE_FOR * SECOND:
+            self._late_since = None
+            raise DeviceTimeoutError(
+                f"{self._port.name}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: begins anew"
+            )
         return stamp
 
     # SCIP 1.1

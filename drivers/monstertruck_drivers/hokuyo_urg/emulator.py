@@ -134,8 +134,16 @@ CATCH_UP: Final = 5
 
 StartState = Literal["scip1", "scip2", "streaming", "time_adjust"]
 FAULTS: Final = (
-    "status 21..98 | deaf [on|off] | fragile [on|off] | cut | laser [on|off] | seri [on|off] | timer MILLISECONDS"
+    "status 21..98 | deaf [on|off] | fragile [on|off] | cut | laser [on|off] | seri [on|off] | tm [on|off] | "
+    "timer MILLISECONDS | drift PPM | cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO"
 )
+MIRROR: Final = 18
+"""Error code of a strongly reflecting object."""
+SPECULAR: Final = 0.2
+"""Share of a mirror, in its middle, from which the light comes straight back."""
+
+Cover = Callable[[NDArray[np.int32]], NDArray[np.int32]]
+"""What becomes of the values (n,) of the steps behind something."""
 
 
 class HokuyoEmulator:
@@ -185,7 +193,10 @@ class HokuyoEmulator:
         self._jitter = jitter
         self._steps = (min_step, max_step)
         self._born = clock.now()
-        self._fragile = self._cut = self._laser_broken = self._seri_quirk = False
+        self._fragile = self._cut = self._laser_broken = self._seri_quirk = self._tm_refused = False
+        self._elapsed = 0
+        """Sensor's own time at ``_born``, ns."""
+        self._covers: list[tuple[slice, Cover]] = []
         self._order: ScanOrder | None = None
         self._statuses: deque[int] = deque()
         self._pending: list[str] = []
@@ -218,7 +229,12 @@ class HokuyoEmulator:
         ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream until 98, 50-97 end
         it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the next scan in
         the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an empty
-        line into VV. ``timer`` sets the counter.
+        line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
+        its clock against the world's.
+
+        ``cover`` puts something over the window between two directions, degrees from straight ahead, left positive:
+        the beams, or a random share of them, give the value (below 20: an error code, otherwise mm). ``mirror`` puts
+        a mirror there: its middle dazzles, the rest shows the room behind the mirror, twice as far away.
 
         Raises:
             InputError: unknown fault or bad value.
@@ -231,6 +247,10 @@ class HokuyoEmulator:
             "cut": lambda: setattr(self, "_cut", True),
             "laser": lambda word="on": setattr(self, "_laser_broken", _switch(word)),
             "seri": lambda word="on": setattr(self, "_seri_quirk", _switch(word)),
+            "tm": lambda word="off": setattr(self, "_tm_refused", not _switch(word)),
+            "drift": self._inject_drift,
+            "cover": self._inject_cover,
+            "mirror": self._inject_mirror,
         }
         try:
             known[fault](*values)
@@ -245,6 +265,32 @@ class HokuyoEmulator:
 
     def _inject_timer(self, milliseconds: str) -> None:
         self._timer_zero = self._time() - int(milliseconds) * 1_000_000
+
+    def _inject_drift(self, ppm: str) -> None:
+        rate = 1.0 + float(ppm) * 1e-6
+        self._elapsed, self._born = self._time(), self._clock.now()
+        self._rate = rate
+
+    def _inject_cover(self, begin: str, end: str = "", value: str = "", share: str = "1") -> None:
+        if begin == "off":
+            self._covers.clear()
+            return
+        shown, part = int(value), float(share)
+
+        def cover(values: NDArray[np.int32]) -> NDArray[np.int32]:
+            return np.where(self._rng.random(len(values)) < part, np.int32(shown), values)
+
+        self._covers.append((_steps_between(begin, end), cover))
+
+    def _inject_mirror(self, begin: str, end: str) -> None:
+        def mirror(values: NDArray[np.int32]) -> NDArray[np.int32]:
+            values = np.where(values >= LEAST_MM, 2 * values, values)
+            values[values > GREATEST_MM] = 0
+            half = round(len(values) * SPECULAR / 2)
+            values[len(values) // 2 - half : len(values) // 2 + half] = MIRROR
+            return values
+
+        self._covers.append((_steps_between(begin, end), mirror))
 
     # Supply and time
 
@@ -264,11 +310,11 @@ class HokuyoEmulator:
 
     def _time(self) -> int:
         """Sensor's own time, ns since construction."""
-        return round((self._clock.now() - self._born) * self._rate)
+        return self._elapsed + round((self._clock.now() - self._born) * self._rate)
 
     def _world_time(self, time: int) -> int:
         """The world's time at a time of the sensor's clock, ns."""
-        return self._born + round(time / self._rate)
+        return self._born + round((time - self._elapsed) / self._rate)
 
     def _counter(self, time: int) -> int:
         return (time - self._timer_zero) // 1_000_000 & COUNTER_MASK
@@ -300,7 +346,12 @@ class HokuyoEmulator:
 
     def _measure(self, begin: int) -> NDArray[np.int32]:
         """Shape (769,), mm or codes."""
-        return self._source.scan(self._world_time(begin))
+        revolution = self._source.scan(self._world_time(begin))
+        if self._covers:
+            revolution = revolution.copy()
+            for steps, cover in self._covers:
+                revolution[steps] = cover(revolution[steps])
+        return revolution
 
     def _sweep(self) -> int:
         return self._steps[1] * PERIOD // STEPS + PROCESSING
@@ -390,7 +441,7 @@ class HokuyoEmulator:
             "RS": self._rs,
             "TM": self._tm,
             "SS": self._ss,
-            "CR": lambda *_: ("04", []),
+            "CR": self._cr,
             "GD": self._single,
             "GS": self._single,
             "MD": self._multi,
@@ -461,7 +512,13 @@ class HokuyoEmulator:
         self._adjusting, self._timer_zero, self._next_baud = False, self._time(), DEFAULT_BAUD
         return self._qt(text, tag)
 
+    def _cr(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
+        """Its rotor has one speed, the default."""
+        return ("03" if text == "CR00" else "04"), []
+
     def _tm(self, text: str, _tag: str) -> tuple[str, list[bytes]]:
+        if self._tm_refused:
+            return "0E", []
         if text == "TM1":
             if not self._adjusting:
                 return "04", []
@@ -512,6 +569,14 @@ class HokuyoEmulator:
 
 def _switch(word: str) -> bool:
     return {"on": True, "off": False}[word]
+
+
+def _steps_between(begin: str, end: str) -> slice:
+    """Steps between two directions, degrees from straight ahead, left positive."""
+    first, last = (FRONT_STEP + round(float(degrees) * STEPS / 360) for degrees in (begin, end))
+    if not 0 <= first < last <= LAST_STEP:
+        raise ValueError(f"{begin}..{end} degrees")
+    return slice(first, last + 1)
 
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:

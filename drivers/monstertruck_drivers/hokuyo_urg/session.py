@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from monstertruck_drivers.hokuyo_urg.clock_map import Anchor
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
-    COUNTER_BITS,
-    COUNTER_MASK,
     Reply,
     ScipParser,
     StatusMeaning,
@@ -167,93 +166,6 @@ def parse_state(fields: dict[str, str]) -> InternalState:
     )
 
 
-MILLISECOND: Final = 1_000_000
-MAX_DRIFT_PPM: Final = 200
-RESTART: Final = 1000 * MILLISECOND
-"""Disagreement of both clocks over one scan that only a restarted counter can explain, ns."""
-SETTLE: Final = 5000 * MILLISECOND
-"""How long the start-up comparison is used while the latency is being found, ns (200 ppm = 1 ms)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """One comparison of both clocks."""
-
-    counter: int
-    """Sensor's milliseconds, 24 bits."""
-    host: int
-    """The daemon's time when the counter said so, ns."""
-    round_trip: int = 0
-    """How long the exchange took, ns; half of it bounds the error."""
-
-
-class ClockMap:
-    """Stamps of counter values, never going backwards.
-
-    Args:
-        nominal_latency: ns from a counter value to the arrival of its scan; used only where it cannot be measured
-            (no ``anchor``, or the counter restarted before the first scan).
-        anchor: comparison made at start.
-    """
-
-    def __init__(self, nominal_latency: int, anchor: Anchor | None = None) -> None:
-        self.restarts = 0
-        """How often the counter restarted."""
-        self._latency: int = nominal_latency
-        self._reference: int | None = None if anchor is None else anchor.host
-        self._counter: int | None = None if anchor is None else anchor.counter
-        self._host = 0 if anchor is None else anchor.host
-        self._elapsed = 0  # sensor's ns since the first comparison
-        self._envelope: int | None = None
-        self._stamp: int | None = None
-
-    def stamp(self, counter: int, arrival: int) -> int:
-        """The daemon's time, ns, at which the sensor's counter said ``counter``.
-
-        Args:
-            counter: milliseconds, 24 bits, later than that of the previous call.
-            arrival: when the last byte came, ns.
-        """
-        offset = self._follow(counter, arrival)
-        stamp = self._elapsed + offset
-        if self._stamp is not None:
-            stamp = max(stamp, self._stamp + 1)
-        self._stamp = stamp
-        return stamp
-
-    def _follow(self, counter: int, arrival: int) -> int:
-        """Take one sample; returns (daemon's time - sensor's time) without latency."""
-        waited = arrival - self._host
-        previous, self._counter, self._host = self._counter, counter, arrival
-        if previous is None:
-            self._envelope = arrival
-            return arrival - self._latency
-        step = ((counter - previous) & COUNTER_MASK) * MILLISECOND
-        if abs(_signed(step - waited)) > RESTART:
-            self.restarts += 1
-            self._reference = None
-            self._elapsed += waited
-            self._envelope = arrival - self._elapsed
-            return self._envelope - self._latency
-        self._elapsed += step
-        sample = arrival - self._elapsed
-        rise = step * MAX_DRIFT_PPM // 1_000_000
-        self._envelope = sample if self._envelope is None else min(sample, self._envelope + rise)
-        if self._reference is None:
-            return self._envelope - self._latency
-        reference = self._reference
-        self._latency = self._envelope - reference
-        if self._elapsed > SETTLE:
-            self._reference = None
-        return reference
-
-
-def _signed(difference: int) -> int:
-    """A difference of counters, ns, as the least one of all that a wrap makes equal."""
-    turn = MILLISECOND << COUNTER_BITS
-    return (difference + turn // 2) % turn - turn // 2
-
-
 LISTEN = 0.05
 """Seconds whose bytes are thrown away after opening."""
 WAKE_TIMEOUT = 0.5
@@ -365,22 +277,28 @@ class ScipSession:
         self._check(sensor)
         return sensor
 
-    async def compare_clocks(self) -> Anchor:
+    async def compare_clocks(self) -> Anchor | None:
         """Read the sensor's counter in time-adjust mode; the quickest of several exchanges counts.
 
+        Returns:
+            None if the sensor refuses that mode.
+
         Raises:
-            ProtocolError: the mode is refused or the time is damaged.
+            ProtocolError: the time is damaged, or the mode is not left.
         """
-        await self.demand("TM0")
+        if classify("TM0", (await self.ask("TM0")).status) not in (StatusMeaning.OK, StatusMeaning.ALREADY):
+            return None
         anchors = []
         for _ in range(self._config.clock_samples):
             sent = self._clock.now()
-            reply = await self.demand("TM1")
+            reply = await self.ask("TM1")
             received = self._clock.now()
+            if classify("TM1", reply.status) is not StatusMeaning.OK:
+                break
             counter = decode_counter(reply.lines[0] if reply.lines else b"")
             anchors.append(Anchor(counter, (sent + received) // 2, received - sent))
         await self.demand("TM2")
-        return min(anchors, key=lambda anchor: anchor.round_trip)
+        return min(anchors, key=lambda anchor: anchor.round_trip, default=None)
 
     async def stop(self) -> None:
         """Laser off, stream ended; waits briefly for the answer and never fails."""

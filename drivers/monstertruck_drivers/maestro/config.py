@@ -12,6 +12,9 @@ from monstertruck_schemas.base import Schema
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
 Microseconds = Annotated[float, Field(gt=0, le=4000)]
 
+ROUNDING = 2
+"""Quarter microseconds by which a pulse may differ from its target."""
+
 
 class ServoConfig(Schema):
     """One steering servo: ``pulse_us = centre_us + direction * scale_us_per_deg * servo angle in degrees``."""
@@ -49,6 +52,10 @@ class ServoConfig(Schema):
         ends = sorted(self.angle(round(4 * pulse)) for pulse in (self.min_us, self.max_us))
         limit = math.radians(self.max_angle_deg)
         return max(ends[0], -limit), min(ends[1], limit)
+
+    def within_limits(self, quarters: int) -> bool:
+        """Whether a pulse in quarter microseconds can be one of this driver's targets."""
+        return 4 * self.min_us - ROUNDING <= quarters <= 4 * self.max_us + ROUNDING
 
     def angle(self, quarters: int) -> float:
         """Servo angle (rad, left positive) of a pulse in quarter microseconds."""

@@ -186,14 +186,21 @@ class MaestroDriver:
 
     def _report(self, session: MaestroSession, stamp: int, received: int, positions: list[int], errors: int) -> None:
         positions = positions[: len(self._angles)]
+        strange = False
         for i, (servo, position) in enumerate(zip(self._config.servos, positions, strict=True)):
-            if position > 0:  # 0: no pulses, the servo stays where it is
+            if position == 0:
+                continue  # no pulses, the servo stays where it is
+            if servo.within_limits(position):
                 self._angles[i] = servo.angle(position)
+            else:
+                strange = True
         pulsing = all(positions)
-        lost = errors != 0 or (self._command is not None and not pulsing)
+        lost = errors != 0 or strange or (self._command is not None and not pulsing)
         if lost:
             if not self._failing:
-                what = ", ".join(error_names(errors)) or "pulses off"
+                what = ", ".join(error_names(errors)) or (
+                    "pulses beyond min_us and max_us" if strange else "pulses off"
+                )
                 text = f"the servo controller reports {what}: settings and targets sent again"
                 self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text, error_word=errors)
             self._restore(session)
@@ -205,7 +212,7 @@ class MaestroDriver:
                 seq=self._out.next_seq(),
                 **servo_fields(self._angles),
                 error_word=errors,
-                trusted=errors == 0 and pulsing,
+                trusted=errors == 0 and pulsing and not strange,
             )
         )
 

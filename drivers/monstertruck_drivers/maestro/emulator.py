@@ -73,7 +73,8 @@ class MaestroEmulator:
 
     Settings given here live in the unit's non-volatile memory; targets, speeds and accelerations do not.
     Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (answers
-    are withheld), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
+    are withheld), ``late SECONDS [COUNT]`` (answers come later), ``pulse CHANNEL MICROSECONDS`` (moved by another
+    program, beyond its limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
 
     Args:
         clock: time.
@@ -137,6 +138,8 @@ class MaestroEmulator:
         self._drift = rail_drift_v
         self._decoder = Decoder(device_number, crc)
         self._mute = False
+        self._late: list[float] = []
+        """Delays of the next answers, s."""
         self._powered = True
         self._fed_again = asyncio.Event()
         self._levels = dict.fromkeys(outputs, False)
@@ -206,28 +209,40 @@ class MaestroEmulator:
                     self._mode = mode
                 case "mute", (("on" | "off") as state,):
                     self._mute = state == "on"
-                case "error", (bit,):
-                    self._fail(Error(1 << int(bit)))
-                case "rail", (volts,):
-                    self.rail_v = float(volts)
-                case "noise", (lsb,):
-                    self._noise = float(lsb)
-                case "battery", (volts,):
-                    self.analog_v.update(dict.fromkeys(self._inputs, float(volts) / 10))
+                case "late", (seconds, *counts):
+                    self._late = [float(seconds)] * int(*counts or ("1",))
+                case "pulse", (channel, pulse):
+                    self._ramps[int(channel)].aim(round(4 * float(pulse)))
+                case _, (number,):
+                    self._set(fault, number)
                 case _:
                     raise ValueError("unknown")
         except ValueError as error:
             raise InputError(
                 f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: brown_out [SECONDS], "
-                "at_junk, mode dual_port|uart, mute on|off, error BIT, rail VOLTS, noise LSB, battery VOLTS"
+                "at_junk, mode dual_port|uart, mute on|off, late SECONDS [COUNT], "
+                "pulse CHANNEL MICROSECONDS, error BIT, rail VOLTS, noise LSB, battery VOLTS"
             ) from error
+
+    def _set(self, fault: str, number: str) -> None:
+        match fault:
+            case "error":
+                self._fail(Error(1 << int(number)))
+            case "rail":
+                self.rail_v = float(number)
+            case "noise":
+                self._noise = float(number)
+            case "battery":
+                self.analog_v.update(dict.fromkeys(self._inputs, float(number) / 10))
+            case _:
+                raise ValueError("unknown")
 
     # Serving
 
     def _take(self, end: DeviceEnd, data: bytes) -> None:
         answer = self._execute(data)
         if answer and not self._mute:
-            end.write(answer)
+            end.write(answer, self._late.pop() if self._late else 0.0)
 
     def _execute(self, data: bytes) -> bytes:
         self.received.extend(data)

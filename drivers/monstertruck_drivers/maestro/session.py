@@ -11,6 +11,8 @@ ATTEMPTS: Final = 3
 """Tries to identify: another program may be talking into a freshly plugged port."""
 QUIET: Final = 0.02
 """Seconds of silence that end an answer; a Maestro says nothing unasked."""
+RESYNC_TRIES: Final = 4
+"""Tries to come into step with the answers again, at one time."""
 
 
 class MaestroSession:
@@ -28,6 +30,8 @@ class MaestroSession:
         self._link = link
         self._clock = clock
         self._timeout = timeout
+        self._in_step = True
+        """No answer to an earlier question can come any more."""
 
     def send(self, *commands: bytes) -> None:
         """Commands without an answer.
@@ -44,12 +48,37 @@ class MaestroSession:
             DeviceLostError: unplugged.
             DeviceTimeoutError: not all answers came in time.
         """
-        self._link.discard()
+        if not self._in_step or self._link.discard():
+            await self._resynchronise()
         self._link.write(b"".join(requests))
         try:
             return words(await self._link.exactly(2 * len(requests), self._timeout))
         except TimeoutError:
-            raise DeviceTimeoutError(f"{self._link.name}: no answer within {self._timeout} s") from None
+            self._in_step = False
+            raise self._silent() from None
+
+    def _silent(self) -> DeviceTimeoutError:
+        return DeviceTimeoutError(f"{self._link.name}: no answer within {self._timeout} s")
+
+    async def _resynchronise(self) -> None:
+        """Wait out a late answer: silence, and then exactly the answer to a question of known length.
+
+        Raises:
+            DeviceTimeoutError: it does not come, or more than it does.
+        """
+        self._in_step = False
+        for _ in range(RESYNC_TRIES):
+            if await self._speaks():
+                continue
+            self._link.write(self.encode.get_position(0))
+            try:
+                await self._link.exactly(2, self._timeout)
+            except TimeoutError:
+                raise self._silent() from None
+            if not await self._speaks():
+                self._in_step = True
+                return
+        raise DeviceTimeoutError(f"{self._link.name}: answers stay out of step")
 
     async def identify(self, *channels: int) -> int:
         """Make sure that a Maestro answers, reading its errors and the positions of ``channels``.

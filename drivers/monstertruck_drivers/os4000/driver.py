@@ -16,6 +16,10 @@ from monstertruck_schemas.sensor import Attitude
 
 RATE_TOLERANCE: Final = 0.25
 """Share by which the observed rate may differ from the configured one."""
+SETTING_PERIOD: Final = 3600.0
+"""Least seconds between two writes of one setting: they go to memory that wears, and each pauses the stream."""
+LOOKS: Final = 2
+"""Looks at the stream that must agree before a setting is written: one may fall into a pause of the host."""
 
 
 class Os4000Driver:
@@ -49,6 +53,8 @@ class Os4000Driver:
         self._out = out
         self._events = events
         self._refusing = False
+        self._written: dict[Key, int] = {}
+        """When each setting was written, ns."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -67,14 +73,18 @@ class Os4000Driver:
             await self._serve(session)
 
     async def _set_up(self, session: Os4000Session) -> None:
-        heard = await session.start(self._config.rate)
+        heard = await session.start(self._config.rate, self._may_write)
         wrong = self._differences(heard)
-        if not wrong:
-            return
+        for _ in range(LOOKS - 1):
+            if not wrong:
+                return
+            heard = await session.listen(LISTEN)
+            wrong = {key: what for key, what in self._differences(heard).items() if key in wrong}
         for key, (number, text) in wrong.items():
-            self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, f"{text}: setting it")
-            await session.set(key, number)
-        heard = await session.listen(LISTEN)
+            if self._may_write(key):
+                self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, f"{text}: setting it")
+                await session.set(key, number)
+                heard = await session.listen(LISTEN)
         missing = NEEDED & ~observed_fields(heard)
         if missing:
             raise ProtocolError(
@@ -82,6 +92,14 @@ class Os4000Driver:
             )
         for _, text in self._differences(heard).values():
             self._events(Reason.DEVICE_MISMATCH, Severity.WARNING, self.name, f"{text} even after setting it")
+
+    def _may_write(self, key: Key) -> bool:
+        """Whether a setting may be written once more; it counts as written."""
+        now, before = self._clock.now(), self._written.get(key)
+        if before is not None and now - before < SETTING_PERIOD * SECOND:
+            return False
+        self._written[key] = now
+        return True
 
     def _differences(self, heard: list[tuple[int, Sentence]]) -> dict[Key, tuple[int, str]]:
         """Settings that differ: key to configured value and a text."""

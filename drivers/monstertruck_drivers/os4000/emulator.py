@@ -92,8 +92,9 @@ class Os4000Emulator:
 
     Faults (``inject``): ``frozen on|off`` (the same sentence again and again), ``silent on|off``, ``bad_checksum N``,
     ``empty_field TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text),
-    ``pending`` (as if a command was left unfinished), ``rate N`` and ``format N`` (stored settings changed by
-    somebody), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the rate), ``host_baud N``
+    ``pending [DIGITS]`` (as if a command was left unfinished, with so much of its value), ``rate N`` and ``format N``
+    (stored settings changed by somebody), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the
+    rate), ``host_baud N``
     (the host's rate; at another one than the unit's both sides see noise).
 
     Args:
@@ -184,7 +185,8 @@ class Os4000Emulator:
             raise InputError(
                 f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: "
                 "frozen on|off, silent on|off, bad_checksum N, empty_field TAG|none, nan_field TAG|none, "
-                "half_sentence, prompt, pending, rate N, format N, disturbance DEGREES, drift SHARE, host_baud N"
+                "half_sentence, prompt, pending [DIGITS], rate N, format N, disturbance DEGREES, drift SHARE, "
+                "host_baud N"
             ) from error
 
     def _inject(self, fault: str, values: tuple[str, ...]) -> None:
@@ -201,8 +203,8 @@ class Os4000Emulator:
                 self._torn = True
             case "prompt", ():
                 self._stray = _prompt(Key.MOUNTING)
-            case "pending", ():
-                self._command, self._digits = Key.RATE, b""
+            case "pending", digits if len(digits) < 2:
+                self._command, self._digits = Key.RATE, "".join(digits).encode("ascii")
             case _, (number,):
                 self._set(fault, number)
             case _:

@@ -1,5 +1,6 @@
 """Listening to an OS4000 and setting it up over one open link; shared by driver and probe."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Final
 
@@ -58,7 +59,7 @@ class Os4000Session:
             pass
         return heard
 
-    async def start(self, rate: int) -> list[tuple[int, Sentence]]:
+    async def start(self, rate: int, may_set: Callable[[Key], bool] = lambda _: True) -> list[tuple[int, Sentence]]:
         """Bring the unit to talk, whatever state it was left in.
 
         It may stream; wait inside an unfinished command; have its output switched off (that is stored); or print
@@ -67,6 +68,7 @@ class Os4000Session:
 
         Args:
             rate: sentences a second to set when the output is off.
+            may_set: asked before a setting is written.
 
         Returns:
             At least one sentence, with arrival times.
@@ -76,19 +78,20 @@ class Os4000Session:
             DeviceTimeoutError: silence to the end.
             WrongDeviceError: bytes come, but no sentence of an OS4000.
         """
-        remedies = [
-            b"\r",  # ends a command that waits for its value
-            LEAVE,
-            protocol.key(Key.RATE) + protocol.value(rate),
-        ]
+        # What a half-typed command holds must not be taken for its value: it is left before anything is ended.
+        set_rate = protocol.key(Key.RATE) + protocol.value(rate)
+        remedies = [LEAVE, b"\r", set_rate]
         heard = await self.listen(LISTEN)
         if not heard and any(is_other_format(line) for line in self.parser.text):
-            await self.set(Key.FORMAT, FORMAT_TAGGED)
+            if may_set(Key.FORMAT):
+                await self.set(Key.FORMAT, FORMAT_TAGGED)
             heard = await self.listen(LISTEN)
         silent = self.bytes_heard == 0
         while not heard and remedies and silent:
-            self._link.write(remedies.pop(0))
-            heard = await self.listen(LISTEN)
+            remedy = remedies.pop(0)
+            if remedy is not set_rate or may_set(Key.RATE):
+                self._link.write(remedy)
+                heard = await self.listen(LISTEN)
         if heard:
             return heard
         name = self._link.name

@@ -68,14 +68,21 @@ def header(now, seq=0, **more):
     return {"stamp": now, "received": now, "seq": seq, **more}
 
 
-def scan(now, *obstacles, **more):
-    """A scan of the plane around a lidar at (0.14, 0), with every beam that meets one of the points given in base."""
+def scan(now, *obstacles, unknown=(), **more):
+    """A scan of the plane around a lidar at (0.14, 0), with every beam that meets one of the points given in base.
+
+    The first beam meets a wall far off. ``unknown``: (from, to, code) in degrees, left positive, give a code.
+    """
     ranges = np.full(682, math.inf)
     codes = np.zeros(682, dtype=np.uint8)
     step = math.radians(240) / 681
+    ranges[0], codes[0] = 3.9, 255
     for x, y in obstacles:
         beam = round((math.atan2(y, x - 0.14) + math.radians(120)) / step)
         ranges[beam], codes[beam] = min(ranges[beam], math.hypot(x - 0.14, y)), 255
+    for begin, end, code in unknown:
+        first, last = (round(math.radians(degrees + 120) / step) for degrees in (begin, end))
+        ranges[first : last + 1], codes[first : last + 1] = math.inf, code
     return LaserScan(
         **header(now),
         frame="lidar",
@@ -122,6 +129,7 @@ class Rig:
         self.speed = 0.0
         self.silent = set()
         self.obstacles = ()
+        self.unknown = ()
         self.tilt = 0.0
         self.level = BatteryLevel.NORMAL
         self.fault = False
@@ -159,7 +167,7 @@ class Rig:
         """Every sensor that is not silent delivers now."""
         mode = DriveMode.FAULT if self.fault else DriveMode.ENABLED
         samples = {
-            "scan": lambda: self.gate.observe_scan(scan(self.now, *self.obstacles)),
+            "scan": lambda: self.gate.observe_scan(scan(self.now, *self.obstacles, unknown=self.unknown)),
             "attitude": lambda: self.gate.observe_attitude(attitude(self.now, roll=self.tilt)),
             "drive": lambda: self.gate.observe_drive(feedback(self.now, self.speed, mode)),
             "steering": lambda: self.gate.observe_steering(servos(self.now)),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monstertruck_drivers.hokuyo_urg.session import Anchor, ClockMap
+from monstertruck_drivers.hokuyo_urg.clock_map import Anchor, ClockMap
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -89,3 +89,52 @@ def test_the_stamp_never_steps_backwards():
     mapping = ClockMap(400 * MS)
     stamps = [mapping.stamp(1000, 10 * SECOND), mapping.stamp(1010, 9 * SECOND + 720 * MS)]
     assert stamps[1] == stamps[0] + 1
+
+
+def two_clocks(
+    *, seconds: int, drift_ppm: float = 0.0, slew: float = 0.0, jump_ms: float = 0.0, jitter_ms: float = 10.0
+) -> tuple[np.ndarray, ClockMap]:
+    """Errors of the stamps, ms, of a stream whose host's clock is slewed by a share ``slew`` from 40 to 45 s.
+
+    From 60 s on scans arrive ``jump_ms`` later.
+    """
+    rng = np.random.default_rng(2)
+    rate, origin = 1 + drift_ppm * 1e-6, 12_345_678_901
+    truth = origin + 2 * SECOND + (np.arange(seconds * 10) * 100 * MS / rate).astype(np.int64)
+
+    def host(time: np.ndarray) -> np.ndarray:
+        return (time + slew * np.clip(time - origin - 40 * SECOND, 0, 5 * SECOND)).astype(np.int64)
+
+    counters = ((truth - origin) * rate // MS + 3_000_000).astype(np.int64) % WRAP
+    late = rng.uniform(0, jitter_ms, len(truth)) + jump_ms * (truth - origin > 60 * SECOND)
+    arrivals = np.maximum.accumulate(host(truth + LATENCY + (late * MS).astype(np.int64)))
+    mapping = ClockMap(0, Anchor(3_000_000, int(host(np.array([origin]))[0])))
+    stamps = np.array([mapping.stamp(int(c), int(a)) for c, a in zip(counters, arrivals, strict=True)])
+    assert np.all(np.diff(stamps) > 0)
+    return (stamps - host(truth)) / MS, mapping
+
+
+@pytest.mark.parametrize("drift_ppm", [-10_000.0, -300.0, 300.0, 10_000.0])
+def test_the_drift_is_estimated(drift_ppm: float):
+    """300 ppm were a second late within the hour; a hundredth is a second in 100 s."""
+    errors, mapping = two_clocks(seconds=600, drift_ppm=drift_ppm)
+    assert np.abs(errors).max() < 80
+    assert np.abs(errors[100:]).max() < 5
+    assert mapping.drift == pytest.approx(-drift_ppm * 1e-6, rel=0.05, abs=3e-5)
+    assert mapping.late == 0
+
+
+@pytest.mark.parametrize("slew", [-0.1, 0.1])
+def test_slews_are_followed(slew: float):
+    """The kernel slews by a tenth at most: half a second within five."""
+    errors, mapping = two_clocks(seconds=120, slew=slew)
+    assert np.abs(errors).max() < 110
+    assert np.abs(errors[-300:]).max() < 5
+    assert mapping.late == 0
+
+
+def test_scans_that_become_late_are_late():
+    """No clock jumps: their stamps stay true, and the map says so."""
+    errors, mapping = two_clocks(seconds=70, jump_ms=400.0)
+    assert np.abs(errors).max() < 5
+    assert mapping.late == pytest.approx(400 * MS, abs=10 * MS)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -494,3 +495,72 @@ def test_two_runs_are_identical():
             return rig.out.kept
 
     assert run_virtual(main) == run_virtual(main)
+
+
+def test_a_scanner_without_time_adjust_mode_streams_and_says_so():
+    async def main(clock: VirtualClock) -> Rig:
+        async with bench(clock, drift_ppm=300.0) as rig:
+            rig.emulator.inject("tm", "off")
+            async with rig.driving():
+                await rig.out.total(50)
+            return rig
+
+    rig = run_virtual(main)
+    assert rig.events.reasons() == [Reason.CLOCK_DRIFT, Reason.DEVICE_READY]
+    for scan, begin in zip(rig.out.kept, rig.emulator._source.times, strict=False):
+        assert scan.stamp == pytest.approx(begin + 44 * STEP_NS, abs=5 * MS)
+
+
+@pytest.mark.parametrize("ppm", ["-100000", "100000"])
+def test_a_slewed_clock_keeps_the_scans_fresh(ppm: str):
+    """Half a second within five, then as before; the gate refuses scans 0.4 s old."""
+
+    async def main(clock: VirtualClock) -> Rig:
+        async with bench(clock, jitter=0.005) as rig, rig.driving():
+            await rig.out.total(100)
+            rig.emulator.inject("drift", ppm)
+            await clock.sleep(5.0)
+            rig.emulator.inject("drift", "0")
+            await clock.sleep(30.0)
+            return rig
+
+    rig = run_virtual(main)
+    assert max(scan.received - scan.stamp for scan in rig.out.kept) < 200 * MS
+    assert max(abs(b.stamp - a.stamp - 100 * MS) for a, b in pairwise(rig.out.kept[-50:])) < 10 * MS
+    assert rig.events.reasons().count(Reason.CLOCK_DRIFT) == 1
+    assert len(rig.ready_at) == 1
+
+
+def test_scans_that_stay_late_start_the_session_anew():
+    async def main(clock: VirtualClock) -> None:
+        async with bench(clock) as rig, rig.driving():
+            await rig.out.total(100)
+            rig.port.device.faults.delay = 0.35
+            await clock.sleep(10.0)
+
+    with pytest.raises(DeviceTimeoutError, match="s later than at the start"):
+        run_virtual(main)
+
+
+def test_covers_and_mirrors_before_the_window():
+    async def main(clock: VirtualClock) -> Rig:
+        async with bench(clock) as rig:
+            rig.emulator.inject("cover", "-10", "10", "19")
+            rig.emulator.inject("cover", "20", "40", "7", "0.5")
+            rig.emulator.inject("cover", "-40", "-20", "30")
+            rig.emulator.inject("mirror", "-80", "-60")
+            async with rig.driving():
+                await rig.out.total(3)
+                rig.emulator.inject("cover", "off")
+                await rig.out.total(6)
+            return rig
+
+    rig = run_virtual(main)
+    scan, clear = rig.out.kept[1], rig.out.kept[-1]
+    degrees = np.degrees(scan.start_angle + scan.angle_increment * np.arange(682))
+    assert set(scan.codes[abs(degrees) < 9.5]) == {19}
+    assert 0.3 < np.mean(scan.codes[(degrees > 20.5) & (degrees < 39.5)] == 7) < 0.7
+    assert set(scan.ranges[(degrees > -39.5) & (degrees < -20.5)]) == {0.03}
+    assert 18 in scan.codes[(degrees > -72) & (degrees < -68)]
+    side = (degrees > -79.5) & (degrees < -75)
+    assert scan.ranges[side] == pytest.approx(2 * clear.ranges[side], abs=0.02)

@@ -23,6 +23,7 @@ from monstertruck_runtime.errors import (
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.health import ServiceHealth
+from monstertruck_schemas.reasons import Reason
 from tests.unit.drivers.kit import Events, Kept, background
 from tests.unit.drivers.maestro.rig import Gate, Rig, on_bench
 
@@ -248,3 +249,43 @@ async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
         assert out.kept[-1].front == pytest.approx(0.1, abs=0.001)
     finally:
         pty.unplug()
+
+
+@pytest.mark.parametrize("late", [0.101, 0.13, 0.16])
+def test_a_late_answer_is_never_taken_for_the_next_one(late: float):
+    """Four words late, three asked for next: the battery would be read as the error word."""
+
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            rig.gate.front = 0.2
+            await rig.settle(1.0)
+            for step in range(20):
+                rig.emulator.inject("late", str(late))
+                await rig.settle(0.5 + 0.013 * step)
+        judge(rig)
+
+    def judge(rig: Rig) -> None:
+        assert {feedback.error_word for feedback in rig.out.kept} == {0}
+        assert Reason.DEVICE_FAULT not in rig.events.reasons()
+        assert all(feedback.front == pytest.approx(0.2, abs=0.01) for feedback in rig.out.kept[20:])
+        assert all(20 < battery.raw_voltage < 26 for battery in rig.battery.kept)
+        assert len(rig.ready_at) == 1
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("pulse", ["1000", "1950"])
+def test_pulses_beyond_the_limits_are_no_angles(pulse: str):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(1.0)
+            rig.gate.talking = False
+            await rig.settle(0.1)
+            rig.emulator.inject("pulse", "1", pulse)
+            await rig.settle(1.0)
+        reach = MaestroConfig().front.reach
+        assert all(reach[0] - 0.01 <= feedback.front <= reach[1] + 0.01 for feedback in rig.out.kept)
+        assert not all(feedback.trusted for feedback in rig.out.kept)
+        assert "pulses beyond" in " ".join(text for _, _, text, _ in rig.events.kept)
+
+    on_bench(test, MaestroConfig(deadman_feed="always"))

@@ -25,6 +25,7 @@ from monstertruck_runtime.errors import (
 )
 from monstertruck_runtime.service import RestartPolicy, supervise
 from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import ServiceHealth
 from monstertruck_schemas.reasons import Reason
 from tests.unit.drivers.kit import Events, Kept, background
 from tests.unit.drivers.os4000.rig import Rig, bench
@@ -265,7 +266,7 @@ def test_a_silent_port_is_explained_after_all_remedies():
         rig.port.device.faults.stalled = True
         with pytest.raises(DeviceTimeoutError, match="expected an OS4000"):
             await rig.session()
-        assert rig.sent == b"\r\x1b\r\x1bR20 "
+        assert rig.sent == b"\x1b\r\r\x1bR20 "
 
     on_bench(test)
 
@@ -362,3 +363,51 @@ async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
         assert out.kept[-1].tilt_valid
     finally:
         pty.unplug()
+
+
+async def minutes(rig: Rig, count: int) -> list[ServiceHealth]:
+    """Session after session for so many minutes."""
+    health: list[ServiceHealth] = []
+    service = supervise(rig.driver, RestartPolicy(max_delay=1.0), rig.clock, health.append, np.random.default_rng(1))
+    async with background(service):
+        await rig.settle(60.0 * count)
+    return health
+
+
+def test_a_compass_without_a_heading_is_set_up_once_an_hour_at_most():
+    """It was written to every 2.3 s: its memory wears, and each write pauses the stream."""
+
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("empty_field", "C")
+        await minutes(rig, 59)
+        assert rig.sent.count(b"\x1bX") == 1
+        assert rig.sent.count(b"\x1bR") == 0
+        await minutes(rig, 10)
+        assert rig.sent.count(b"\x1bX") == 2
+
+    on_bench(test)
+
+
+def test_a_pause_of_the_host_is_no_wrong_rate():
+    async def test(rig: Rig) -> None:
+        rig.port.device.faults.delay = 0.6
+        async with rig.driving():
+            await rig.settle(0.7)
+            rig.port.device.faults.delay = 0.0  # what was sent since arrives in one burst
+            await rig.out.total(20)
+        assert rig.sent == b""
+
+    on_bench(test)
+
+
+def test_a_half_typed_command_is_left_not_ended():
+    """CR would store what a host that died had typed: a rate of 2."""
+
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("pending", "2")
+        async with rig.driving():
+            await rig.out.total(20)
+        assert rig.emulator.settings.rate == 20
+        assert rig.sent == b"\x1b\r"
+
+    on_bench(test)

@@ -1,0 +1,151 @@
+"""A lidar that does not see: covered, dazzled, mirrored, or blind."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.collision import Footprint, scan_points, swept_poses
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.visibility import SECTORS, Visibility
+from tests.unit.gate.rig import Rig, scan
+
+MOUNT = (0.14, 0.0, 0.0)
+ALL = (-120.0, 120.0)
+AHEAD = swept_poses((1.0, 0.0, 0.0), np.linspace(0.0, 0.4, 20))
+LEFT = swept_poses((1.0, 0.0, 2.0), np.linspace(0.0, 0.4, 40))
+
+
+def seen(message):
+    """Sectors that one scan sees, of those ahead."""
+    visibility = Visibility(Footprint(), MOUNT, 0.5)
+    visibility.observe(message, scan_points(message, MOUNT))
+    return visibility.last_seen(visibility.travelled(AHEAD)) > 0
+
+
+@pytest.mark.parametrize("code", [3, 4, 5, *range(6, 20)])
+def test_codes_that_say_nothing_stop_the_truck_within_half_a_second(code):
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((-119.0, 120.0, code),)
+    rig.tick()
+    assert Reason.LIDAR_SLOW in rig.out.reasons
+    assert rig.out.speed_limit == 0.1
+    rig.tick(25)
+    assert Reason.LIDAR_BLIND in rig.out.reasons
+    assert rig.speed == 0.0
+    assert [trip.reason for trip in rig.trips] == [Reason.LIDAR_BLIND]
+    assert Reason.LIDAR_BLIND in {event.reason for event in rig.events}
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_codes_that_say_nothing_is_there_are_free_ground(code):
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((-119.0, 120.0, code),)
+    rig.tick(50)
+    assert rig.out.reasons == ()
+    assert rig.speed == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("code", [0, 2, 7, 19])
+def test_a_scan_without_any_range_is_blind_whatever_its_codes(code):
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((*ALL, code),)
+    rig.tick(40)
+    assert rig.speed == 0.0
+    assert Reason.SCAN_STALE in rig.out.reasons
+    measured = {figure.name: figure.value for figure in rig.trips[0].causes[0].measurements}
+    assert measured["beams with a range"] == 0.0
+
+
+def test_a_blind_truck_cannot_be_armed():
+    rig = Rig()
+    rig.unknown = ((*ALL, 19),)
+    rig.tick(3)
+    assert rig.order(Order.ARM) is Reason.SCAN_STALE
+
+
+def test_open_ground_has_to_be_configured():
+    rig = Rig(obstacle={"open_ground": True}).driving(speed=0.2)
+    rig.unknown = ((*ALL, 0),)
+    rig.tick(50)
+    assert rig.speed == pytest.approx(0.2)
+    rig.unknown = ((*ALL, 7),)
+    rig.tick(50)
+    assert rig.speed == 0.0
+
+
+@pytest.mark.parametrize("covered", [(0.0, 120.0), (-119.0, 0.0), (-30.0, 30.0), (-6.0, 6.0)])
+def test_a_covered_part_ahead_stops_but_leaves_the_way_back(covered):
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((*covered, 6),)
+    rig.tick(30)
+    assert rig.speed == 0.0
+    assert Reason.LIDAR_BLIND in rig.out.reasons
+    rig.driver = {"speed": -0.1}
+    rig.tick(40)
+    assert rig.speed == pytest.approx(-0.1)
+
+
+def test_what_is_covered_aside_of_the_way_does_not_matter():
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((100.0, 119.0, 6),)
+    rig.tick(30)
+    assert rig.speed == pytest.approx(0.2)
+
+
+def test_one_scan_that_does_not_see_slows_and_does_not_stop():
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((-20.0, 20.0, 10),)
+    rig.tick(5)
+    assert 0.1 <= rig.speed < 0.2
+    rig.unknown = ()
+    rig.tick(30)
+    assert rig.speed == pytest.approx(0.2)
+    assert not rig.trips
+
+
+def test_an_obstacle_stays_where_it_was_seen_while_its_sector_is_not_seen():
+    rig = Rig().driving(speed=0.2)
+    rig.obstacles = tuple((0.40, y) for y in np.linspace(-0.1, 0.1, 9))
+    rig.tick(3)
+    slow = rig.out.speed_limit
+    rig.unknown = ((-40.0, 40.0, 18),)
+    rig.tick()
+    assert rig.out.speed_limit <= slow
+
+
+def test_a_hand_before_the_window_is_no_view():
+    """Its ranges end within the body."""
+    message = scan(SECOND, *((0.14 + 0.04 * math.cos(a), 0.04 * math.sin(a)) for a in np.linspace(-1.0, 1.0, 500)))
+    assert not seen(message).all()
+
+
+def test_few_failed_beams_are_a_view():
+    """A recorded URG-04LX fails on two to five beams of a hundred."""
+    message = scan(SECOND, unknown=tuple((angle, angle + 1.0, 7) for angle in range(-60, 60, 5)))
+    assert seen(message).all()
+
+
+def test_sectors_of_travel_are_those_of_the_ground_it_takes():
+    visibility = Visibility(Footprint(), MOUNT, 0.5)
+    visibility.observe(message := scan(SECOND), scan_points(message, MOUNT))
+    ahead, left = visibility.travelled(AHEAD), visibility.travelled(LEFT)
+    middle = SECTORS // 2
+    assert {middle - 1, middle} <= set(ahead)
+    assert {middle - 9, middle + 8}.isdisjoint(ahead)
+    assert max(left) > max(ahead)
+    back = visibility.travelled(swept_poses((-1.0, 0.0, 0.0), np.linspace(0.0, 0.4, 20)))
+    assert len(visibility.last_seen(back)) < len(back)
+
+
+def test_the_mode_stays_driving_and_goes_on_when_the_lidar_sees_again():
+    rig = Rig().driving(speed=0.2)
+    rig.unknown = ((-30.0, 30.0, 6),)
+    rig.tick(30)
+    assert rig.out.mode is GateMode.DRIVING
+    rig.unknown = ()
+    rig.tick(40)
+    assert rig.speed == pytest.approx(0.2)
