@@ -116,6 +116,10 @@ WEAKER_ABOVE: Final = (
     "turning.speed",
     "battery_low_speed",
     "obstacle.deceleration",
+    "obstacle.unseen_speed",
+    "blocked.within",
+    "blocked.speed",
+    "short_faults",
 )
 """Settings of the gate that are weaker the greater they are."""
 
@@ -127,6 +131,9 @@ WEAKER_BELOW: Final = (
     "obstacle.ahead",
     "obstacle.side_clearance",
     "obstacle.crawl",
+    "obstacle.seen",
+    "blocked.share",
+    "short_faults_within",
 )
 """Settings of the gate that are weaker the less they are."""
 
@@ -150,6 +157,10 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     ]
     if config.turning is None:
         texts.append("gate.turning null: servos without supply are not noticed")
+    if config.blocked is None:
+        texts.append("gate.blocked null: a blocked shaft is not noticed")
+    if config.obstacle.open_ground:
+        texts.append("gate.obstacle.open_ground true: a scan without any range counts as free ground")
     if more := sorted(set(config.tolerated_failures) - set(default.tolerated_failures)):
         texts.append(f"gate.tolerated_failures: {', '.join(more)} may fail while the truck drives")
     if config.remote_trackers:
