@@ -14,7 +14,7 @@ BODY = BodyLimits(length=0.47, mass=7.25, pull=25.0, motor_speed=0.2196, sight=3
 STRONG = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=3.9)
 NOT_LIMITS = {
     "leases", "remote_trackers", "scan", "drive", "steering", "attitude", "battery", "tolerated_failures", "tilt",
-    "turning", "obstacle", "event_interval", "steering_rate",
+    "turning", "blocked", "obstacle", "event_interval", "steering_rate",
 }  # fmt: skip
 """Sections, what is judged apart, and what makes nothing less safe."""
 
