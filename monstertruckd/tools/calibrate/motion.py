@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, Truc
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
-from monstertruck_schemas.cmd import SteeringCommand
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
@@ -76,9 +76,11 @@ class Mover:
             self._truck.subscribe(topics.STEERING, fifo(DEPTH)) as steering,
             self._truck.subscribe(topics.COMPASS, fifo(DEPTH)) as attitude,
             self._truck.subscribe(topics.GATE, fifo(DEPTH)) as gate,
-            self._truck.subscribe(topics.CMD_STEERING, fifo(DEPTH)) as commands,
+            self._truck.subscribe(topics.CMD_STEERING, fifo(DEPTH)) as steering_commands,
+            self._truck.subscribe(topics.CMD_DRIVE, fifo(DEPTH)) as drive_commands,
         ):
-            run = _Run(self._truck, self._clock, (drive, steering, attitude, gate, commands))
+            feeds = drive, steering, attitude, gate, steering_commands, drive_commands
+            run = _Run(self._truck, self._clock, feeds)
             async with self._armed(run):
                 if move.approach:
                     await run.hold(0.0, move.approach, move.approach, STEERING)
@@ -132,6 +134,7 @@ class _Run:
             Mailbox[Attitude],
             Mailbox[GateState],
             Mailbox[SteeringCommand],
+            Mailbox[DriveCommand],
         ],
     ) -> None:
         self.track = MoveRecord()
@@ -234,8 +237,9 @@ class _Run:
         self.track.arrived = still
 
     def _take(self) -> None:
-        drive, steering, attitude, gate, commands = self._feeds
-        self.track.commands += commands.drain()
+        drive, steering, attitude, gate, steering_commands, drive_commands = self._feeds
+        self.track.steering_commands += steering_commands.drain()
+        self.track.drive_commands += drive_commands.drain()
         self.track.drive += drive.drain()
         self.track.steering += [reading for reading in steering.drain() if reading.trusted]
         self.track.attitude += [reading for reading in attitude.drain() if not reading.heading_disturbed]

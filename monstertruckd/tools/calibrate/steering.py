@@ -16,10 +16,10 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.response import estimates, response, weaves
 from monstertruckd.tools.calibrate.statistics import NORMAL
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
+from monstertruckd.tools.calibrate.weave import estimates, response, weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
 ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"

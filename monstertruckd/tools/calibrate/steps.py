@@ -13,7 +13,7 @@ from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.cmd import SteeringCommand
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.topics import Topic
 
@@ -28,8 +28,10 @@ class MoveRecord:
 
     drive: list[DriveFeedback] = field(default_factory=list)
     steering: list[SteeringFeedback] = field(default_factory=list)
-    commands: list[SteeringCommand] = field(default_factory=list)
+    steering_commands: list[SteeringCommand] = field(default_factory=list)
     """What the gate sent to the servos"""
+    drive_commands: list[DriveCommand] = field(default_factory=list)
+    """And to the drive"""
     attitude: list[Attitude] = field(default_factory=list)
     left: int = 0
     """When the command to set off was given, ns"""

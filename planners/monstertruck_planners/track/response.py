@@ -43,7 +43,7 @@ CORRELATED: Final = 3.0
 TELLING: Final = 0.001
 """Turns whose predictions differ by less than this say nothing, rad."""
 MEMORY: Final = 150.0
-"""Telling turns that are remembered while driving."""
+"""Telling turns after which the older ones count for a third."""
 
 
 class Response(NamedTuple):
@@ -79,18 +79,15 @@ class ResponseEstimator:
     Args:
         geometry: the truck's.
         rate: greatest turning rate of the axles, rad/s.
-        lags: candidates, s.
-        memory: telling turns after which the older ones count for a third.
     """
 
-    def __init__(self, geometry: FourWheelSteering, rate: float, lags: Array = LAGS, memory: float = MEMORY) -> None:
+    def __init__(self, geometry: FourWheelSteering, rate: float) -> None:
         self._geometry = geometry
-        self._fade = 1.0 - 1.0 / memory
         self._rate = rate
-        dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(CELL * np.arange(DEAD_TIMES), lags[:, None]))
+        dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(CELL * np.arange(DEAD_TIMES), LAGS[:, None]))
         totals = dead_times + by_lag
         self._prior = 0.5 * ((totals - EXPECTED[0]) / EXPECTED[1]) ** 2
-        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in lags.tolist()]
+        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
         self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
         """Of the candidates; weighted and summed up they are the estimate's moments."""
         self._by_x: Array = np.zeros((3, len(totals)))
@@ -184,7 +181,7 @@ class ResponseEstimator:
         return np.ravel(low + (cells - i) * (high - low))
 
     def _learn(self, x: Array, y: float, way: float) -> None:
-        fade, products = self._fade, self._products
+        fade, products = 1.0 - 1.0 / MEMORY, self._products
         np.multiply(x, x, out=products[0])
         np.multiply(x, y, out=products[1])
         np.multiply(x, way, out=products[2])

@@ -1,0 +1,126 @@
+"""Dead time and lag of the steering, from a weaving truck: what the gate commanded, and how the compass turned.
+
+The integral of the lagged curvature, times the speed, is the turn that the compass should see. Each weave has its own
+gain (the linkage may turn less than it should) and trim (the axles may be off centre).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+
+from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.calibration import STEERING, Estimate
+from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+
+WEAVE: Final = (0.3, 0.3, 0.3, 0.3, 1.2)
+"""Seconds between changes of side: many changes tell the lag, and a long arc tells the gain, which a lag resembles
+where changes follow each other evenly."""
+SPEED: Final = 0.15
+ANGLE: Final = 0.12
+"""Small, so that the curvature is about linear in it."""
+ROUNDED: Final = 1.5e-4
+"""Square of the lag, s^2, that a curvature looks like which is 2 % from linear in the angles."""
+METRES: Final = 1.8
+LEAST: Final = 60
+"""Turns that dead time and lag have to rest on."""
+BASE: Final = 0.3
+"""Seconds between two headings that are compared, about as long as the steering keeps to one side."""
+STEADY: Final = 0.9
+"""Share of the greatest speed from which on a truck neither sets off nor stops."""
+HALF_FRAME: Final = 0.010
+"""Half the period of the servo pulses, s. How long a command waits for the next pulse is constant while the daemon
+runs, and another time after each start: nothing between 0 and a period can be excluded."""
+
+
+def weaves(rounds: int) -> list[MoveStep]:
+    """Forward and back, in turn."""
+    return [
+        MoveStep(f"weaving {way}", sign * SPEED, ANGLE, -ANGLE, METRES, weave=WEAVE)
+        for _ in range(rounds)
+        for sign, way in ((1, "ahead"), (-1, "back"))
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Weave:
+    """One weaving move, ready for the fit."""
+
+    curvature: Steps
+    """Commanded, 1/m."""
+    times: Array
+    """Of the headings, s; (n,)."""
+    ways: Array
+    """Rolled until then, m; (n,)."""
+    stride: int
+    """Headings from one to the one it is compared with."""
+    turns: Array
+    """Measured between those, rad; (n - stride,)."""
+
+    @classmethod
+    def of(cls, record: MoveRecord, chassis: TruckChassis) -> Self | None:
+        """From what was read while the truck was at speed; None where that is too little to compare headings."""
+        times = np.array([reading.stamp for reading in record.drive]) / SECOND
+        speeds = np.abs([reading.velocity for reading in record.drive])
+        steady = times[speeds >= STEADY * speeds.max(initial=0.0)]
+        if not (record.steering_commands and steady.size):
+            return None
+        seen = [reading for reading in record.attitude if steady[0] <= reading.stamp / SECOND <= steady[-1]]
+        at = np.array([reading.stamp for reading in seen]) / SECOND
+        stride = max(round(BASE * (at.size - 1) / float(at[-1] - at[0])), 1) if at.size > 1 else 1
+        if at.size <= stride:
+            return None
+        yaws = -np.unwrap([reading.heading for reading in seen])
+        rolled = chassis.drivetrain.distance(np.array([reading.position for reading in record.drive]))
+        sent = np.array([(command.stamp / SECOND, command.front, command.rear) for command in record.steering_commands])
+        curvatures = chassis.bicycle.body_twist(np.ones(len(sent)), sent[:, 1], sent[:, 2])[2]
+        return cls(
+            curvature=Steps.of(sent[:, 0], np.asarray(curvatures)),
+            times=at,
+            ways=np.interp(at, times, rolled),
+            stride=stride,
+            turns=yaws[stride:] - yaws[:-stride],
+        )
+
+    def residuals(self, delay: float, squared: float) -> Array:
+        """Turns that remain unexplained, rad, whatever gain and trim are; arguments as ``Steps.integral``."""
+        turned = np.diff(self.curvature.integral(self.times, delay, squared)) / np.diff(self.times) * np.diff(self.ways)
+        predicted = np.append(0.0, np.cumsum(turned))
+        return unexplained(
+            self.turns, *(series[self.stride :] - series[: -self.stride] for series in (predicted, self.ways))
+        )
+
+
+def response(records: Iterable[MoveRecord], chassis: TruckChassis) -> ResponseFit:
+    """Dead time and lag of the axles behind the commands.
+
+    Raises:
+        InputError: too few turns were seen.
+    """
+    seen = [weave for record in records if (weave := Weave.of(record, chassis)) is not None]
+    samples = sum(weave.turns.size for weave in seen)
+    if samples < LEAST:
+        raise InputError(f"only {samples} turns tell dead time and lag: expected {LEAST}")
+
+    def residuals(delay: float, squared: float) -> Array:
+        return np.concatenate([weave.residuals(delay, squared) for weave in seen])
+
+    return ResponseFit.of(residuals, HALF_FRAME, ROUNDED)
+
+
+def estimates(found: ResponseFit) -> list[Estimate]:
+    """What is saved of it."""
+    meanings = (
+        "from a command to the first movement of the wheels",
+        "time constant of the turning wheels",
+        "dead time and lag together",
+    )
+    covers = (
+        f"95 % of the compass's noise, a linkage 2 % from linear, and {2000 * HALF_FRAME:g} ms of waiting for a pulse"
+    )
+    return found.estimates(meanings, covers, key=STEERING)
