@@ -1,0 +1,71 @@
+"""Inside the booted system: the emulated truck behind /dev/truck, and what passes its drive's wire.
+
+    python emulated.py CONFIG LINES
+
+``LINES`` gets one JSON object a line, instants in s of CLOCK_MONOTONIC: ``{"t", "to_device", "hex"}`` for what passes
+the drive's cable, ``{"t", "v"}`` for the true speed in m/s, 20 times a second.
+"""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import TextIO
+
+from monstertruck_drivers.cable import PtyPort
+from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruckd.tools.simulation import simulate
+from monstertruckd.tools.simulation.config import load_simulated
+
+
+def main(config: Path, lines: Path) -> None:
+    """Serve until SIGTERM."""
+    with lines.open("a", buffering=1) as out:
+
+        async def serve(clock: Clock) -> None:
+            simulate.PtyPort = lambda path: tapped(path, clock, out)
+            simulate.TruthLog = lambda world, _: Speeds(world, clock, out)
+            await simulate.serve(clock, load_simulated(config), None)
+
+        run_wall(serve)
+
+
+def tapped(path: Path, clock: Clock, out: TextIO) -> PtyPort:
+    """A port that the group of the serial devices may open, as udev leaves it; the drive's traffic is written down."""
+    port = PtyPort(path)
+    plug = port.plug
+
+    def plug_for_all() -> None:
+        plug()
+        shutil.chown(path.resolve(), group="dialout")
+        path.resolve().chmod(0o660)
+
+    def write(to_device: bool, data: bytes) -> None:
+        json.dump({"t": clock.now() / SECOND, "to_device": to_device, "hex": data.hex()}, out)
+        out.write("\n")
+
+    port.plug = plug_for_all
+    if path.name == "drive":
+        port.device.on_bytes = write
+    return port
+
+
+class Speeds(simulate.TruthLog):
+    """Writes the true speed down."""
+
+    def __init__(self, world: simulate.World, clock: Clock, out: TextIO) -> None:
+        super().__init__(world, clock)
+        self.out = out
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        while True:
+            now = self._clock.now()
+            json.dump({"t": now / SECOND, "v": self._world.truth(now).v}, self.out)
+            self.out.write("\n")
+            await self._clock.sleep(0.05)
+
+
+if __name__ == "__main__":
+    Path("/dev/truck").mkdir(exist_ok=True)
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
