@@ -20,6 +20,7 @@ from monstertruckd.tools.cli import (
     plan,
     replay,
     robot,
+    security,
     service,
     usb,
 )
@@ -81,6 +82,7 @@ app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 app.add_typer(maps.app, name="map")
+app.add_typer(security.app, name="security")
 
 
 def main() -> None:

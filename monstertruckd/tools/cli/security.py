@@ -1,0 +1,148 @@
+"""Commands on certificates: who may connect to a robot, and what each may do there."""
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import AccessRole, Role
+from monstertruckd.tools.cli.options import RobotOption
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.security.folder import Folder
+
+app = command_group("Certificates: an authority, who may connect to the robot, and what each may do there.")
+
+FolderOption = Annotated[
+    Path, typer.Option("--folder", "-f", help="Folder of the authority; keep it off the robot.", show_default=False)
+]
+HERE = Path("security")
+NameArgument = Annotated[str, typer.Argument(help="Name of the station: letters, digits and . _ - @.")]
+RESTART = (
+    "Takes effect once these files are on the robot and its daemon was restarted; restart it while the truck stands."
+)
+
+
+@app.command("init")
+def init(
+    robot: RobotOption = "truck",
+    address: Annotated[
+        list[str] | None,
+        typer.Option("--address", "-a", help="Address or host name that stations dial; repeatable."),
+    ] = None,
+    place: Annotated[Path | None, typer.Option(help="Where the robot keeps its files.")] = None,
+    days: Annotated[int, typer.Option(min=1, help="Until the robot's certificate expires.")] = 825,
+    folder: FolderOption = HERE,
+) -> None:
+    """Make an authority and the robot's certificate and configuration; again: renew the robot's certificate."""
+    from monstertruckd.tools.security.folder import PLACE
+
+    kept = _folder(folder)
+    new = kept.init(robot, tuple(address or ("localhost", "127.0.0.1")), place or PLACE, _now(), days)
+    print(f"{'authority made' if new else 'certificate of the robot renewed'} in {folder}")
+    _say_robot(kept)
+    if new:
+        remark("Next: monstertruckd security add NAME --role pilot")
+
+
+@app.command("add")
+def add(
+    name: NameArgument,
+    role: Annotated[AccessRole, typer.Option(help="What it may do.")] = AccessRole.PILOT,
+    rank: Annotated[
+        Role, typer.Option(help="Highest priority it may claim: gamepad, keyboard or station.")
+    ] = Role.STATION,
+    days: Annotated[int, typer.Option(min=1, help="Until its certificate expires.")] = 365,
+    folder: FolderOption = HERE,
+) -> None:
+    """Certify a station; again: renew its certificate."""
+    kept = _folder(folder)
+    changed = kept.add(name, role, rank, _now(), days)
+    target = kept.path / "stations" / name
+    print(f"{name}: {role.value}, rank {rank.value}, {days} days; its files: {target}")
+    remark(f"To the station, into ~/.config/monstertruckd/tls: {shlex.quote(str(target))}/*")
+    if changed:
+        _say_robot(kept)
+    else:
+        remark("The robot needs nothing: it knows the issuer.")
+
+
+@app.command("show")
+def show(folder: FolderOption = HERE, json_output: JsonOption = False) -> None:
+    """Everything that is certified, with the days until it expires. Ends with code 12 if something has expired."""
+    rows = _folder(folder).certificates(_now())
+    if json_output:
+        print_json([{"name": r.name, "role": r.role, "rank": r.rank, "days": r.days} for r in rows])
+    else:
+        cells = [(row.name, row.role, row.rank, str(row.days)) for row in rows]
+        print_table(("name", "role", "rank", "days left"), cells, right=("days left",))
+    expired = [row.name for row in rows if row.days < 0]
+    finish(Reason.NOT_PERMITTED if expired else Reason.OK, f"expired: {', '.join(expired)}")
+
+
+@app.command("revoke")
+def revoke(name: NameArgument, folder: FolderOption = HERE) -> None:
+    """Forget a station: after the robot's next start its certificate opens no link."""
+    kept = _folder(folder)
+    kept.revoke(name)
+    print(f"{name} revoked")
+    _say_robot(kept)
+
+
+@app.command("rules")
+def rules(folder: FolderOption = HERE) -> None:
+    """Print the access rules that follow for each of the robot's Zenoh sessions, as Zenoh reads them."""
+    from monstertruckd.bus.access import access_rules
+    from monstertruckd.bus.zenoh_config import doors
+
+    kept = _folder(folder)
+    robot = kept.register().robot
+    print_json(
+        [{"listen": door.listen, "access_control": access_rules(robot, door.grants)} for door in doors(kept.zenoh())]
+    )
+
+
+@app.command("check")
+def check(
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Of the running robot: tls/HOST:PORT.")],
+    folder: FolderOption = HERE,
+    json_output: JsonOption = False,
+) -> None:
+    """Try a running robot as pilot, observer, under another name, as strangers, without TLS, with what expires.
+
+    Nothing moves. Ends with code 12 if one of them gets more or less than it should.
+    """
+    from monstertruck_runtime.clock import run_wall
+    from monstertruckd.tools.security.check import check as tried
+
+    cases = run_wall(lambda clock: tried(_folder(folder), endpoint, clock))
+    if json_output:
+        print_json([{"who": c.who, "expected": c.expected, "found": c.found, "met": c.met} for c in cases])
+    else:
+        print_table(
+            ("who", "found", ""), [(c.who, c.found, "ok" if c.met else f"expected {c.expected}") for c in cases]
+        )
+    failed = [case.who for case in cases if not case.met]
+    finish(Reason.NOT_PERMITTED if failed else Reason.OK, f"not as it should be: {', '.join(failed)}")
+
+
+def _folder(path: Path) -> "Folder":
+    from monstertruckd.tools.security.folder import Folder
+
+    return Folder(path)
+
+
+def _now() -> int:
+    from monstertruck_runtime.clock import SECOND, WallClock
+
+    clock = WallClock()
+    return (clock.now() + clock.real_offset()) // SECOND
+
+
+def _say_robot(folder: "Folder") -> None:
+    place = folder.register().place
+    remark(f"To the robot, into {place} (robot.key readable by its daemon alone): {shlex.quote(str(folder.robot))}/*")
+    remark(f"The robot's configuration has `include: {place}/zenoh.yaml`. {RESTART}")

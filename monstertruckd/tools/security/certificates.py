@@ -1,0 +1,188 @@
+"""X.509 certificates of P-256 keys (RFC 5280, RFC 5480): authorities, and what they issue.
+
+Every station has an issuer of its own, certified by the authority. A robot that trusts the issuers of its stations,
+and not the authority, lets in nobody else at all: another certificate of the authority does not even open a link.
+"""
+
+import ipaddress
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import replace_file
+
+DAY: Final = 86_400
+EARLY: Final = 300
+"""Seconds by which a certificate begins before now: computers without a clock of their own run late."""
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """A certificate with its key."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @property
+    def pem(self) -> bytes:
+        """The certificate as PEM."""
+        return self.certificate.public_bytes(serialization.Encoding.PEM)
+
+    @property
+    def key_pem(self) -> bytes:
+        """The key as PEM, not encrypted: who reads the file has it."""
+        return self.key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+
+    def save(self, certificate: Path, key: Path, *chain: bytes) -> None:
+        """Write both files, the certificate followed by those of its issuers.
+
+        Raises:
+            OSError: one cannot be written.
+        """
+        replace_file(key, self.key_pem, 0o600)
+        replace_file(certificate, b"".join((self.pem, *chain)))
+
+
+def load(certificate: Path, key: Path) -> Certificate:
+    """Read both files.
+
+    Raises:
+        InputError: one is not there, or no certificate or key of this kind.
+    """
+    loaded = read_certificate(certificate)
+    try:
+        private = serialization.load_pem_private_key(key.read_bytes(), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{key}: expected a private key: {error}") from None
+    if not isinstance(private, ec.EllipticCurvePrivateKey):
+        raise InputError(f"{key}: expected a key of an elliptic curve")
+    return Certificate(loaded, private)
+
+
+def read_certificate(path: Path) -> x509.Certificate:
+    """The first certificate of a file.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a certificate: {error}") from None
+
+
+def seconds_left(certificate: x509.Certificate, now: int) -> int:
+    """Seconds until a certificate expires.
+
+    Args:
+        certificate: which.
+        now: real time, s.
+    """
+    return round(certificate.not_valid_after_utc.timestamp()) - now
+
+
+def new_authority(name: str, now: int, days: int) -> Certificate:
+    """A self-signed authority.
+
+    Args:
+        name: common name.
+        now: real time, s.
+        days: until it expires.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = _name(name)
+    return Certificate(_authority(_builder(subject, subject, key, now, days * DAY), key, None), key)
+
+
+def new_issuer(authority: Certificate, name: str, now: int, days: int) -> Certificate:
+    """An authority below ``authority`` that certifies nothing but end entities."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = _builder(_name(name), authority.certificate.subject, key, now, days * DAY)
+    return Certificate(_authority(builder, authority.key, 0), key)
+
+
+def issue(issuer: Certificate, name: str, now: int, seconds: int, *, server: Sequence[str] = ()) -> Certificate:
+    """A certificate of a station, or of a robot that others dial.
+
+    Args:
+        issuer: who signs it.
+        name: common name.
+        now: real time, s.
+        seconds: until it expires.
+        server: addresses and host names that stations dial; none for a station.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if server else [])]
+    names = [_general_name(address) for address in server or (name,)]
+    builder = (
+        _builder(_name(name), issuer.certificate.subject, key, now, seconds)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(digital_signature=True), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+    )
+    return Certificate(builder.sign(issuer.key, hashes.SHA256()), key)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: int, seconds: int
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(_date(now - EARLY))
+        .not_valid_after(_date(now + seconds))
+    )
+
+
+def _authority(
+    builder: x509.CertificateBuilder, key: ec.EllipticCurvePrivateKey, below: int | None
+) -> x509.Certificate:
+    return (
+        builder.add_extension(x509.BasicConstraints(ca=True, path_length=below), critical=True)
+        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+
+
+def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_sign: bool = False) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=digital_signature,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=key_cert_sign,
+        crl_sign=crl_sign,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _general_name(address: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(address))
+    except ValueError:
+        return x509.DNSName(address)
+
+
+def _date(seconds: int) -> Any:
+    """UTC as the library wants it."""
+    return np.datetime64(seconds, "s").item()
