@@ -1,11 +1,12 @@
 """Edits of YAML text in place: whatever is not named stays as it is, comments too. Pure."""
 
 import json
+import stat
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.composer import Composer, ComposerError, MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
@@ -16,12 +17,29 @@ MOST_BYTES: Final = 1_000_000
 """Of one file."""
 DEEPEST: Final = 50
 """Sections and lists within each other."""
+MOST_NODES: Final = 10_000
+"""Keys and values of one file as they are written: read in half a second; a full configuration has a thousand."""
+
+
+class _BoundedComposer(Composer):
+    """Builds the nodes of one document, until there are too many."""
+
+    count = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node with all below it."""
+        self.count += 1
+        if self.count > MOST_NODES:
+            place = self.parser.peek_event().start_mark
+            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
+        return super().compose_node(parent, index)
 
 
 def reader() -> YAML:
     """Reads one document of plain data."""
     yaml = YAML(typ="safe", pure=True)
     yaml.max_depth = DEEPEST
+    yaml.Composer = _BoundedComposer
     return yaml
 
 
@@ -84,7 +102,10 @@ class YamlText:
             ConfigError: it cannot be read, is longer than ``MOST_BYTES``, or is refused as above.
         """
         try:
-            if (size := path.stat().st_size) > MOST_BYTES:
+            status = path.stat()
+            if stat.S_ISFIFO(status.st_mode) or stat.S_ISCHR(status.st_mode):
+                raise ConfigError(f"{path}: cannot be read: not a file of text")
+            if (size := status.st_size) > MOST_BYTES:
                 raise ConfigError(f"{path}:1: {size} bytes: expected a configuration of at most {MOST_BYTES}")
             return cls(path.read_text(encoding="utf-8"), path)
         except (OSError, UnicodeDecodeError) as error:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -31,6 +31,8 @@ T = TypeVar("T", bound=TruckConfig)
 
 MOST_VALUES = 20_000
 """Of one file; a full configuration has a few hundred."""
+MOST_MISTAKES = 50
+"""Named at once."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -149,35 +151,39 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: 
         if not target.is_file():
             raise ConfigError(f"{where}: include: no such file: {target}")
         tree = _load(target, (*including, path.resolve()), version)
-        _merge(merged, tree, ())
+        _merge(merged, tree)
         merged.files += [] if Path(name).is_absolute() else tree.files
-    _merge(merged, own, ())
+    _merge(merged, own)
     merged.origins = {key: origin for key, origin in merged.origins.items() if key[:1] != ("include",)}
     return merged
 
 
-def _merge(base: Tree, top: Tree, prefix: Key) -> None:
-    below, above = _at(base.data, prefix), _at(top.data, prefix)
+def _merge(base: Tree, top: Tree) -> None:
+    """Lay ``top`` over ``base``, values and origins."""
+    replaced: set[Key] = set()
+    _merge_values(base.data, top.data, (), replaced)
+    kept = (
+        (key, origin)
+        for key, origin in base.origins.items()
+        if replaced.isdisjoint(key[:length] for length in range(1, len(key) + 1))
+    )
+    base.origins = dict(kept) | {key: origin for key, origin in top.origins.items() if key}
+
+
+def _merge_values(below: dict[str, Any], above: dict[str, Any], prefix: Key, replaced: set[Key]) -> None:
+    """Collects in ``replaced`` the keys whose whole value comes from ``above``."""
     for name, value in above.items():
         key = (*prefix, name)
         if isinstance(value, dict) and isinstance(below.get(name), dict) and not _other_kind(below[name], value):
-            _merge(base, top, key)
+            _merge_values(below[name], value, key, replaced)
         else:
             below[name] = value
-            base.origins = {k: o for k, o in base.origins.items() if k[: len(key)] != key}
-            base.origins |= {k: o for k, o in top.origins.items() if k[: len(key)] == key}
-        base.origins[key] = top.origins[key]
+            replaced.add(key)
 
 
 def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
     """Whether ``above`` chooses another ``kind``, so that the keys of the one ``below`` mean nothing to it."""
     return "kind" in above and above["kind"] != below.get("kind", above["kind"])
-
-
-def _at(data: Any, key: Key) -> dict[str, Any]:
-    for part in key:
-        data = data[part]
-    return cast("dict[str, Any]", data)
 
 
 @dataclass(slots=True)
@@ -272,11 +278,14 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
 
 
 def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:
-    for detail in error.errors(include_url=False):
+    details = error.errors(include_url=False)
+    for detail in details[:MOST_MISTAKES]:
         key = _data_key(tree.data, detail["loc"])
         origin = tree.origin(key) or f"{path}:1"
         dotted = ".".join(map(str, key)) or "configuration"
         yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
+    if more := details[MOST_MISTAKES:]:
+        yield f"{path}: {len(more)} more mistakes"
 
 
 def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:

@@ -180,13 +180,15 @@ class TruckConfig(Schema):
     def weakened(self) -> tuple[str, ...]:
         """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
         usual = EposConfig()
-        return weakened(self.gate) + tuple(
+        drives = tuple(
             f"devices.{role}.driver.{name} {value:g}, default {default:g}"
             for role, device in self.devices.shafts().items()
             if isinstance(device.driver, EposConfig)
             for name in ("command_timeout", "quick_stop_after")
             if (value := getattr(device.driver, name)) > (default := getattr(usual, name))
         )
+        opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
+        return (*weakened(self.gate), *drives, *opened)
 
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""

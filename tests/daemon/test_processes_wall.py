@@ -39,6 +39,16 @@ def metres_after(truth: np.ndarray, instant: float) -> float:
     return float(np.hypot(*np.diff(later[:, 1:3], axis=0).T).sum())
 
 
+@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.8, 1.5])
+async def test_sigterm_during_the_start_is_an_ordinary_end(seconds: float, tmp_path: Path):
+    config = ROOT / "configs" / "emulated.yaml"
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "monstertruckd", "run", "-c", str(config), cwd=tmp_path, stderr=subprocess.DEVNULL
+    )
+    await asyncio.sleep(seconds)
+    assert await end(daemon) == 0
+
+
 async def test_sigterm_stops_the_truck_first_and_closes_the_log(tmp_path: Path):
     async with robot(tmp_path) as truck:
         await truck.start_simulator()

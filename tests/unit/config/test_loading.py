@@ -1,5 +1,6 @@
 """YAML with origins: merging, and one clear line for every mistake."""
 
+import os
 from pathlib import Path
 from time import process_time
 from typing import Annotated, ClassVar, Literal
@@ -115,8 +116,14 @@ BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(
         ("version: 2\nname:\n  " + "[" * 5000, 3, "nested more than 50 times"),
         ("version: 2\nname:\n" + "".join(f"{' ' * n}a:\n" for n in range(1, 900)), 51, "nested more than 50 times"),
         ("name: " + "x" * 50_000_000, 1, "50000006 bytes: expected a configuration of at most 1000000"),
+        (
+            "version: 2\n" + "".join(f"k{n}: &a{n} {n}\n" for n in range(19_000)),
+            5000,
+            "more than 10000 keys and values",
+        ),
+        ("version: 2\nname: [" + "1," * 200_000 + "1]", 2, "more than 10000 keys and values"),
     ],
-    ids=["cycle", "deep cycle", "bomb", "YAML 1.1", "NUL", "flow", "block", "size"],
+    ids=["cycle", "deep cycle", "bomb", "YAML 1.1", "NUL", "flow", "block", "size", "keys", "list"],
 )
 def test_hostile_text_is_one_clear_line_within_a_second(tmp_path: Path, text: str, line: int, expected: str):
     file = write(tmp_path, text)
@@ -127,6 +134,24 @@ def test_hostile_text_is_one_clear_line_within_a_second(tmp_path: Path, text: st
     assert str(caught.value).startswith(f"{file}:{line}: ")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_no_file(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for name in (tmp_path / "pipe.yaml", Path("/dev/zero")):
+        with pytest.raises(ConfigError, match="not a file of text"):
+            load_config(name, Root)
+
+
+def test_of_many_mistakes_the_first_are_named(tmp_path: Path):
+    file = write(tmp_path, "version: 2\nname: t\n" + "".join(f"k{n}: {n}\n" for n in range(4000)))
+    begin = process_time()
+    with pytest.raises(ConfigError) as caught:
+        load_config(file, Root)
+    assert process_time() - begin < 1
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 51
+    assert lines[-1].endswith("more mistakes")
 
 
 def test_yaml_1_2_may_be_declared_and_values_repeated(tmp_path: Path):

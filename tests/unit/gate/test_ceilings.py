@@ -136,6 +136,10 @@ def test_a_truck_knows_its_limits_and_what_weakens_it():
     slow = drive.model_copy(update={"driver": drive.driver.model_copy(update={"command_timeout": 1.0})})
     devices = config.devices.model_copy(update={"drive": slow})
     weak = truck(scan={"stale_after": 0.5}).model_copy(update={"devices": devices})
+    opened = config.zenoh.model_copy(update={"listen": ("tcp/0.0.0.0:7447",), "insecure": True})
+    assert config.model_copy(update={"zenoh": opened}).weakened() == (
+        "zenoh.insecure: anybody who reaches tcp/0.0.0.0:7447 may drive",
+    )
     assert weak.weakened() == (
         "gate.scan.stale_after 0.5, default 0.25",
         "devices.drive.driver.command_timeout 1, default 0.25",
