@@ -34,7 +34,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, GoalRequest
+from monstertruck_schemas.req import GoalRequest
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final
 
-from monstertruck_schemas.req import AccessRole, ControlRequest, Order, Request, Role
+from monstertruck_schemas.req import ControlRequest, Order, Request, Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import KEY_ROOT, TOPICS, Writer, alive_key, rpc_key
 
 ANONYMOUS: Final = "anonymous"

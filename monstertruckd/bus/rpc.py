@@ -13,7 +13,8 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Handler
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.bus.access import Sender
 

@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 
 from monstertruck_runtime.endpoints import host_of, local_endpoint, protocol_of
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, owner_of
 
 HANG_UP_US: Final = 2_000_000

@@ -24,7 +24,8 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, Order
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import (
     CAMERA,
     KEY_ROOT,

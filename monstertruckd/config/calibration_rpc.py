@@ -13,7 +13,7 @@ from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, with_values

@@ -13,7 +13,8 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import RpcRegistry
 from monstertruck_runtime.requests import parse_request
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, ControlRequest, Order
+from monstertruck_schemas.req import ControlRequest, Order
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import GATE, REQ_CONTROL
 from monstertruckd.bus.local import Bus

@@ -7,7 +7,7 @@ from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import Topic, Writer
 
 M = TypeVar("M", bound=Message)

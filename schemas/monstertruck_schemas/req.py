@@ -25,22 +25,6 @@ class Role(StrEnum):
     TRACKER = "tracker"
 
 
-class AccessRole(StrEnum):
-    """What a source may ask for; each may do all that those before it may."""
-
-    OBSERVER = "observer"
-    """See everything, and order an emergency stop."""
-    PILOT = "pilot"
-    """Drive, give orders and goals."""
-    ENGINEER = "engineer"
-    """Change settings and calibration."""
-
-    def covers(self, needed: "AccessRole") -> bool:
-        """Whether this role may do what takes ``needed``."""
-        roles = list(AccessRole)
-        return roles.index(self) >= roles.index(needed)
-
-
 class Request(Message):
     """Header of every request."""
 

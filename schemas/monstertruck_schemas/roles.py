@@ -1,4 +1,4 @@
-"""Names of the devices that the rest of the robot knows by what they are for."""
+"""Roles of devices, by which the rest of the robot knows them, and of those who ask the robot for something."""
 
 from enum import StrEnum
 from typing import Final
@@ -26,3 +26,19 @@ class DeviceRole(StrEnum):
 
 SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
 """Controllers of the driven shafts, in the order of the body's shafts."""
+
+
+class AccessRole(StrEnum):
+    """What a source may ask for; each may do all that those before it may."""
+
+    OBSERVER = "observer"
+    """See everything, and order an emergency stop."""
+    PILOT = "pilot"
+    """Drive, give orders and goals."""
+    ENGINEER = "engineer"
+    """Change settings and calibration."""
+
+    def covers(self, needed: "AccessRole") -> bool:
+        """Whether this role may do what takes ``needed``."""
+        roles = list(AccessRole)
+        return roles.index(self) >= roles.index(needed)

@@ -2,12 +2,12 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruckd.tools.cli.options import RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, remark
 
@@ -53,16 +53,18 @@ def add(
     name: NameArgument,
     role: Annotated[AccessRole, typer.Option(help="What it may do.")] = AccessRole.PILOT,
     rank: Annotated[
-        Role, typer.Option(help="Highest priority it may claim: gamepad, keyboard or station.")
-    ] = Role.STATION,
+        Literal["gamepad", "keyboard", "station"], typer.Option(help="Highest priority it may claim.")
+    ] = "station",
     days: Annotated[int, typer.Option(min=1, help="Until its certificate expires.")] = 365,
     folder: FolderOption = HERE,
 ) -> None:
     """Certify a station; again: renew its certificate."""
+    from monstertruck_schemas.req import Role
+
     kept = _folder(folder)
-    changed = kept.add(name, role, rank, _now(), days)
+    changed = kept.add(name, role, Role(rank), _now(), days)
     target = kept.path / "stations" / name
-    print(f"{name}: {role.value}, rank {rank.value}, {days} days; its files: {target}")
+    print(f"{name}: {role.value}, rank {rank}, {days} days; its files: {target}")
     remark(f"To the station, into ~/.config/monstertruckd/tls: {shlex.quote(str(target))}/*")
     if changed:
         _say_robot(kept)

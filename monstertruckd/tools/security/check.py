@@ -19,7 +19,7 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.security.certificates import Certificate, issue, new_authority
 from monstertruckd.tools.security.folder import Folder

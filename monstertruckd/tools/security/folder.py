@@ -20,7 +20,8 @@ from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.zenoh_config import OwnerName, TlsConfig, ZenohConfig
 from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.security.certificates import (

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, in_groups, out_groups
 from monstertruckd.bus.zenoh_config import TlsConfig, ZenohConfig, doors, session_config

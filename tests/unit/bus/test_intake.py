@@ -15,7 +15,8 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender

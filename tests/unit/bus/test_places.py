@@ -9,7 +9,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.endpoints import nearest
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_schemas.req import AccessRole
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, Writer
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 from tests.unit.bus.test_zenoh_session import raw_session

@@ -8,7 +8,8 @@ import pytest
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.bus.access import EVERYTHING, Grant, Sender
 from monstertruckd.bus.rpc import Rpc, topic_rows

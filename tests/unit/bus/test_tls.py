@@ -11,7 +11,7 @@ import pytest
 from monstertruck_runtime.client import TLS_VARIABLE, ClientTls, TruckClient, station_tls
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_schemas.req import AccessRole
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot

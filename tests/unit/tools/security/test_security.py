@@ -10,7 +10,8 @@ from monstertruck_runtime.client import ClientTls, TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import AccessRole, Role
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, Writer
 from monstertruckd.config.load import load_tree
 from monstertruckd.tools.cli.main import app
