@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 
@@ -90,6 +90,8 @@ def _flags(parameter: Any) -> str:
 
 def _type(parameter: Any) -> str:
     kind = parameter.type_descriptor.annotation
+    if get_origin(kind) is Literal:
+        return "|".join(map(str, get_args(kind)))
     (kind,) = get_args(kind)[:1] or (kind,)
     if issubclass(kind, Enum):
         return "|".join(str(member.value) for member in kind)
