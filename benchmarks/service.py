@@ -63,7 +63,7 @@ OFF_GOALS = {"killed": 2.0, "process_frozen": 5.5, "loop_frozen": 5.5, "gate_fro
 STAND_GOALS = OFF_GOALS | {"gate_frozen": 1.0}
 """Seconds until the truck stands; without a gate the drive's own driver stops it."""
 READY_GOAL = 20.0
-"""Seconds from a death to the next READY."""
+"""Seconds from a death, or from systemd's start, to the next READY."""
 LEVELS = {name: PRIORITIES[level] for name, level in (("INFO", 20), ("WARNING", 30), ("ERROR", 40))}
 
 
@@ -336,9 +336,10 @@ def _edit(root: Path, name: str, before: str, after: str) -> None:
 
 def second_boot(bench: Bench) -> None:
     """After a power-on nobody does anything."""
-    began = monotonic()
     bench.holds("active_after_boot", until(bench.active, 60))
-    bench.figures["boot_to_ready_s"] = round(monotonic() - began, 2)
+    stamps = bench.machine.show("", "UserspaceTimestampMonotonic") | bench.show("ActiveEnterTimestampMonotonic")
+    began, ready = (int(stamps[f"{name}TimestampMonotonic"]) / 1e6 for name in ("Userspace", "ActiveEnter"))
+    bench.within("boot_to_ready_s", ready - began, READY_GOAL)
     bench.holds("drives_after_boot", bench.drive())
 
 

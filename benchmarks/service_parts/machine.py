@@ -151,8 +151,9 @@ class Machine:
         return done
 
     def show(self, unit: str, *names: str) -> dict[str, str]:
-        """Properties of a unit, by systemd."""
-        lines = self.run("systemctl", "show", f"--property={','.join(names)}", unit).stdout.splitlines()
+        """Properties of a unit, of systemd itself if that is "", by systemd."""
+        units = [unit] if unit else []
+        lines = self.run("systemctl", "show", f"--property={','.join(names)}", *units).stdout.splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
 
     def _up(self) -> bool:
