@@ -153,6 +153,14 @@ class TruckPlant:
             if end % STEP_NS == 0:
                 self._remember()
 
+    def carry(self, pose: Pose) -> None:
+        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
+        self._pose, self._twist, self._stuck_at = pose, (0.0, 0.0, 0.0), None
+        self._wheel_speeds = [0.0] * len(self.shafts)
+        self._attitude = self._tilt(self._elapsed, *pose)
+        self._trail.clear()
+        self._remember()
+
     def slot(self, time_ns: int, period_ns: int) -> int:
         """Number of the period since the start that an instant falls into: the index of its noise."""
         return max(0, time_ns - (self._start_ns or 0)) // period_ns

@@ -95,6 +95,17 @@ class World:
         """Put the lidar onto a mount with joints."""
         self._lidar.joints = joints
 
+    def carry(self, time_ns: int, pose: Pose) -> None:
+        """Put the truck down at another ``pose``: x, y (m) and yaw (rad) in the map frame.
+
+        Raises:
+            InputError: it would touch what is not free there.
+        """
+        if self._overlap(self.map.cells != FREE, pose) > 0 or self._depth(pose) > 0:
+            raise InputError(f"carry: the truck at {pose} touches what is not free")
+        self._plant.advance(time_ns)
+        self._plant.carry(pose)
+
     def add(self, time_ns: int, obstacle: Obstacle) -> None:
         """Put something into the world: seen by the lidar, stops the truck."""
         self._plant.advance(time_ns)

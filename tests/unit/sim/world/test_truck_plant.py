@@ -8,6 +8,7 @@ import pytest
 from monstertruck_kinematics.linkage import common_motion
 from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.battery import BatteryModel, rest_voltage
 from monstertruck_sim.world.config import (
     BatteryModelConfig,
@@ -323,3 +324,27 @@ def test_an_obstacle_put_beside_the_truck_is_felt_at_once(field):
 )
 def test_rest_voltage_is_straight_between_the_tables_points(charge, cell):
     assert rest_voltage(charge) == pytest.approx(6 * cell)
+
+
+def test_a_carried_truck_stands_elsewhere_and_its_lidar_sees_no_way_between(field):
+    driver = field(truck=IDEAL, walls=[(3.0, -6.0, 3.2, 6.0)])
+    driver.drive(0.2)
+    driver.wait(2)
+    before = driver.world.motor.reading(driver.now).turns
+    driver.world.carry(driver.now, (-2.0, 1.0, pi / 2))
+    truth = driver.world.truth(driver.now)
+    assert (truth.x, truth.y, truth.yaw, truth.v) == (-2.0, 1.0, pi / 2, 0.0)
+    driver.now += 50_000_000  # half a revolution before, half after
+    ranges = driver.world.lidar.scan(driver.now - 100_000_000)
+    assert ranges[384 - 256] / 1000 == pytest.approx(5.0, abs=0.02)
+    assert driver.wait(3).y > 1.4, "the motor turns on"
+    assert driver.world.motor.reading(driver.now).turns < before
+
+
+@pytest.mark.parametrize("pose", [(3.1, 0.0, 0.0), (1.0, 1.0, 0.0)])
+def test_a_truck_is_not_carried_into_things(field, pose):
+    driver = field(walls=[(3.0, -6.0, 3.2, 6.0)])
+    driver.world.add(driver.now, Disc(1.0, 1.0, 0.1))
+    with pytest.raises(InputError, match="carry"):
+        driver.world.carry(driver.now, pose)
+    assert driver.world.truth(driver.now).x == 0.0
