@@ -43,7 +43,10 @@ class GroundGrid:
         self._corner: Cells = np.zeros(2, np.int64)
         """Column and row of the lower left cell, counted from the frame's origin."""
         self._counts: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
-        self._tilt = self._roughness = np.zeros((0, 0), np.float32)
+        self._layers: NDArray[np.float32] = np.zeros((2, 0, 0), np.float32)
+        """Tilt, rad, and roughness, m; shape (2, rows, columns)."""
+        self._quantised: NDArray[np.uint8] = np.zeros((2, 0, 0), np.uint8)
+        """The same as published: quantised where it was observed, for all of a large map takes milliseconds."""
 
     @property
     def empty(self) -> bool:
@@ -65,9 +68,9 @@ class GroundGrid:
             return
         columns, rows = (cells - self._corner).T
         count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, REMEMBERED)
-        for layer, values in ((self._tilt, tilt), (self._roughness, roughness)):
-            value = np.broadcast_to(values, len(points))[first]
-            layer[rows, columns] += (value - layer[rows, columns]) / count
+        values = np.stack([np.broadcast_to(value, len(points))[first] for value in (tilt, roughness)])
+        self._layers[:, rows, columns] += (values - self._layers[:, rows, columns]) / count
+        self._quantised[:, rows, columns] = quantised(self._layers[:, rows, columns])
 
     def message(self, stamp: int, seq: int, frame: str) -> Ground:
         """The layers as published; of an empty grid there is none."""
@@ -82,8 +85,8 @@ class GroundGrid:
             width=columns,
             height=rows,
             origin=Pose2D(x=x, y=y, yaw=0.0),
-            tilt=self._quantised(self._tilt, TILT_STEP),
-            roughness=self._quantised(self._roughness, ROUGHNESS_STEP),
+            tilt=self._quantised[0].reshape(-1),
+            roughness=self._quantised[1].reshape(-1),
         )
 
     def save(self, folder: Path) -> None:
@@ -93,9 +96,8 @@ class GroundGrid:
             OSError: it could not be written.
         """
         content = io.BytesIO()
-        np.savez_compressed(
-            content, corner=self._corner, counts=self._counts, tilt=self._tilt, roughness=self._roughness
-        )
+        tilt, roughness = self._layers
+        np.savez_compressed(content, corner=self._corner, counts=self._counts, tilt=tilt, roughness=roughness)
         replace_file(folder / FILE, content.getvalue())
 
     @classmethod
@@ -119,15 +121,9 @@ class GroundGrid:
         if not (np.isfinite(tilt).all() and np.isfinite(roughness).all()):
             raise InputError(f"{path}: expected finite tilt and roughness")
         grid._corner, grid._counts = corner.astype(np.int64), counts.astype(np.uint8)
-        grid._tilt, grid._roughness = tilt.astype(np.float32), roughness.astype(np.float32)
+        grid._layers = np.stack((tilt, roughness)).astype(np.float32)
+        grid._quantised = np.where(grid._counts > 0, quantised(grid._layers), np.uint8(GROUND_UNKNOWN))
         return grid
-
-    def _quantised(self, layer: NDArray[np.float32], step: float) -> NDArray[np.uint8]:
-        values: NDArray[np.uint8] = np.minimum(np.rint(layer / step), GROUND_UNKNOWN - 1).astype(np.uint8)
-        values[self._counts == 0] = GROUND_UNKNOWN
-        values = values.reshape(-1)
-        values.flags.writeable = False
-        return values
 
     def _grow(self, low: Cells, high: Cells) -> bool:
         """Make room for the cells from ``low`` to ``high``; False if that would be too large."""
@@ -142,9 +138,18 @@ class GroundGrid:
             return False
         widths = ((before[1], behind[1]), (before[0], behind[0]))
         self._counts = np.pad(self._counts, widths)
-        self._tilt, self._roughness = np.pad(self._tilt, widths), np.pad(self._roughness, widths)
+        self._layers = np.pad(self._layers, ((0, 0), *widths))
+        self._quantised = np.pad(self._quantised, ((0, 0), *widths), constant_values=GROUND_UNKNOWN)
         self._corner = self._corner - before
         return True
+
+
+def quantised(layers: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Tilt, rad, and roughness, m, shape (2, ...), in the units of the message."""
+    steps = np.array((TILT_STEP, ROUGHNESS_STEP), np.float32)
+    steps = steps.reshape(2, *(1 for _ in layers.shape[1:]))
+    values: NDArray[np.uint8] = np.minimum(np.rint(layers / steps), GROUND_UNKNOWN - 1).astype(np.uint8)
+    return values
 
 
 def planes(points: Array) -> tuple[Array, Array, Array]:

@@ -43,6 +43,18 @@ def test_a_cell_is_the_mean_of_its_last_observations_and_extremes_are_no_unknown
     assert value(grid.message(0, 0, "map"), "tilt", 0.05, 0.05) == pytest.approx(0.3 / TILT_STEP, abs=1)
 
 
+def test_a_message_keeps_its_values_when_the_grid_grows_and_changes():
+    grid, at = GroundGrid(), np.array([(0.05, 0.05)])
+    grid.observe(at, 0.1, 0.01)
+    first = grid.message(0, 0, "map")
+    grid.observe(np.array([(-7.0, 9.0)]), 0.2, 0.02)
+    assert value(grid.message(0, 0, "map"), "tilt", 0.05, 0.05) == round(0.1 / TILT_STEP)
+    assert value(grid.message(0, 0, "map"), "tilt", -7.0, 9.0) == round(0.2 / TILT_STEP)
+    grid.observe(at, 0.3, 0.01)
+    assert value(first, "tilt", 0.05, 0.05) == round(0.1 / TILT_STEP)
+    assert value(grid.message(0, 0, "map"), "tilt", 0.05, 0.05) == round(0.2 / TILT_STEP)
+
+
 def test_places_far_off_are_left_out():
     grid = GroundGrid()
     grid.observe(np.array([(0.0, 0.0)]), 0.1, 0.0)
