@@ -1,13 +1,12 @@
 """``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
 
-import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config
+from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
@@ -66,13 +65,7 @@ def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
     ) -> None:
         _run(make(**own), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
 
-    mine, shared = (inspect.signature(function).parameters.values() for function in (make, command))
-    together = [*mine, *(parameter for parameter in shared if parameter.kind is not parameter.VAR_KEYWORD)]
-    parameters = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in together]
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    command.__doc__ = make.__doc__
-    app.command(make.__name__)(command)
+    app.command(make.__name__)(with_parameters(command, make, command))
     return make
 
 

@@ -1,12 +1,13 @@
 """Commands on maps: build one from a log, show it, save a robot's, localise in it."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruckd.tools.cli.options import ENDPOINT
+from monstertruckd.tools.cli.options import ENDPOINT, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
@@ -30,18 +31,43 @@ Trajectory = Annotated[
 Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
 
 
+def _with_geometry(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command on a log have the options of its geometry, which it takes as ``geometry``."""
+
+    def run(
+        *,
+        start_angle: StartAngle = None,
+        angle_increment: AngleIncrement = None,
+        range_max: RangeMax = None,
+        mount: LidarMount = None,
+        **own: Any,
+    ) -> None:
+        import math
+
+        from monstertruckd.tools.logs.scans import LogGeometry
+
+        geometry = LogGeometry(
+            start_angle=None if start_angle is None else math.radians(start_angle),
+            angle_increment=None if angle_increment is None else math.radians(angle_increment),
+            range_max=range_max,
+            mount=None if mount is None else (mount[0], mount[1], math.radians(mount[2])),
+        )
+        command(geometry=geometry, **own)
+
+    return with_parameters(run, command, run, without=("geometry",))
+
+
 @app.command("build")
+@_with_geometry
 def build(
     log: Log,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
     png: Png = None,
     front: Annotated[str, typer.Option(help="Scan matcher: planar or kiss.")] = "planar",
     trajectory: Trajectory = None,
-    start_angle: StartAngle = None,
-    angle_increment: AngleIncrement = None,
-    range_max: RangeMax = None,
-    mount: LidarMount = None,
     json_output: JsonOption = False,
+    *,
+    geometry: "LogGeometry",
 ) -> None:
     """Build a map from a log's scans, and its odometry if it has any."""
     from monstertruck_estimation.slam.config import SlamConfig
@@ -52,7 +78,7 @@ def build(
 
     if front not in ("planar", "kiss"):
         raise InputError(f"--front {front}: expected planar or kiss")
-    scans = _read(log, _geometry(start_angle, angle_increment, range_max, mount))
+    scans = _read(log, geometry)
     worker = SlamWorker()
     facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front}))
     done: WorkerOutput = worker.step(
@@ -156,16 +182,15 @@ def load_command(
 
 
 @app.command("localise")
+@_with_geometry
 def localise(
     log: Log,
     place: MapPlace,
     png: Png = None,
     trajectory: Trajectory = None,
-    start_angle: StartAngle = None,
-    angle_increment: AngleIncrement = None,
-    range_max: RangeMax = None,
-    mount: LidarMount = None,
     json_output: JsonOption = False,
+    *,
+    geometry: "LogGeometry",
 ) -> None:
     """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
@@ -173,7 +198,7 @@ def localise(
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruckd.tools.logs.trajectory import write_tum
 
-    saved, scans = load(place), _read(log, _geometry(start_angle, angle_increment, range_max, mount))
+    saved, scans = load(place), _read(log, geometry)
     facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
     known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
     facts |= {"map": place, "localised": len(known)}
@@ -187,25 +212,6 @@ def localise(
     if png is not None:
         _draw(png, saved, [estimate.pose for estimate in known])
     _print(facts, json_output)
-
-
-def _geometry(
-    start_angle: float | None,
-    angle_increment: float | None,
-    range_max: float | None,
-    mount: tuple[float, float, float] | None,
-) -> "LogGeometry":
-    """Geometry by the options; angles in degrees."""
-    import math
-
-    from monstertruckd.tools.logs.scans import LogGeometry
-
-    return LogGeometry(
-        start_angle=None if start_angle is None else math.radians(start_angle),
-        angle_increment=None if angle_increment is None else math.radians(angle_increment),
-        range_max=range_max,
-        mount=None if mount is None else (mount[0], mount[1], math.radians(mount[2])),
-    )
 
 
 def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":

@@ -1,8 +1,9 @@
 """Options and arguments that many commands share, with what a shell completes for them."""
 
-from collections.abc import Iterator
+import inspect
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -108,3 +109,22 @@ def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
 ViaOption = Annotated[
     list[str] | None, typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way; may be repeated.")
 ]
+
+
+def with_parameters(
+    command: Callable[..., None], *functions: Callable[..., Any], without: Collection[str] = ()
+) -> Callable[..., None]:
+    """Let ``command``, which takes any keywords, have the parameters of ``functions``: theirs are its options.
+
+    Those that collect keywords and those named in ``without`` are left out. The help is that of the first function.
+    """
+    every = (parameter for function in functions for parameter in inspect.signature(function).parameters.values())
+    parameters = [
+        parameter.replace(kind=parameter.KEYWORD_ONLY)
+        for parameter in every
+        if parameter.kind is not parameter.VAR_KEYWORD and parameter.name not in without
+    ]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    command.__doc__ = functions[0].__doc__
+    return command
