@@ -46,6 +46,8 @@ CONFIRM_TOLERANCE: Final = (0.3, 0.1)
 BASELINE: Final = (0.8, 3.0)
 """Way between the first look and the last one that makes a place certain, m: of looks that found it unique, and of
 all."""
+BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
+"""After these events keyframes of the local map are elsewhere, or have other numbers: it begins anew."""
 OUTSIDE_AFTER: Final = 10 * SECOND
 """Time after which a robot that no look has found on the map is outside it, ns."""
 
@@ -84,12 +86,9 @@ class GlobalLocaliser:
     """
 
     def __init__(self, submap: Submap, evidence: EvidenceGrid, config: MapperConfig) -> None:
-        self._submap, self._evidence = submap, evidence
-        self._mapper = Mapper(config)
+        self._submap, self._evidence, self._config = submap, evidence, config
         self._mount = np.zeros(2)
-        self._ways: list[float] = []
-        """Way driven at every keyframe, m."""
-        self._hypotheses: list[Hypothesis] = []
+        self._begin_local_map()
         self._seen_on_map: int | None = None
         """Stamp of the newest look that found any place, or of the first scan, ns."""
         self.outside = False
@@ -108,6 +107,9 @@ class GlobalLocaliser:
             mount: planar pose of the sensor in base, m and rad.
         """
         step = self._mapper.step(scan, stamp, odom)
+        if step is not None and not BROKEN.isdisjoint(step.events):
+            self._begin_local_map()
+            step = self._mapper.step(scan, stamp, odom)
         if self._seen_on_map is None:
             self._seen_on_map = stamp
         found = None
@@ -121,6 +123,12 @@ class GlobalLocaliser:
                 found = None if look.ambiguous else self._judged(look)
         self.outside = stamp - self._seen_on_map >= OUTSIDE_AFTER
         return found
+
+    def _begin_local_map(self) -> None:
+        self._mapper = Mapper(self._config)
+        self._ways: list[float] = []
+        """Way driven at every keyframe, m."""
+        self._hypotheses: list[Hypothesis] = []
 
     def _look(self) -> Look | None:
         """Search the whole map for the surroundings of the newest keyframe; None if they fit nowhere."""

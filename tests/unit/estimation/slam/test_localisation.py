@@ -55,6 +55,17 @@ def test_a_place_is_found_by_a_second_look_and_is_right(odom: bool):
 
 
 @pytest.mark.parametrize("odom", [True, False])
+def test_a_robot_that_is_carried_while_it_is_searched_for_is_found_where_it_then_is(odom: bool):
+    walls = [*ROOM, *box(-19.0, -1.0, -13.0, 4.0), *box(-17.0, 1.5, -16.0, 2.5)]
+    before = np.linspace((-18.0, 0.0, 0.0), (-14.5, 0.0, 0.0), 50)
+    truth = np.concatenate((before, rounds(160, laps=1.2)))
+    estimates = followed(SavedMap(drawn(), None), walls, truth, odom=odom)
+    assert not PLACED & {estimate.status for estimate in estimates[:50]}
+    assert estimates[-1].status in PLACED
+    assert math.hypot(*(np.array(estimates[-1].pose) - truth[-1])[:2]) < 0.1
+
+
+@pytest.mark.parametrize("odom", [True, False])
 def test_a_room_that_only_fits_is_outside_the_map(odom: bool):
     truth = rounds(160, laps=1.0)
     estimates = followed(SavedMap(drawn(), None), EMPTY, truth, odom=odom)
