@@ -37,15 +37,17 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
     return vx, vy, wz
 
 
-COMPARED: Final = 5.0
-"""Seconds over which odometry is compared with the scans."""
-SAMPLE: Final = 0.25
-"""Least length of a step of the comparison, s: the noise of single matches would add up to a way."""
+COMPARED: Final = (5.0, 2.0)
+"""Odometry is compared with the scans over so many seconds, and over so much motion (m or rad)."""
+SAMPLE: Final = (0.25, 0.1)
+"""Least length of a step of the comparison, s and motion: the noise of single matches would add up to a way."""
 FEWEST_SAMPLES: Final = 3
 TOLERANCE: Final = 0.3
 """Share of the way, or of the turn, by which they may differ,"""
-SLACK: Final = (0.2, 0.2)
-"""and what may come from clocks that disagree, m and rad."""
+SLACK: Final = (0.1, 0.2)
+"""what clocks that disagree may add, and at most with what follows, m and rad,"""
+CROSSED: Final = 0.1
+"""and what a radian may add to the way, m, and a metre to the turn, rad: levers, and wheels of unequal size."""
 CONTRADICTIONS: Final = 2
 """Comparisons in a row that contradict odometry before it is dropped."""
 AGREEMENT: Final = 0.4
@@ -57,13 +59,15 @@ AGREED: Final = (2.0, 2.0)
 class OdometryCheck:
     """Compares ways and turns by odometry with those by the scans, which know nothing of the wheels.
 
-    Over some seconds, and in lengths and sums: clocks that disagree shift both a little and change neither. What was
-    contradicted, ways or turns, must agree step by step over ``AGREED`` before odometry counts again: a turn of the
-    wrong sign agrees as long as the robot drives straight.
+    The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
+    no sum. A slow robot's are compared over as much motion as a fast one's: within seconds alone its error would not
+    exceed ``SLACK``. What was contradicted, ways or turns, must agree step by step over ``AGREED`` before odometry
+    counts again: a turn of the wrong sign agrees as long as the robot drives straight.
     """
 
     def __init__(self) -> None:
-        self._steps: deque[tuple[float, float, float, float, float]] = deque()
+        self._steps: deque[Array] = deque()
+        """Seconds, motion by odometry and by the scans, shape (7,)."""
         self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
         self._row = 0
         self._wrong = np.zeros(2, bool)
@@ -80,44 +84,58 @@ class OdometryCheck:
         """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans."""
         self._seconds += dt
         self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
-        if self._seconds < SAMPLE:
+        step = np.array((self._seconds, *self._odom, *self._scans))
+        if self._seconds < SAMPLE[0] or _motion(step) < SAMPLE[1]:
             return
-        way, turn = math.hypot(*self._odom[:2]), float(self._odom[2])
-        way_by_scans, turn_by_scans = math.hypot(*self._scans[:2]), float(self._scans[2])
-        self._steps.append((self._seconds, way, way_by_scans, turn, turn_by_scans))
-        while len(self._steps) > FEWEST_SAMPLES and sum(step[0] for step in self._steps) > COMPARED:
+        self._steps.append(step)
+        while len(self._steps) > FEWEST_SAMPLES and self._long_enough_without_oldest():
             self._steps.popleft()
         self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
         self._judge()
 
-    def restart(self) -> None:
-        """Forget the steps: the next motion does not follow the last one."""
-        self._steps.clear()
-        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
-        self._row = 0
+    def interrupt(self, dt: float) -> None:
+        """Over ``dt`` seconds there is nothing to compare, and the next motion does not follow the last one."""
+        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), self._seconds + dt
+
+    def _long_enough_without_oldest(self) -> bool:
+        later = list(self._steps)[1:]
+        return sum(float(step[0]) for step in later) > COMPARED[0] and sum(map(_motion, later)) > COMPARED[1]
 
     def _judge(self) -> None:
         """Compare over the last three and more steps; drop odometry, or take it back."""
         rows = np.array(self._steps)[::-1]
-        sums, lengths = np.cumsum(rows, axis=0), np.cumsum(np.abs(rows), axis=0)
-        off = np.abs(np.stack((sums[:, 1] - sums[:, 2], sums[:, 3] - sums[:, 4]), axis=1))
-        motion = np.stack((lengths[:, 1:3].max(axis=1), lengths[:, 3:5].max(axis=1)), axis=1)
-        wrong = (off > TOLERANCE * motion + SLACK)[FEWEST_SAMPLES - 1 :].any(axis=0)
+        differences = np.cumsum(rows[:, 1:4] - rows[:, 4:], axis=0)
+        off = np.stack((np.hypot(differences[:, 0], differences[:, 1]), np.abs(differences[:, 2])), axis=1)
+        lengths = np.cumsum(np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:]))), axis=1)
+        motion = lengths.max(axis=0)
+        slack = np.minimum(SLACK[0] + CROSSED * motion[:, ::-1], SLACK[1])
+        wrong = (off > TOLERANCE * motion + slack)[FEWEST_SAMPLES - 1 :].any(axis=0)
         self._row = self._row + 1 if wrong.any() else 0
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
-                self.since = float(sums[-1, 0])
+                self.since = float(rows[:, 0].sum())
             self._wrong |= wrong
             self._agreed[wrong] = 0.0
         if self.contradicted:
-            step = np.abs(rows[0, 1:])
-            errors = abs(step[0] - step[1]), abs(rows[0, 3] - rows[0, 4])
-            self._agreed += np.stack(((max(step[:2]), max(step[2:])), errors), axis=1)
+            by_odometry, by_scans = _lengths(rows[0, 1:4]), _lengths(rows[0, 4:])
+            error = abs(by_odometry[0] - by_scans[0]), abs(rows[0, 3] - rows[0, 6])
+            self._agreed += np.stack((np.maximum(by_odometry, by_scans), error), axis=1)
             enough, good = self._agreed[:, 0] >= AGREED, self._agreed[:, 1] <= AGREEMENT * self._agreed[:, 0]
             self._agreed[enough & ~good] = 0.0
             self._wrong &= ~(enough & good)
             if not self._wrong.any():
-                self.restart()
+                self._steps.clear()
+                self._row = 0
+
+
+def _lengths(motions: Array) -> Array:
+    """Ways and turns, m and rad, shape (..., 2), of motions, shape (..., 3)."""
+    return np.stack((np.hypot(motions[..., 0], motions[..., 1]), np.abs(motions[..., 2])), axis=-1)
+
+
+def _motion(step: Array) -> float:
+    """Way or turn, m or rad, of a step by odometry or the scans: what is most."""
+    return float(max(_lengths(step[1:4]).max(), _lengths(step[4:]).max()))
 
 
 class MotionPredictor:
@@ -139,6 +157,7 @@ class MotionPredictor:
         self._delta = np.zeros(3)
         self._dt = 0.0
         self._seen = False
+        self._fitted = False
         self._missing = 0.0
         self.check = OdometryCheck()
 
@@ -202,8 +221,10 @@ class MotionPredictor:
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
         """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""
         self._dt, self._delta = dt, moved
-        if self._by_odometry is None or not match.accepted or match.overlap < LOW_OVERLAP:
-            self.check.restart()
+        fitted, self._fitted = self._fitted, match.accepted and match.overlap >= LOW_OVERLAP
+        # The first motion after a misfit makes up for what was predicted wrongly at it.
+        if self._by_odometry is None or not (fitted and self._fitted):
+            self.check.interrupt(dt)
             return
         by_odometry = self._by_odometry[0]
         # Along a corridor the match has the way from the prediction: it says nothing of it, but it measures the turn.

@@ -1,8 +1,10 @@
+import itertools
 import math
 
 import numpy as np
 import pytest
 
+from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.motion import MotionPredictor, OdometryCheck, ScanOdometry
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
@@ -115,6 +117,39 @@ def test_odometry_that_the_scans_contradict_is_dropped_within_five_seconds(wrong
     assert not check.contradicted
     assert compared(check, np.array(wrong), 50).contradicted
     assert 0.5 < check.since <= 5.5
+
+
+@pytest.mark.parametrize("wrong", [0.5, 2.0], ids=["half", "double"])
+def test_a_slow_robots_odometry_is_judged_over_as_much_way(wrong):
+    """At 0.1 m/s no error of half the way exceeds what clocks may do within 5 s."""
+    assert compared(OdometryCheck(), wrong, 125, np.array((0.01, 0.0, 0.0))).contradicted
+
+
+def test_misfits_do_not_forget_what_was_compared_before():
+    check = OdometryCheck()
+    for _ in range(5):
+        compared(check, 0.5, 8)
+        check.interrupt(0.1)
+    assert check.contradicted
+
+
+def test_what_a_match_makes_up_for_after_a_misfit_is_no_motion():
+    model, place = MotionPredictor(MapperConfig()), np.zeros(3)
+    for k in range(100):
+        delta, noise = model.predict(0.1, np.array((0.05 * k, 0.0, 0.0)))
+        misfit = k % 5 == 4
+        moved = delta if misfit else delta + np.array((0.3 if k % 5 == 0 else 0.0, 0.0, 0.0))
+        made = rejected(place, np.eye(3), MatchStatus.FAR) if misfit else match((0.0, 0.0, 0.0))
+        model.learn(0.1, delta, noise, moved, made)
+    assert model.use is OdometryUse.USED
+
+
+def test_the_noise_of_matches_while_the_robot_stands_is_no_way():
+    check, rng = OdometryCheck(), np.random.default_rng(1)
+    places = rng.normal(0.0, (0.006, 0.006, 0.003), (5000, 3))
+    for before, after in itertools.pairwise(places):
+        check.add(0.1, np.zeros(3), between(before, after))
+    assert not check.contradicted
 
 
 def test_odometry_of_ordinary_error_is_used():
