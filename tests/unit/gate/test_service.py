@@ -86,6 +86,19 @@ def test_state_goes_out_on_change_and_ten_times_a_second():
     on_bench(scenario)
 
 
+def test_an_emergency_stop_lowers_the_deadman_line_until_it_is_reset():
+    async def scenario(bench):
+        assert bench.out.steering.last.deadman
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.05)
+        assert not bench.out.steering.last.deadman
+        bench.order(Order.RESET)
+        await bench.clock.sleep(0.05)
+        assert bench.out.steering.last.deadman
+
+    on_bench(scenario)
+
+
 def test_the_deadman_line_falls_when_the_drive_is_silent_and_rises_with_its_voice():
     async def scenario(bench):
         assert bench.out.steering.last.deadman
