@@ -21,6 +21,8 @@ class Shaft:
         self.demand_rpm = 0.0
         self.slope = 0.0
         """Present acceleration, rpm/s."""
+        self.blocked = False
+        """Something holds it, whatever the motor does."""
 
     def command(self, target_rpm: float | None, accel_rpm_s: float) -> None:
         """Ramp towards a speed; None switches the power stage off."""
@@ -45,6 +47,8 @@ class Shaft:
             rpm = demand + (before - demand) * exp(-dt / self._config.lag)
             if demand == 0.0 and abs(rpm) < 0.5:
                 rpm = 0.0
+        if self.blocked:
+            rpm = 0.0
         self.rpm = rpm
         self.turns += (before + rpm) / 2 * dt / 60
         self.slope = (rpm - before) / dt

@@ -65,6 +65,8 @@ class MotorConfig(Schema):
     """Of all gear stages together."""
     idle_current: NotNegative = 0.08
     """Current of the unloaded turning motor, A."""
+    peak_current: NotNegative = 2.0
+    """The controller's limit, which a motor that is held draws, A."""
     rotor_inertia: NotNegative = 1e-6
     """kg m^2."""
     winding_resistance: NotNegative = 2.0

@@ -256,6 +256,8 @@ class TruckPlant:
             load = pull * self.config.wheel_radius / self._gearing
             idle = copysign(motor.idle_current, shaft.rpm) if shaft.rpm else 0.0
             current = idle + (load + inertia) / motor.torque_constant
+            if shaft.blocked and shaft.demand_rpm:
+                current = copysign(motor.peak_current, shaft.demand_rpm)
         self.currents[i] = current
         return current
 

@@ -138,6 +138,11 @@ class World:
         self._plant.advance(time_ns)
         self._plant.servo_supply = on
 
+    def block_shaft(self, time_ns: int, shaft: int = 0, *, on: bool) -> None:
+        """Hold a driven shaft, or let it go."""
+        self._plant.advance(time_ns)
+        self._plant.shafts[shaft].blocked = on
+
     def set_tilt(self, time_ns: int, tilt: TiltConfig) -> None:
         """From now on tilt the truck in another way."""
         self._plant.advance(time_ns)
