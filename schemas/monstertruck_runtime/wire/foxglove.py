@@ -110,6 +110,8 @@ def _planar(pose: Any) -> tuple[float, float, float]:
 
 _Numbers = Sequence[float] | bytes
 """A field of type ``repeated double``, or its packed bytes."""
+_Fields = dict[str, Any]
+"""Of one of our models, by name, not validated yet."""
 
 
 def _array(numbers: _Numbers) -> NDArray[np.float64]:
@@ -125,18 +127,17 @@ def _packed(*numbers: float) -> bytes:
     return struct.pack(f"<{len(numbers)}d", *numbers)
 
 
-def _three(numbers: _Numbers) -> tuple[float, float, float]:
-    values = _array(numbers)
-    if len(values) != 3:
-        msg = f"expected 3 numbers, got {len(values)}"
+def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
+    """So many numbers."""
+    if len(numbers) != (8 * count if isinstance(numbers, bytes) else count):
+        msg = f"expected {count} numbers, got {len(_array(numbers))}"
         raise InputError(msg)
-    a, b, c = values.tolist()
-    return a, b, c
+    return struct.unpack(f"<{count}d", numbers) if isinstance(numbers, bytes) else tuple(numbers)
 
 
 def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
     """Our exact (x, y, yaw) if the writer gave it, else the standard pose."""
-    x, y, yaw = _three(exact) if exact else _planar(pose)
+    x, y, yaw = _unpacked(exact, 3) if exact else _planar(pose)
     return Pose2D(x=x, y=y, yaw=yaw)
 
 
@@ -155,19 +156,19 @@ def _write_scan(scan: LaserScan, proto: Any) -> None:
         proto.tilt = _packed(scan.tilt)
 
 
-def _read_scan(proto: Any) -> LaserScan:
-    return LaserScan(
+def _read_scan(proto: Any) -> _Fields:
+    return {
         **_own_header(proto),
-        start_angle=proto.start_angle,
-        end_angle=proto.end_angle,
-        time_increment=proto.time_increment,
-        scan_time=proto.scan_time,
-        range_min=proto.range_min,
-        range_max=proto.range_max,
-        ranges=_array(proto.ranges),
-        codes=np.frombuffer(proto.codes, np.uint8),
-        tilt=_array(proto.tilt).item() if proto.tilt else None,
-    )
+        "start_angle": proto.start_angle,
+        "end_angle": proto.end_angle,
+        "time_increment": proto.time_increment,
+        "scan_time": proto.scan_time,
+        "range_min": proto.range_min,
+        "range_max": proto.range_max,
+        "ranges": _array(proto.ranges),
+        "codes": np.frombuffer(proto.codes, np.uint8),
+        "tilt": _unpacked(proto.tilt, 1)[0] if proto.tilt else None,
+    }
 
 
 def _write_image(image: CompressedImage, proto: Any) -> None:
@@ -177,8 +178,8 @@ def _write_image(image: CompressedImage, proto: Any) -> None:
     proto.sequence = image.sequence
 
 
-def _read_image(proto: Any) -> CompressedImage:
-    return CompressedImage(**_own_header(proto), data=proto.data, format=proto.format, sequence=proto.sequence)
+def _read_image(proto: Any) -> _Fields:
+    return {**_own_header(proto), "data": proto.data, "format": proto.format, "sequence": proto.sequence}
 
 
 def _write_odometry(odometry: Odometry, proto: Any) -> None:
@@ -194,18 +195,18 @@ def _write_odometry(odometry: Odometry, proto: Any) -> None:
     proto.sources.extend(odometry.sources)
 
 
-def _read_odometry(proto: Any) -> Odometry:
-    vx, vy, wz = _three(proto.twist2d)
-    return Odometry(
+def _read_odometry(proto: Any) -> _Fields:
+    vx, vy, wz = _unpacked(proto.twist2d, 3)
+    return {
         **_own_header(proto),
-        child=proto.child,
-        pose=_pose2d(proto.pose2d, proto.pose),
-        twist=Twist2D(vx=vx, vy=vy, wz=wz),
-        pose_covariance=_array(proto.pose_covariance),
-        twist_covariance=_array(proto.twist_covariance),
-        age=proto.age,
-        sources=tuple(proto.sources),
-    )
+        "child": proto.child,
+        "pose": _pose2d(proto.pose2d, proto.pose),
+        "twist": Twist2D(vx=vx, vy=vy, wz=wz),
+        "pose_covariance": _array(proto.pose_covariance),
+        "twist_covariance": _array(proto.twist_covariance),
+        "age": proto.age,
+        "sources": tuple(proto.sources),
+    }
 
 
 def _write_path(path: Path, proto: Any) -> None:
@@ -223,17 +224,17 @@ def _write_path(path: Path, proto: Any) -> None:
     proto.name = path.name
 
 
-def _read_path(proto: Any) -> Path:
+def _read_path(proto: Any) -> _Fields:
     poses = proto.poses2d or [value for pose in proto.poses for value in _planar(pose)]
-    return Path(
+    return {
         **_own_header(proto),
-        poses=_array(poses),
-        directions=_array(proto.directions),
-        steering=tuple(proto.steering),
-        clearance=_array(proto.clearance),
-        closed=proto.closed,
-        name=proto.name,
-    )
+        "poses": _array(poses),
+        "directions": _array(proto.directions),
+        "steering": tuple(proto.steering),
+        "clearance": _array(proto.clearance),
+        "closed": proto.closed,
+        "name": proto.name,
+    }
 
 
 def _write_grid(grid: Grid, proto: Any) -> None:
@@ -251,19 +252,19 @@ def _write_grid(grid: Grid, proto: Any) -> None:
     proto.data = grid.cells.tobytes()
 
 
-def _read_grid(proto: Any) -> Grid:
+def _read_grid(proto: Any) -> _Fields:
     width, data = proto.column_count, proto.data
     if proto.cell_stride != 1 or proto.row_stride != width or width == 0 or len(data) % width:
         msg = f"grid of {len(data)} bytes, {width} columns: expected whole rows of one int8 per cell"
         raise InputError(msg)
-    return Grid(
+    return {
         **_own_header(proto),
-        resolution=proto.cell_size.x,
-        width=width,
-        height=len(data) // width,
-        origin=_pose2d(proto.origin2d, proto.pose),
-        cells=np.frombuffer(data, np.int8),
-    )
+        "resolution": proto.cell_size.x,
+        "width": width,
+        "height": len(data) // width,
+        "origin": _pose2d(proto.origin2d, proto.pose),
+        "cells": np.frombuffer(data, np.int8),
+    }
 
 
 _GROUND: Final = ("tilt", "roughness")
@@ -288,21 +289,21 @@ def _write_ground(ground: Ground, proto: Any) -> None:
     proto.data = np.column_stack(layers).tobytes()
 
 
-def _read_ground(proto: Any) -> Ground:
+def _read_ground(proto: Any) -> _Fields:
     width, data, stride = proto.column_count, proto.data, len(_GROUND)
     if proto.cell_stride != stride or proto.row_stride != stride * width or width == 0 or len(data) % (stride * width):
         msg = f"ground of {len(data)} bytes, {width} columns: expected whole rows of {stride} bytes per cell"
         raise InputError(msg)
     layers = np.frombuffer(data, np.uint8).reshape(-1, stride)
-    return Ground(
+    return {
         **_own_header(proto),
-        resolution=proto.cell_size.x,
-        width=width,
-        height=len(layers) // width,
-        origin=_pose2d(proto.origin2d, proto.pose),
-        tilt=layers[:, 0].copy(),
-        roughness=layers[:, 1].copy(),
-    )
+        "resolution": proto.cell_size.x,
+        "width": width,
+        "height": len(layers) // width,
+        "origin": _pose2d(proto.origin2d, proto.pose),
+        "tilt": layers[:, 0].copy(),
+        "roughness": layers[:, 1].copy(),
+    }
 
 
 def _write_transforms(tree: Transforms, proto: Any) -> None:
@@ -322,14 +323,14 @@ def _write_transform(transform: Transform, proto: Any) -> None:
     q.x, q.y, q.z, q.w = transform.rotation
 
 
-def _read_transforms(proto: Any) -> Transforms:
-    return Transforms(
-        stamp=proto.stamp,
-        received=proto.received,
-        seq=proto.seq,
-        frame=proto.frame,
-        transforms=tuple(map(_read_transform, proto.transforms)),
-    )
+def _read_transforms(proto: Any) -> _Fields:
+    return {
+        "stamp": proto.stamp,
+        "received": proto.received,
+        "seq": proto.seq,
+        "frame": proto.frame,
+        "transforms": tuple(map(_read_transform, proto.transforms)),
+    }
 
 
 def _read_transform(proto: Any) -> Transform:
@@ -359,18 +360,18 @@ def _write_log(record: LogRecord, proto: Any) -> None:
     proto.line = record.line
 
 
-def _read_log(proto: Any) -> LogRecord:
-    return LogRecord(
-        stamp=_nanoseconds(proto.timestamp),
-        received=proto.received,
-        seq=proto.seq,
-        frame=proto.frame,
-        level=_LEVELS.get(proto.level, LogLevel.INFO),
-        text=proto.message,
-        name=proto.name,
-        file=proto.file,
-        line=proto.line,
-    )
+def _read_log(proto: Any) -> _Fields:
+    return {
+        "stamp": _nanoseconds(proto.timestamp),
+        "received": proto.received,
+        "seq": proto.seq,
+        "frame": proto.frame,
+        "level": _LEVELS.get(proto.level, LogLevel.INFO),
+        "text": proto.message,
+        "name": proto.name,
+        "file": proto.file,
+        "line": proto.line,
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,11 +383,11 @@ class _Binding:
     """The same message with its numbers packed, see ``_message_class``."""
     write: Callable[[Any, Any], None]
     """Fill the packed message from the model; raises ``InputError``."""
-    read: Callable[[Any], Message]
-    """Message, packed or not, to model; raises ``InputError`` or ``pydantic.ValidationError``."""
+    read: Callable[[Any], _Fields]
+    """Message, packed or not, to the model's fields; raises ``InputError`` or ``pydantic.ValidationError``."""
 
 
-def _binding(name: str, write: Callable[[Any, Any], None], read: Callable[[Any], Message]) -> _Binding:
+def _binding(name: str, write: Callable[[Any, Any], None], read: Callable[[Any], _Fields]) -> _Binding:
     proto, packed = (_message_class(f"foxglove.{name}", packed=packed) for packed in (False, True))
     return _Binding(proto, packed, write, read)
 
@@ -425,9 +426,10 @@ def decode(model: type[Message], data: bytes) -> Message:
     """
     binding = _BINDINGS[model]
     try:
-        return binding.read(_parse_packed(binding.packed, data) or binding.proto.FromString(data))
+        proto = _parse_packed(binding.packed, data) or binding.proto.FromString(data)
     except DecodeError as error:
         raise InputError(str(error)) from None
+    return model.model_validate(binding.read(proto))
 
 
 def _parse_packed(packed: type[Any], data: bytes) -> Any | None:
