@@ -278,6 +278,8 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
             "inverted": truck.motor.inverted,
             "drive_ratio": truck.motor.ratio * config.geometry.wheel_radius / truck.wheel_radius,
             "turns_per_metre": turns,
+            "start_lag": truck.motor.lag,
+            "stop_lag": truck.motor.lag,
             "ticks_per_metre": 4 * (drive.driver.encoder_pulses_per_turn or 0) * turns,
         },
         "steering": steering,

@@ -100,7 +100,7 @@ def test_drive(seed: int, tmp_path: Path):
         assert [e.name for e in session.result.estimates] == ["inverted"]
         session = run_session(config, drive_wizard(), rng)
     judged(session, config)
-    assert len(session.result.estimates) == 4
+    assert len(session.result.estimates) == 4 + 6
 
 
 @pytest.mark.parametrize("seed", [1, 6])
@@ -302,7 +302,7 @@ def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path
             result, _ = await calibrate(wizard, truck, panel, clock, config, {})
             return result
 
-    assert len(run_virtual(main).estimates) == 4
+    assert len(run_virtual(main).estimates) == 4 + 6
 
 
 def test_a_truck_that_somebody_has_armed_is_left_alone(tmp_path: Path):

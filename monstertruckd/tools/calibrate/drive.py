@@ -1,4 +1,4 @@
-"""Sign and ratio of the drive from taped distances.
+"""Sign and ratio of the drive from taped distances, and how late its motor follows.
 
 Only turns of the motor per metre over the floor can be seen: gear ratio and wheel radius never show apart. So the
 radius stays as configured, and the ratio is the one that makes the odometer right with it.
@@ -12,12 +12,14 @@ import numpy as np
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.tools.calibrate.drive_response import drive_estimates
 from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
+RATE: Final = "devices.drive.driver.rate"
 ROOM: Final = "a straight of 3 m (half a metre of it behind the truck), 1 m wide, level"
 
 TAPE_SCALE: Final = 0.0005
@@ -65,14 +67,17 @@ class DriveWizard:
                 estimates=(_sign(inverted),),
                 partial=True,
             )
-        runs = []
+        runs, tracks = [], []
         for run in range(self.runs):
             await context.confirm(_MARK)
             speed = self.speed if run % 2 == 0 else -min(self.speed, 0.12)
             name = f"run {run + 1} of {self.runs}, {'forward' if speed > 0 else 'back'}"
             track = await context.move(MoveStep(name, speed, metres=self.metres))
             runs.append(TapedRun.of(track, await context.ask(_DISTANCE)))
-        return context.fit("turns per metre", lambda: self._result(context, inverted, runs))
+            tracks.append(track)
+        delays = context.fit("dead time and lag", lambda: drive_estimates(tracks, float(context.value(RATE))))
+        result = context.fit("turns per metre", lambda: self._result(context, inverted, runs))
+        return result.model_copy(update={"estimates": (*result.estimates, *delays)})
 
     @staticmethod
     def _reversed(inverted: bool) -> Result:
@@ -118,13 +123,17 @@ class DriveWizard:
             wizard="drive",
             measured=f"{count} runs of about {self.metres:g} m, forward and back in turn, measured with a tape",
             estimates=tuple(estimates),
-            unobserved=("gear ratio and wheel radius apart from each other", "slip on slopes and in curves"),
+            unobserved=(
+                "gear ratio and wheel radius apart from each other",
+                "slip on slopes and in curves",
+                "how much later than the motor the wheels turn",
+            ),
         )
 
 
 def drive_wizard(settings: DriveWizard | None = None) -> Wizard:
     """Sign and ratio."""
-    doc = "which way is forward, and how far a turn of the motor goes, from taped distances"
+    doc = "which way is forward, how far a turn of the motor goes, from taped distances, and how late it follows"
     return Wizard("drive", doc, ROOM, settings or DriveWizard())
 
 
