@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
@@ -135,22 +136,26 @@ def test_a_hub_vanishes_and_returns(hub: str):
     play(scene)
 
 
-def test_devices_of_a_returned_hub_start_one_after_the_other_what_stops_the_truck_first():
+def test_behind_a_returned_hub_interfaces_start_together_and_what_loads_it_apart():
     ready: dict[str, float] = {}
 
     async def scene(robot: Robot) -> None:
-        robot.usb.lose_hub("1-1")
-        await robot.clock.sleep(1.0)
-        robot.events()
-        await robot.usb.return_hub("1-1", robot.clock)
-        await robot.ready()
-        for event in robot.events(Reason.DEVICE_READY):
-            ready[event.source] = event.stamp / SECOND
+        for hub in BEHIND:
+            robot.usb.lose_hub(hub)
+            await robot.clock.sleep(1.0)
+            robot.events()
+            await robot.usb.return_hub(hub, robot.clock)
+            back = robot.clock.now()
+            await robot.ready()
+            for event in robot.events(Reason.DEVICE_READY):
+                ready[event.source] = (event.stamp - back) / SECOND
 
     play(scene)
-    starts = [role for role in sorted(ready, key=ready.__getitem__) if role in BEHIND["1-1"]]
-    assert starts[0] == "drive"
-    assert set(starts) == set(BEHIND["1-1"])
+    assert set(ready) == {role for roles in BEHIND.values() for role in roles}
+    settle, stagger = UsbConfig().settle, UsbConfig().stagger
+    assert max(ready[role] for role in BEHIND["1-1"]) < settle + 0.4
+    assert ready["lidar"] < settle + 0.5
+    assert ready["camera"] > settle + stagger
 
 
 def test_two_adapters_of_one_kind_in_each_others_ports_are_refused_by_their_handshakes():

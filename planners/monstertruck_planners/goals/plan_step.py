@@ -8,6 +8,7 @@ behind it, so nothing is forgotten by age.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -62,6 +63,8 @@ class ObstacleMemory:
         self._square = square
         self.places: Array = np.empty((0, 2))
         """Shape (n, 2), m."""
+        self.doubted: Array = np.empty((0, 2))
+        """Shape (k, 2), m: cleared, but seen through by no scan. They still count where the truck drives blind."""
 
     def look(self, points: Array, sensor: Array) -> None:
         """Forget what a scan saw through. A bearing without a return says nothing.
@@ -71,14 +74,26 @@ class ObstacleMemory:
             sensor: shape (2,), where it was taken.
         """
         self.places = self.places[~seen_through(self.places, points, sensor)]
+        self.doubted = self.doubted[~seen_through(self.doubted, points, sensor)]
 
     def keep(self, points: Array) -> None:
         """Remember places, shape (n, 2)."""
         self.places = _one_per_square(np.vstack((self.places, points)), self._square)
 
-    def forget(self, where: NDArray[np.bool_]) -> None:
-        """Drop those places; shape (n,)."""
+    def doubt(self, where: NDArray[np.bool_]) -> None:
+        """Those places, shape (n,), count no longer where the lidar looks."""
+        self.doubted = _one_per_square(np.vstack((self.doubted, self.places[where])), self._square)
         self.places = self.places[~where]
+
+    def trust(self, where: NDArray[np.bool_]) -> None:
+        """Those doubted places, shape (k,), count again."""
+        self.keep(self.doubted[where])
+        self.doubted = self.doubted[~where]
+
+    def drop_explained(self, unexplained: Callable[[Array], NDArray[np.bool_]]) -> None:
+        """Keep the places, shape (n, 2), of which ``unexplained`` is true, shape (n,)."""
+        self.places = self.places[unexplained(self.places)]
+        self.doubted = self.doubted[unexplained(self.doubted)]
 
 
 def seen_through(places: Array, points: Array, sensor: Array) -> NDArray[np.bool_]:
@@ -261,12 +276,38 @@ class PlanningStep:
         """Take in a scan, and what has become of the map."""
         memory = self._memory
         if task.clear:
-            memory.forget(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
+            memory.doubt(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
         memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
         memory.keep(task.points)
-        memory.forget(~static_map.unexplained(memory.places, explained_within(setup.config, task.deviation)))
+        tolerance = explained_within(setup.config, task.deviation)
+        memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+        """A route that does not back into doubted places: those near it count again, then all."""
+        answer = self._plan_once(static_map, task)
+        for nearby in (NEARBY, math.inf):
+            doubted = self._memory.doubted
+            touched = self._backs_into(answer, doubted)
+            if not touched.any():
+                break
+            apart = np.hypot(*(doubted[:, None] - doubted[touched]).transpose(2, 0, 1)).min(axis=1)
+            self._memory.trust(apart <= nearby)
+            self._route = None
+            answer = self._plan_once(static_map, task)
+        return answer
+
+    def _backs_into(self, answer: PlanAnswer, places: Array) -> NDArray[np.bool_]:
+        """Whether the backward motions of a route touch each place; shape (k,)."""
+        assert self._setup is not None
+        if answer.poses is None or answer.directions is None or not len(places):
+            return np.zeros(len(places), dtype=np.bool_)
+        backward = answer.poses[answer.directions < 0]
+        if not len(backward):
+            return np.zeros(len(places), dtype=np.bool_)
+        gaps = rectangle_distance(self._setup.footprint, backward, places).min(axis=0)
+        return np.asarray(gaps < self._setup.config.route.margin + SQUARE / 2)
+
+    def _plan_once(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         assert self._setup is not None
         points = self._memory.places
         if len(points):
@@ -330,7 +371,8 @@ class PlanningStep:
         setup = self._setup
         assert setup is not None
         config = setup.config
-        near = static_map.obstacles(static_map.with_points(self._memory.places), task.pose, NEARBY)
+        known = np.vstack((self._memory.places, self._memory.doubted))
+        near = static_map.obstacles(static_map.with_points(known), task.pose, NEARBY)
         way = escape(
             config.escape,
             setup.geometry,

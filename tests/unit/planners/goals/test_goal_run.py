@@ -333,7 +333,29 @@ def test_what_no_scan_sees_behind_the_truck_is_not_forgotten():
     assert gone.poses is not None
     back = step.step(task(what="escape", points=wall))
     assert back.poses is not None
-    assert back.poses[-1, 0] == pytest.approx(0.5, abs=0.03), "far away it was"
+    assert 0.04 < 1.0 - back.poses[-1, 0] < 0.35, "cleared from afar, and seen through by no scan"
+
+
+def test_what_was_cleared_from_afar_is_driven_at_forward_and_not_backed_into():
+    """A corridor of 0.7 m with a box across it: none can turn."""
+    grid = hall()
+    cells = grid.cells.reshape(60, 120).copy()
+    cells[:23] = cells[37:] = 100
+    grid = grid.model_copy(update={"cells": cells.ravel()})
+    box = [(2.5, y) for y in np.arange(1.2, 1.85, 0.05)]
+    forward = PlanningStep()
+    assert forward.step(task(setup=setup(), grid=grid, points=box)).reason is Reason.GOAL_UNREACHABLE
+    assert forward.step(task(clear=True)).reason is Reason.GOAL_UNREACHABLE, "near, it counts"
+    forward.step(task(clear=True, pose=(0.5, 1.5, 0.0)))
+    assert forward.step(task(clear=True, pose=(0.5, 1.5, 0.0))).reason is Reason.OK
+    backward = PlanningStep()
+    there = {"pose": (4.8, 1.5, 0.0), "goal": (1.0, 1.5, 0.0)}
+    assert backward.step(task(setup=setup(), grid=grid, points=box, **there)).reason is Reason.GOAL_UNREACHABLE
+    assert backward.step(task(clear=True, **there)).reason is Reason.GOAL_UNREACHABLE
+    ahead = [(5.7, 1.5)]
+    assert backward.step(task(points=ahead, **there)).reason is Reason.GOAL_UNREACHABLE, "nor later"
+    seen_through = [(0.2, y) for y in np.arange(1.0, 2.0, 0.01)]
+    assert backward.step(task(points=seen_through, **there)).reason is Reason.OK
 
 
 def test_what_a_scan_sees_through_is_forgotten():

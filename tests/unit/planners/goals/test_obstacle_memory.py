@@ -60,5 +60,18 @@ def test_it_keeps_one_place_a_square_until_a_scan_or_somebody_says_otherwise():
     assert len(memory.places) == 2
     memory.look(ring(2.0, (3.0, 3.3)), HERE)
     assert memory.places.tolist() == [[-1.0, 0.0]], "behind, where nothing was seen"
-    memory.forget(memory.places[:, 0] < 0.0)
+    memory.drop_explained(lambda places: places[:, 0] > 0.0)
     assert len(memory.places) == 0
+
+
+def test_what_is_doubted_waits_until_a_scan_sees_through_it_or_it_counts_again():
+    memory = ObstacleMemory(0.05)
+    memory.keep(np.array([[1.01, 0.01], [-1.0, 0.0], [-2.0, 0.0]]))
+    memory.doubt(np.array([True, True, True]))
+    assert (len(memory.places), len(memory.doubted)) == (0, 3)
+    memory.look(ring(2.0, (3.0, 3.3)), HERE)
+    assert sorted(memory.doubted[:, 0]) == [-2.0, -1.0]
+    memory.trust(memory.doubted[:, 0] > -1.5)
+    assert (memory.places.tolist(), memory.doubted.tolist()) == ([[-1.0, 0.0]], [[-2.0, 0.0]])
+    memory.drop_explained(lambda places: places[:, 0] > 0.0)
+    assert (len(memory.places), len(memory.doubted)) == (0, 0)
