@@ -52,8 +52,8 @@ SCAN_BYTES: Final = 500
 """More bytes than any answer of the lidar that is no scan."""
 STEERING_SIDE: Final = ("/maestro/",)
 """Commands to the motor are followed, those to the servos are not."""
-SPEED: Final = 0.5137
-"""Value of ``gate.speed`` that is followed; it occurs nowhere else."""
+SPEED: Final = 0.1537
+"""Value of ``gate.speed`` that is followed; it occurs nowhere else, and the motor can turn so fast."""
 
 
 def source_file(name: str, known: dict[str, str | None] = {}) -> str | None:  # noqa: B006  # a cache
@@ -96,11 +96,19 @@ class Trace:
     def _watched(self, frame: FrameType) -> bool:
         name = frame.f_code.co_filename
         file = source_file(name)
-        if (file is None and not _makes(frame)) or any(part in name for part in self._leaves):
+        if (file is None and not _makes(frame)) or self._has_arrived(frame):
             return False
         task = asyncio.current_task()
         who = task.get_name() if task is not None else "Task-0"
         return any(who.endswith(end) or (end == "*" and who.startswith("Task-")) for end in self._tasks)
+
+    def _has_arrived(self, frame: FrameType) -> bool:
+        above: FrameType | None = frame
+        while self._leaves and above is not None:
+            if any(part in above.f_code.co_filename for part in self._leaves):
+                return True
+            above = above.f_back
+        return False
 
     def _note(self, frame: FrameType) -> None:
         self._passed.add(frame)

@@ -27,8 +27,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
-from monstertruckd.gate.ceilings import SIGHT, BodyLimits, beyond, weakened
-from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 Metres = Annotated[float, Field(gt=0, le=10)]

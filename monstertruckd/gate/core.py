@@ -28,11 +28,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.sensors import STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
-from monstertruckd.gate.sources import Source, Sources
-from monstertruckd.gate.states import EventLog, GateEvent, GateStateMachine
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
 
 URGENT: Final = frozenset(

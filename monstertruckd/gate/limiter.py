@@ -4,6 +4,9 @@ Every form of request becomes a twist of the base and the steering angles it nee
 limits, ramps and the sweep know nothing of forms. The size of a twist is its **pace**: the greatest speed of the base
 and of the driven wheels, m/s. It is the speed of the base for a truck that drives straight on, and that of the wheels
 for a body that turns on the spot.
+
+A beam without a range may be free ground, or a covered or dazzled sensor: ``Visibility`` says which directions the
+lidar sees.
 """
 
 import math
@@ -11,6 +14,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_kinematics.chassis import MAX_ANGLE, STILL, Angles, Chassis, Speeds
 from monstertruck_kinematics.drive import Twist
@@ -19,10 +23,9 @@ from monstertruck_planners.collision import Footprint, ScanPoints, first_contact
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.sensors import SensorMonitor
-from monstertruckd.gate.visibility import Sectors, Visibility
 
 POSES: Final = 20
 """Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
@@ -45,6 +48,95 @@ ROUNDING: Final = 1e-6
 
 Way = tuple[float, float, float]
 """Motion of the base per metre of pace: m/m, m/m, rad/m."""
+
+SECTORS: Final = 36
+"""Of a turn about the lidar: 0.1 m at the end of the distance the gate checks, less than the width of the body."""
+SECTOR: Final = 2 * math.pi / SECTORS
+PRESENT: Final = 0.5
+"""Share of a sector's beams that a scan must have for the sector to be in the lidar's field."""
+OUTLINE: Final = 12
+"""Points on each edge of the footprint from which the directions of travel are found."""
+MARGIN: Final = 0.005
+"""Ground this near to the body is not travelled, m."""
+
+Sectors = NDArray[np.intp]
+
+
+class Visibility:
+    """When each sector around the lidar was last seen.
+
+    A beam sees if it measured a range that ends outside the body, or met nothing within the sensor's range. A sector
+    is seen if a share of its beams sees: single beams fail on edges and dark surfaces.
+
+    Args:
+        footprint: the body's outline.
+        mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
+        share: of a sector's beams that must see, 0..1.
+    """
+
+    def __init__(self, footprint: Footprint, mount: tuple[float, float, float], share: float) -> None:
+        self._footprint = footprint
+        self._mount = mount
+        self._share = share
+        self._geometry: tuple[float, float, int] | None = None
+        self._sector_of_beam: Sectors = np.empty(0, np.intp)
+        self._beams: Array = np.zeros(SECTORS)
+        self._field: NDArray[np.bool_] = np.zeros(SECTORS, np.bool_)
+        self._seen_at: NDArray[np.int64] = np.zeros(SECTORS, np.int64)
+
+    def observe(self, scan: LaserScan, points: Array) -> None:
+        """Take a scan.
+
+        Args:
+            scan: the revolution.
+            points: its valid returns in base, ``scan_points``, shape (n, 2), m.
+        """
+        geometry = scan.start_angle, scan.angle_increment, len(scan.ranges)
+        if geometry != self._geometry:
+            self._geometry = geometry
+            start, increment, count = geometry
+            self._sector_of_beam = _sector(start + increment * np.arange(count, dtype=np.float64))
+            self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
+            self._field = self._beams * abs(increment) > PRESENT * SECTOR
+        sees = scan.codes <= NO_ECHO
+        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~self._on_body(points, 0.0)
+        seen = np.bincount(self._sector_of_beam, weights=sees, minlength=SECTORS) >= self._share * self._beams
+        self._seen_at[seen & self._field] = scan.stamp
+
+    def sectors_of(self, points: Array) -> Sectors:
+        """Sector of every point (n, 2) in base, m."""
+        x, y, yaw = self._mount
+        return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
+
+    def travelled(self, poses: Array) -> Sectors:
+        """Sectors of the ground that the footprint covers at the poses (m, 3), but not where the body is."""
+        half_length, half_width = self._footprint.half_length, self._footprint.half_width
+        along, across = np.linspace(-half_length, half_length, OUTLINE), np.linspace(-half_width, half_width, OUTLINE)
+        ends, sides = np.full(OUTLINE, half_length), np.full(OUTLINE, half_width)
+        x = np.concatenate((along, along, ends, -ends)) + self._footprint.offset
+        y = np.concatenate((sides, -sides, across, across))
+        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        outline = np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2).reshape(-1, 2)
+        return np.unique(self.sectors_of(outline[~self._on_body(outline, MARGIN)]))
+
+    def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
+        """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
+        return self._seen_at[sectors[self._field[sectors]]]
+
+    def age(self, points: Array, now: int) -> NDArray[np.int64]:
+        """How long ago the sector of every point (n, 2) in base was seen, ns."""
+        return now - self._seen_at[self.sectors_of(points)]
+
+    def _on_body(self, points: Array, margin: float) -> NDArray[np.bool_]:
+        body = self._footprint
+        on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
+            np.abs(points[:, 1]) < body.half_width + margin
+        )
+        return on
+
+
+def _sector(bearings: Array) -> Sectors:
+    return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
 
 
 class ObstacleGuard:

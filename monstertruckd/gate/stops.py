@@ -14,10 +14,10 @@ from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.arbitration import Source
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, ShaftCheck, SteeringCheck
-from monstertruckd.gate.sources import Source
 
 GATE: Final = "gate"
 """Source of causes that only the gate itself knows."""

@@ -16,8 +16,7 @@ from pydantic import Field
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.motion import integrate, integration_jacobians
+from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription

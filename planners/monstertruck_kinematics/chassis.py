@@ -3,7 +3,7 @@
 A motion is asked for in one of two forms, and ``forms`` says which of them a body takes:
 
 - ``axles``: the motion of an equivalent bicycle about the base point, by its speed along the direction of travel and
-  the angles of its two axles, whatever angles the wheels of a real linkage have (``axles.LinkedAxles``). ``freedom`` is
+  the angles of its two axles, whatever angles the wheels of a real linkage have (``truck.LinkedAxles``). ``freedom`` is
   the set of axle angles that a body can take.
 - ``twist``: the velocity (vx, vy, wz) of the base itself.
 
@@ -28,13 +28,22 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import ClassVar, Final, Literal
 
-from monstertruck_kinematics.axles import FULL, Axles, IdealAxles, LinkedAxles, Range, Reach, TurnDeficit
 from monstertruck_kinematics.drive import Drive, Twist, refuse
-from monstertruck_kinematics.elementary import KinematicsError, clip, signed_hypot
-from monstertruck_kinematics.motion import twist_at
+from monstertruck_kinematics.elementary import KinematicsError, clip, signed_hypot, twist_at
 from monstertruck_kinematics.polynomials import AxlePolynomials, PolynomialSet, SteeringPolynomials
 from monstertruck_kinematics.steered import WHEEL_NAMES, Ackermann, Bicycle, IndependentSteer, Synchro, Tricycle
-from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, DriveTrain, FourWheelSteering
+from monstertruck_kinematics.truck import (
+    FULL,
+    MAX_AXLE_ANGLE,
+    Axles,
+    DriveTrain,
+    FourWheelSteering,
+    IdealAxles,
+    LinkedAxles,
+    Range,
+    Reach,
+    TurnDeficit,
+)
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 Freedom = Literal["both", "front", "parallel"]

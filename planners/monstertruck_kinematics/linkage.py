@@ -14,7 +14,6 @@ import numpy as np
 from monstertruck_kinematics.elementary import (
     KinematicsError,
     Real,
-    all_positive,
     asin,
     atan,
     atan2,
@@ -26,7 +25,7 @@ from monstertruck_kinematics.elementary import (
     sin,
     sqrt,
 )
-from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.truck import FourWheelSteering, least_squares_motion
 
 _NEWTON_STEPS = 50
 
@@ -143,25 +142,6 @@ class SteeringLinkage:
         miss = abs(error) / self.arm
         require_within("left: wheel angle out of the servo's reach, miss", miss, 0.0, 1e-9)
         return self._side * servo
-
-
-def least_squares_motion(geometry: FourWheelSteering, angles: tuple[Real, Real, Real, Real]) -> tuple[Real, Real]:
-    """Tan(sideslip) and turning of ``common_motion``, for wheel angles known to be below 89 deg.
-
-    Raises:
-        KinematicsError: wheels that leave the motion undetermined.
-    """
-    zero = 0.0 * angles[0]
-    bb, bk, kk, bs, ks = zero, zero, zero, zero, zero
-    for (x, y), angle in zip(geometry.wheel_positions, angles, strict=True):
-        side, drive = cos(angle), sin(angle)
-        turn = y * drive + x * side
-        bb, bk, kk = bb + side * side, bk + side * turn, kk + turn * turn
-        bs, ks = bs + side * drive, ks + turn * drive
-    determinant = bb * kk - bk * bk
-    if not all_positive(determinant - 1e-12 * (bb * geometry.wheelbase) ** 2):
-        raise KinematicsError("angles: all wheels roll towards one point, the turning rate is undetermined")
-    return (bs * kk - ks * bk) / determinant, (bb * ks - bk * bs) / determinant
 
 
 def common_motion(

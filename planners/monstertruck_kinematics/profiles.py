@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from monstertruck_kinematics.drive import Drive
-from monstertruck_kinematics.elementary import Array, KinematicsError, require_finite, require_positive
-from monstertruck_kinematics.motion import integrate
+from monstertruck_kinematics.elementary import Array, KinematicsError, integrate, require_finite, require_positive
 
 
 @dataclass(frozen=True)

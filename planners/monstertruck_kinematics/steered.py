@@ -22,8 +22,8 @@ from monstertruck_kinematics.elementary import (
     sign,
     sin,
     tan,
+    to_world,
 )
-from monstertruck_kinematics.motion import to_world
 from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, FourWheelSteering
 from monstertruck_kinematics.wheels import FixedWheel, SteeredWheel, Wheel
 
@@ -214,7 +214,7 @@ class Ackermann:
         """Bicycle angle of two front wheels: the mean of the tangents that each wheel alone gives the bicycle.
 
         For ideal wheels both are the same and cot d = (cot d_l + cot d_r)/2 (2.13), defined at 0 too. Other wheels have
-        no common ICR, and their least-squares motion another angle: see ``axles.LinkedAxles``.
+        no common ICR, and their least-squares motion another angle: see ``truck.LinkedAxles``.
         """
         tan_l, tan_r = tan(left), tan(right)
         half = 0.5 * self.track / self.wheelbase

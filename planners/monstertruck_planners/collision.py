@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.motion import integrate
+from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.state import Grid

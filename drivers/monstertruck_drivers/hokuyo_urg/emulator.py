@@ -23,13 +23,13 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     COUNTER_MASK,
     RANGE_WIDTH,
     TAG_LIMIT,
+    build_fields,
     build_reply,
     encode,
     encode_array,
     line_sum,
     wrap_lines,
 )
-from monstertruck_drivers.hokuyo_urg.session import build_fields
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 

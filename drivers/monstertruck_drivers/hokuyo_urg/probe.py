@@ -5,14 +5,15 @@ from dataclasses import asdict
 import numpy as np
 
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.hokuyo_urg.driver import Dialect, ScipSession, Sensor
 from monstertruck_drivers.hokuyo_urg.protocol import (
+    Parameters,
     ScanBlock,
     decode_scan,
     scan_command,
     scip1_scan_command,
     split_ranges,
 )
-from monstertruck_drivers.hokuyo_urg.session import Dialect, Parameters, ScipSession, Sensor
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
 

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import PulseSource
-from monstertruck_kinematics.axles import LinkedAxles
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.dynamics import SingleTrack
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_kinematics.linkage import dragged_speeds
-from monstertruck_kinematics.motion import integrate
+from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig

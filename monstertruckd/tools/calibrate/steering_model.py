@@ -14,11 +14,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from monstertruck_kinematics.axles import LinkedAxles, TurnDeficit
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_kinematics.polynomials import SERVO_LIMIT
+from monstertruck_kinematics.truck import LinkedAxles, TurnDeficit
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TruckBody
 from monstertruckd.config.truck import TruckConfig

@@ -31,8 +31,7 @@ from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.motion import integrate
+from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion

@@ -10,8 +10,7 @@ from monstertruck_estimation.fusion.compass_gate import CompassGate, HeadingInno
 from monstertruck_estimation.fusion.config import DEVIATION_SCALE, FusionConfig
 from monstertruck_estimation.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
-from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.motion import integrate, integration_jacobians
+from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
 from monstertruck_runtime.clock import SECOND
 
 

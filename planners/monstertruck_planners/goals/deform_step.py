@@ -17,10 +17,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, placed, poses_relative, scan_points
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
-from monstertruck_planners.local.core import nearest_pose
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import moved
 from monstertruck_runtime.errors import InputError

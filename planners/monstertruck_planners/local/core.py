@@ -4,7 +4,6 @@ Loads numba.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
+from monstertruck_planners.local.api import (
+    CUSP_REACHED,
+    LocalPlan,
+    LocalPlannerState,
+    PosePath,
+    direction_runs,
+    nearest_pose,
+    pose_distance,
+)
 from monstertruck_planners.local.config import LocalPlannerConfig
 from monstertruck_planners.local.elastic_band import CoveringDiscs, clearance, cover_footprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
@@ -38,9 +45,6 @@ MIN_CLEARANCE = -0.05
 CLEARANCE_ERROR = 2e-3
 """Clearances that differ by less are equal, m."""
 
-
-CUSP_REACHED = 0.1
-"""Nearer than this to a cusp of its band the truck continues with what follows, m."""
 
 PATH_CUSP_REACHED = 0.02
 """The same for a cusp of its path, m."""
@@ -328,25 +332,6 @@ def remaining_band(band: PosePath, pose: Array) -> PosePath:
         directions[0] = directions[1]
         return PosePath(rest.poses, directions)
     return rest
-
-
-def nearest_pose(band: PosePath, pose: Array) -> int:
-    """Index of the band's pose nearest to the truck, not beyond a cusp that the truck has not reached."""
-    for begin, end in direction_runs(band.directions):
-        at = begin + int(np.argmin(pose_distance(band.poses[begin:end], pose)))
-        last = band.poses[end - 1]
-        if end == len(band.poses) or math.hypot(last[0] - pose[0], last[1] - pose[1]) > CUSP_REACHED:
-            return at
-    return 0
-
-
-def direction_runs(directions: Array) -> Iterator[tuple[int, int]]:
-    """Index ranges of one direction; the pose at a cusp, which ends one, also begins the next one."""
-    cuts = [*np.flatnonzero(np.diff(directions)).tolist(), len(directions) - 1]
-    begin = 0
-    for cut in cuts:
-        yield begin, cut + 1
-        begin = cut
 
 
 def remaining_path(path: MotionPath, pose: Array) -> tuple[MotionPath, float]:

@@ -13,15 +13,20 @@ from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, pose_distance
+from monstertruck_planners.local.api import (
+    CUSP_REACHED,
+    LocalPlan,
+    LocalPlannerState,
+    PosePath,
+    direction_runs,
+    pose_distance,
+)
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.local.core import (
-    CUSP_REACHED,
     PATH_CUSP_REACHED,
     LocalPlannerCore,
     LocalRoute,
     costs_of,
-    direction_runs,
     ends_at,
     remaining_path,
     starting_at,

@@ -24,13 +24,12 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, direction_runs
 from monstertruck_planners.local.config import TebConfig
 from monstertruck_planners.local.core import (
     LocalPlannerCore,
     LocalRoute,
     costs_of,
-    direction_runs,
     ends_at,
     remaining_path,
     starting_at,

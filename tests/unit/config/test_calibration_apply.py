@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_kinematics.axles import LinkedAxles, TurnDeficit
+from monstertruck_kinematics.truck import LinkedAxles, TurnDeficit
 from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName, value_at
 from monstertruckd.config.load import load_truck, resolved

@@ -6,8 +6,15 @@ import pytest
 
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.gate.ceilings import WEAKER_ABOVE, WEAKER_BELOW, BodyLimits, beyond, stopping_distance, weakened
-from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.config import (
+    WEAKER_ABOVE,
+    WEAKER_BELOW,
+    BodyLimits,
+    GateConfig,
+    beyond,
+    stopping_distance,
+    weakened,
+)
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 BODY = BodyLimits(length=0.47, mass=7.25, pull=25.0, motor_speed=0.2196, sight=3.9)

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.visibility import SECTORS, Visibility
+from monstertruckd.gate.limiter import SECTORS, Visibility
 from tests.unit.gate.rig import Rig, scan
 
 MOUNT = (0.14, 0.0, 0.0)

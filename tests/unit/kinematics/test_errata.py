@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.axles import LinkedAxles
+from monstertruck_kinematics.elementary import twist_at
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
-from monstertruck_kinematics.motion import twist_at
 from monstertruck_kinematics.polynomials import (
     F_CORRECTED,
     F_PRINTED,
@@ -18,7 +17,7 @@ from monstertruck_kinematics.polynomials import (
     polynomial,
 )
 from monstertruck_kinematics.steered import Ackermann, Synchro
-from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
+from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, LinkedAxles
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_kinematics.wheels import analyse
 from tests.unit.kinematics.kit import H_PRINTED, round_trip_error

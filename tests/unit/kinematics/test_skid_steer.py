@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError, integrate, twist_at
 from monstertruck_kinematics.fitting import least_squares, minimax
 from monstertruck_kinematics.identification import (
     MODEL_NAMES,
@@ -20,7 +20,6 @@ from monstertruck_kinematics.identification import (
     skid_model,
     unexplained_spread,
 )
-from monstertruck_kinematics.motion import integrate, twist_at
 from monstertruck_kinematics.unsteered import SkidSteer
 
 IDEAL = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)

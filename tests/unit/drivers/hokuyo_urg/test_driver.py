@@ -11,7 +11,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
-from monstertruck_drivers.hokuyo_urg.session import build_fields
+from monstertruck_drivers.hokuyo_urg.protocol import build_fields
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceFaultError,

@@ -12,8 +12,14 @@ import pytest
 
 from monstertruck_drivers.cable import MemoryPort, PtyPort
 from monstertruck_drivers.hokuyo_urg.emulator import parse_order, parse_scip1_order
-from monstertruck_drivers.hokuyo_urg.protocol import Reply, ScipParser, decode_counter, decode_scan, sum_matches
-from monstertruck_drivers.hokuyo_urg.session import parse_fields
+from monstertruck_drivers.hokuyo_urg.protocol import (
+    Reply,
+    ScipParser,
+    decode_counter,
+    decode_scan,
+    parse_fields,
+    sum_matches,
+)
 from monstertruck_drivers.link import Link, SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual, run_wall
 from monstertruck_runtime.errors import DeviceLostError, InputError, ProtocolError

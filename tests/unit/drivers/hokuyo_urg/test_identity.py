@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from monstertruck_drivers.hokuyo_urg.protocol import line_sum
-from monstertruck_drivers.hokuyo_urg.session import (
+from monstertruck_drivers.hokuyo_urg.protocol import (
     SCIP1_PARAMETERS,
     build_fields,
+    line_sum,
     parse_fields,
     parse_identity,
     parse_parameters,

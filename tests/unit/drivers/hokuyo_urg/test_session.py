@@ -10,9 +10,8 @@ from pydantic import ValidationError
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
-from monstertruck_drivers.hokuyo_urg.protocol import build_reply
-from monstertruck_drivers.hokuyo_urg.session import Dialect, ScipSession, build_fields
+from monstertruck_drivers.hokuyo_urg.driver import Dialect, HokuyoDriver, ScipSession
+from monstertruck_drivers.hokuyo_urg.protocol import build_fields, build_reply
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from tests.unit.drivers.kit import Events, Kept

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import LocalPlannerState, PosePath
+from monstertruck_planners.local.api import LocalPlannerState, PosePath, nearest_pose
 from monstertruck_planners.local.catalog import LOCAL_PLANNERS, make_local_planner
 from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.local.core import LocalPlannerCore, LocalRoute, nearest_pose, remaining_band, remaining_path
+from monstertruck_planners.local.core import LocalPlannerCore, LocalRoute, remaining_band, remaining_path
 from monstertruck_planners.local.elastic_band import cover_footprint
 from monstertruck_planners.local.published import oriented
 from monstertruck_planners.local.teb import cost_and_gradient, resampled, teb_parameters

@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.axles import IdealAxles, LinkedAxles, TurnDeficit
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.linkage import common_motion, dragged_speeds
 from monstertruck_kinematics.polynomials import SteeringPolynomials
-from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_kinematics.truck import FourWheelSteering, IdealAxles, LinkedAxles, TurnDeficit
 
 BICYCLE, POLYNOMIALS = FourWheelSteering(), SteeringPolynomials()
 AXLES = LinkedAxles(BICYCLE, POLYNOMIALS.front, POLYNOMIALS.rear)
