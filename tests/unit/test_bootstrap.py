@@ -59,3 +59,12 @@ def test_a_fetched_program_that_is_not_the_pinned_one_is_never_stored(cache: Pat
 
 def test_every_supported_machine_has_both_digests():
     assert bootstrap.WHEEL_SHA256.keys() == bootstrap.PROGRAM_SHA256.keys() == {"x86_64", "aarch64"}
+
+
+def test_bytecode_is_compiled_with_the_environment(monkeypatch: pytest.MonkeyPatch):
+    """Where Python may not write it, every process would compile all libraries anew."""
+    commands: list[list[str]] = []
+    monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
+    monkeypatch.setattr(bootstrap.subprocess, "run", lambda command, **_: commands.append(command))
+    bootstrap.sync(("dev",))
+    assert "--compile-bytecode" in commands[0]

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from monstertruck_estimation.slam import storage
+from monstertruck_estimation.slam.closure import contradiction, describe, in_view
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
+from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, MappingEvent
 from monstertruck_estimation.slam.scan_matcher import ScanMatcher
 from monstertruck_estimation.slam.scans import prepare_input
@@ -125,8 +127,11 @@ def _warm_up() -> None:
     """Compile everything before the first scan is due."""
     angles = np.linspace(-2.0, 2.0, 200)
     estimator = MappingEstimator(MapperConfig(), GridConfig())
-    for i in range(4):
-        ranges = 2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    scans, poses = [], np.zeros((4, 3))
+    poses[:, 0] = 0.2 * np.arange(4)
+    for i, pose in enumerate(poses):
+        along, across = np.cos(angles), np.sin(angles)
+        ranges = np.minimum((2.0 - pose[0] * np.sign(along)) / np.abs(along), 2.0 / np.abs(across))
         inputs = ScanInput(
             stamp=(i + 1) * 10**8,
             ranges=ranges,
@@ -134,7 +139,15 @@ def _warm_up() -> None:
             angle_increment=float(angles[1] - angles[0]),
             range_min=0.02,
             range_max=5.6,
-            odom=(0.2 * i, 0.0, 0.0),
+            odom=(float(pose[0]), 0.0, 0.0),
         )
-        estimator.step(prepare_input(inputs, 30.0), inputs)
+        scans.append(prepare_input(inputs, 30.0))
+        estimator.step(scans[-1], inputs)
+    estimator.mapper.map.optimise()
     estimator.changes()
+    # What a few scans of a small room do not come to: loops that are closed, and a saved map.
+    points = scans[0].points
+    describe(points)
+    contradiction(scans, poses, scans, poses)
+    in_view(scans, poses, points)
+    EvidenceGrid(storage.trinary(estimator.patch())).judge(poses[0], points, np.zeros(2))

@@ -20,7 +20,9 @@ from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
-from monstertruck_planners.route.api import Vehicle
+from monstertruck_planners.route.api import Vehicle, warm_up
+from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
@@ -285,7 +287,11 @@ class DeformingWorker(DeformStep):
         super().__init__()
         cells = np.zeros((100, 100), np.bool_)
         cells[45:55, 45:55] = True
-        poses = np.column_stack((np.linspace(0.5, 3.5, 31), np.full(31, 2.0), np.zeros(31)))
-        guide, surroundings = PosePath(poses, np.ones(31)), DistanceField(cells, 0.04)
+        surroundings = DistanceField(cells, 0.04)
+        warm_up(make_planner(Vehicle.truck(), HybridConfig()))
+        # Past the box, into it, and with the truck at it.
         for config in (RsbandConfig(effort=200), TebConfig(effort=200)):
-            make_local_planner(Vehicle.truck(), config).plan(guide, surroundings, poses[0], LocalPlannerState())
+            planner = make_local_planner(Vehicle.truck(), config)
+            for y, start in ((1.2, 0.5), (2.0, 0.5), (2.36, 2.0)):
+                poses = np.column_stack((np.linspace(start, 3.5, 31), np.full(31, y), np.zeros(31)))
+                planner.plan(PosePath(poses, np.ones(31)), surroundings, poses[0], LocalPlannerState())

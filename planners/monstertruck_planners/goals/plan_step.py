@@ -22,7 +22,7 @@ from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
 from monstertruck_planners.route.catalog import make_planner
-from monstertruck_planners.route.config import HybridConfig, LatticeConfig
+from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_planners.track.segments import stops
@@ -430,5 +430,6 @@ class PlanningWorker(PlanningStep):
 
     def __init__(self) -> None:
         super().__init__()
-        for config in (HybridConfig(effort=200), LatticeConfig(effort=200)):
+        for config in (HybridConfig(), LatticeConfig(), GridAstarConfig()):
             warm_up(make_planner(Vehicle.truck(), config))
+        Vehicle.truck("2ws").reeds_shepp().distance(np.zeros(3), np.ones(3))

@@ -219,7 +219,7 @@ class Vehicle:
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
-WARM_UP_EFFORT = 200
+WARM_UP_EFFORT = 6000
 """See ``GoalConfig.effort``."""
 
 
@@ -356,8 +356,18 @@ def _format_pose(pose: Array) -> str:
 
 
 def warm_up(planner: RoutePlanner) -> None:
-    """Plan once on a small map, so that numba compiles everything (or reads its cache) beforehand."""
+    """Plan on two small maps, so that numba compiles everything (or reads its cache) beforehand.
+
+    The second one is the first with a wall whose gap is too narrow.
+    """
+    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT})
+    planner = make_planner(planner.vehicle, config)
+    ends = (2.0, 4.0, 0.0), (6.0, 4.0, 1.0)
     cells = np.zeros((80, 80), np.int8)
     cells[38:42, 36:44] = 100
-    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT})
-    make_planner(planner.vehicle, config).plan(RouteMap.from_cells(cells, 0.1), (2.0, 4.0, 0.0), (6.0, 4.0, 1.0))
+    route_map = RouteMap.from_cells(cells, 0.1)
+    path = planner.plan(route_map, *ends).path
+    if path is not None:
+        path.part(0.1, path.length).base_poses(0.1)
+    cells[:60, 40] = cells[63:, 40] = 100
+    planner.plan(RouteMap.from_cells(cells, 0.1, previous=route_map), *ends)
