@@ -94,9 +94,9 @@ def parsers() -> dict[str, Stream | Whole]:
         "scip": Stream(
             scip.ScipParser, [(data, scip.ScipParser().feed(data)[0]) for data in replies], held=2 * scip.MAX_REPLY
         ),
-        "os4000": Stream(os4000.Parser, [(data, os4000.parse(data)) for data in sentences]),
+        "os4000": Stream(os4000.Os4000Parser, [(data, os4000.parse(data)) for data in sentences]),
         "maestro": Stream(maestro.Decoder, [(data, maestro.Decoder().feed(data)[0]) for data in commands]),
-        "ax12": Stream(ax12.Parser, [(packet.encode(), packet) for packet in status]),
+        "ax12": Stream(ax12.Ax12Parser, [(packet.encode(), packet) for packet in status]),
         "camera": Stream(packets.PacketParser, [(packet.encode(), packet) for packet in pictures], held=HELD_LIMIT),
         "epos": Whole(_epos, (epos.FrameError,), [_epos_frame(entry) for entry in (od.STATUSWORD, od.TARGET_VELOCITY)]),
         "jpeg": Whole(webcam_driver.complete, (ValueError,), [_jpeg(rng)]),

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.body import TurnDeficit
+from monstertruck_schemas.body import TurnDeficitConfig
 from monstertruckd.config.truck import TruckConfig
 
 C = TypeVar("C", bound=TruckConfig)
@@ -49,7 +49,7 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
         ),
         f"{STEERING}.dead_time",
         f"{STEERING}.lag",
-        *(f"body.turn_deficit.{name}" for name in TurnDeficit.model_fields),
+        *(f"body.turn_deficit.{name}" for name in TurnDeficitConfig.model_fields),
     ),
 }
 """Values of the configuration that each wizard may set; a calibration never touches any other."""

@@ -316,7 +316,7 @@ class GateService:
         )
 
     def _mark_latch(self, mode: GateMode) -> None:
-        """Mark an emergency stop before anybody is told of it, and clear the mark once the disk agrees.
+        """Mark an emergency stop before it is reported, and clear the mark once the disk agrees.
 
         The thread that stores the latch never touches the mark: a stop that is ordered while the one before is being
         removed from the disk keeps its own.

@@ -88,7 +88,7 @@ class LogOutputThread:
     def __init__(self, handler: LossyQueueHandler, output: logging.Handler) -> None:
         self._handler = handler
         self._output = output
-        self._told = 0
+        self._reported = 0
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
 
@@ -103,9 +103,9 @@ class LogOutputThread:
     def _run(self) -> None:
         while (record := self._handler.records.get()) is not None:
             self._output.handle(record)
-            if (lost := self._handler.lost) > self._told:
-                text = f"{lost - self._told} records lost: this output was stuck"
-                self._told = lost
+            if (lost := self._handler.lost) > self._reported:
+                text = f"{lost - self._reported} records lost: this output was stuck"
+                self._reported = lost
                 self._output.handle(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))
 
 

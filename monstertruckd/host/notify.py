@@ -82,7 +82,7 @@ class NotifyService:
         self._status = status
         self._up = False
         self._seen_ticks = 0
-        self._told_status = ""
+        self._sent_status = ""
 
     def up(self) -> None:
         """Everything has been started; from now on the tick alone decides."""
@@ -112,11 +112,11 @@ class NotifyService:
         lines = [*first]
         if first or kept_pace:
             lines += self._ping
-        if status != self._told_status:
+        if status != self._sent_status:
             lines.append(f"STATUS={status}")
         if not lines or not self._send(*lines):
             return False
-        self._told_status = status
+        self._sent_status = status
         return True
 
 

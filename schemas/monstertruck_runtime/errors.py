@@ -74,7 +74,7 @@ class DeviceLostError(DeviceError):
 
 
 class DeviceRestartedError(DeviceLostError):
-    """The device restarted while its link stayed up: what it was told is forgotten."""
+    """The device restarted while its link stayed up: its settings are lost."""
 
     reason = Reason.DEVICE_RESTARTED
 

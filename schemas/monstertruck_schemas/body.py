@@ -45,7 +45,7 @@ class BodyConfig(Schema):
     kind: str
 
 
-class TurnDeficit(Schema):
+class TurnDeficitConfig(Schema):
     """What the axles turn less than their linkage says; dimensionless, 0 = as it says.
 
     The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and the side to which its
@@ -65,7 +65,7 @@ class TruckBody(BodyConfig):
     """Two steered axles, one motor for all four wheels."""
 
     kind: Literal["truck"] = "truck"
-    turn_deficit: TurnDeficit = TurnDeficit()
+    turn_deficit: TurnDeficitConfig = TurnDeficitConfig()
     """By circles to both sides, with each axle alone and with both"""
 
 

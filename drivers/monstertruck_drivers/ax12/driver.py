@@ -61,7 +61,7 @@ class Joint:
         self.torque = TorqueState.ABSENT
         self._present: Present | None = None
         self._error = Alarm(0)
-        self._told = Alarm(0)
+        self._reported = Alarm(0)
         self._clean_since = self._clock.now()
         self._misses = 0
         self._ask_at = 0
@@ -237,12 +237,12 @@ class Joint:
     def _tell_alarms(self, error: Alarm, now: int) -> None:
         """Each bit once, until all were clear for a while."""
         if not error:
-            if self._told and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
-                self._told = Alarm(0)
+            if self._reported and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
+                self._reported = Alarm(0)
             return
         self._clean_since = now
-        new = error & ~self._told
-        self._told |= error
+        new = error & ~self._reported
+        self._reported |= error
         if new:
             self._tell(Reason.DEVICE_FAULT, Severity.WARNING, f"reports {alarm_names(new)}", error=int(error))
 

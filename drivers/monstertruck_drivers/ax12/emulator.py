@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
-from monstertruck_drivers.ax12.protocol import Alarm, Instruction, Packet, Parser
+from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Instruction, Packet
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, Trail
@@ -188,12 +188,12 @@ class Ax12Bus:
 
     async def run(self, end: DeviceEnd) -> None:
         """Serve the host that has the port open."""
-        parser, heard = Parser(), 0
+        parser, heard = Ax12Parser(), 0
         while True:
             data = await end.read()
             now = self._clock.now()
             if now - heard > BYTE_GAP:
-                parser = Parser()
+                parser = Ax12Parser()
             heard = now
             self.received.extend(data)
             if self._echo:

@@ -219,7 +219,7 @@ def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
     return Packet(BROADCAST, Instruction.SYNC_WRITE, bytes((start.address, lengths.pop())) + rows).encode()
 
 
-class Parser:
+class Ax12Parser:
     """Bytes in, packets out, however they are cut; bounded by one packet.
 
     Nothing is stuffed: a header may occur inside parameters. So packets are taken by their length and proven by

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from monstertruck_drivers.ax12 import protocol
-from monstertruck_drivers.ax12.protocol import Alarm, Packet, Parser, Register, alarm_names
+from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Packet, Register, alarm_names
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
@@ -131,7 +131,7 @@ class Ax12Session:
         self._link.discard()
         self._link.write(request)
         # A damaged length must not make the parser wait for more than can come.
-        parser = Parser(longest=max(len(request) - 4, count + 2))
+        parser = Ax12Parser(longest=max(len(request) - 4, count + 2))
         echo_due = self.echo
         end = self._clock.now() + round(self._timeout(len(request) + 6 + count) * SECOND)
         while (left := end - self._clock.now()) > 0:

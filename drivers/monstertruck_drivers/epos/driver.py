@@ -192,7 +192,7 @@ class EposDriver:
         """
         async with await self._port.open() as link:
             line = Exchanger(link, self.clock, self.config.node, self._quiet_until)
-            session = _Session(self, line)
+            session = _DriveSession(self, line)
             try:
                 await session.start()
                 await session.serve(ready)
@@ -205,7 +205,7 @@ class EposDriver:
                     self._quiet_until = line.quiet_until
 
 
-class _Session:
+class _DriveSession:
     """One connection: what was sent and what the controller last said."""
 
     def __init__(self, driver: EposDriver, line: Exchanger) -> None:
@@ -228,7 +228,7 @@ class _Session:
         self._fault: int | None = None
         self._stopping = False
         """The quick stop that is wanted now was sent."""
-        self._told_off = False
+        self._commanded_off = False
         """The power stage was switched off by this host."""
         self._prepared = False
         """Mode and profile are those configured."""
@@ -315,13 +315,13 @@ class _Session:
     async def serve(self, ready: Ready) -> None:
         """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
         schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
-        failures, told_ready = 0, False
+        failures, reported_ready = 0, False
         while True:
             try:
                 await self._cycle()
                 self._judge_link()
-                if not told_ready and self._state not in FAULTED:
-                    told_ready = True
+                if not reported_ready and self._state not in FAULTED:
+                    reported_ready = True
                     ready()
                 await self._idle(schedule.step())
             except (DeviceTimeoutError, ProtocolError):
@@ -445,7 +445,7 @@ class _Session:
         if self._state in OFF and was not in OFF:
             self._prepared = False
             await self._check_mark()
-            if was is State.ENABLED and not self._told_off:
+            if was is State.ENABLED and not self._commanded_off:
                 raise DeviceRestartedError("the controller restarted")
         if self._state in FAULTED:
             await self._attend_fault()
@@ -476,7 +476,7 @@ class _Session:
             await self._control(control)
 
     async def _control(self, control: Control) -> None:
-        self._told_off = control is Control.DISABLE_VOLTAGE
+        self._commanded_off = control is Control.DISABLE_VOLTAGE
         try:
             await self._line.write(od.CONTROLWORD, control)
         except ObjectError as error:

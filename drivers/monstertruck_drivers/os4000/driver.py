@@ -25,7 +25,7 @@ LOOKS: Final = 2
 class Os4000Driver:
     """Listens; writes a setting only where the unit behaves otherwise than configured.
 
-    Baud rates are not hunted for: a port opens at its configured rate, and a unit at another one shows as bytes
+    Baud rates are not searched: a port opens at its configured rate, and a unit at another one shows as bytes
     without a sentence. Stamps are arrival times minus ``config.delay``; the unit has no clock.
 
     Args:

@@ -198,7 +198,7 @@ def value(number: int) -> bytes:
 
 
 @dataclass(slots=True)
-class Parser:
+class Os4000Parser:
     """Sentences out of a byte stream, however it is cut; bounded, never stuck.
 
     Text that is no sentence (prompts, answers, other formats) is kept in ``text`` until taken.

@@ -6,7 +6,7 @@ from typing import Final
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.os4000 import protocol
-from monstertruck_drivers.os4000.protocol import FORMAT_TAGGED, Fields, Key, Parser, Sentence, is_other_format
+from monstertruck_drivers.os4000.protocol import FORMAT_TAGGED, Fields, Key, Os4000Parser, Sentence, is_other_format
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
 
@@ -29,7 +29,7 @@ class Os4000Session:
     """
 
     def __init__(self, link: Link, clock: Clock) -> None:
-        self.parser = Parser()
+        self.parser = Os4000Parser()
         self.bytes_heard = 0
         self._link = link
         self._clock = clock

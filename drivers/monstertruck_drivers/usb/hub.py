@@ -50,7 +50,7 @@ class _Slot:
 
 
 @dataclass(slots=True)
-class _Outage:
+class _HubOutage:
     """A hub that is gone, or whose devices are; ends when they may start."""
 
     hub: str
@@ -78,7 +78,7 @@ class HubCoordinator:
         self._events = events
         self._slots: dict[str, _Slot] = {}
         self._judging: dict[str, int] = {}
-        self._outages: dict[str, _Outage] = {}
+        self._outages: dict[str, _HubOutage] = {}
         self._looked = False
         self._turn = asyncio.Event()
         self.on_miss: Callable[[], None] = _nothing
@@ -184,9 +184,9 @@ class HubCoordinator:
                 if before is None or not _alike(before, slot.device):
                     self._tell_if_moved(name, slot.device)
                 if slot.device.hub:  # a new hub's devices start one after the other, too
-                    self._outages[name] = _Outage(name, now, now, {name}, announced=False)
+                    self._outages[name] = _HubOutage(name, now, now, {name}, announced=False)
 
-    def _outage_of(self, name: str) -> _Outage | None:
+    def _outage_of(self, name: str) -> _HubOutage | None:
         return next((self._outages[hub] for hub in (name, *ancestors(name)) if hub in self._outages), None)
 
     def _judge(self, now: int) -> None:
@@ -205,7 +205,7 @@ class HubCoordinator:
             inner = [self._outages.pop(name) for name in list(self._outages) if hub in ancestors(name)]
             members = group.union(*(outage.members for outage in inner))
             since = min(lost[name] for name in group)
-            self._outages[hub] = _Outage(hub, since, now, members, announced=True)
+            self._outages[hub] = _HubOutage(hub, since, now, members, announced=True)
             self._tell_lost(hub, members)
 
     def _lost_hub(self, name: str, lost: Mapping[str, int]) -> str | None:
@@ -218,12 +218,12 @@ class HubCoordinator:
                 top = hub
         return top
 
-    def _back(self, outage: _Outage) -> list[str]:
+    def _back(self, outage: _HubOutage) -> list[str]:
         """Devices behind the hub that are there again, in the order they shall start."""
         back = [name for name in outage.members if self._slots[name].present and not self._is_hub(name)]
         return sorted(back, key=self._start_rank)
 
-    def _pause(self, outage: _Outage) -> int:
+    def _pause(self, outage: _HubOutage) -> int:
         """Nanoseconds without change after which a returned hub's devices may start."""
         return _ns(self._config.settle if self._back(outage) else self._config.patience)
 
@@ -280,7 +280,7 @@ class HubCoordinator:
             roles=self._roles_at(devices),
         )
 
-    def _tell_returned(self, outage: _Outage, back: list[str], now: int) -> None:
+    def _tell_returned(self, outage: _HubOutage, back: list[str], now: int) -> None:
         missing = sorted((m for m in outage.members if not self._slots[m].present), key=sort_key)
         text = f"hub {outage.hub} is back with {self._names(back) or 'no devices'}"
         if missing:
@@ -407,7 +407,7 @@ class UsbService:
         self._published: tuple[UsbNode, ...] = ()
         self._publish_at = 0
         self._look_at = 0
-        self._told_asleep: dict[str, int] = {}
+        self._reported_asleep: dict[str, int] = {}
 
     async def run(self, ready: Ready) -> None:
         """Watch until cancelled."""
@@ -448,8 +448,8 @@ class UsbService:
         rescan = min(self._config.rescan, IMPATIENT) if self._hubs.waiting else self._config.rescan
         self._look_at = self._clock.now() + round(rescan * SECOND)
         for node in self._hubs.tree():
-            if node.role is not None and node.autosuspend and self._told_asleep.get(node.name) != node.replugs:
-                self._told_asleep[node.name] = node.replugs
+            if node.role is not None and node.autosuspend and self._reported_asleep.get(node.name) != node.replugs:
+                self._reported_asleep[node.name] = node.replugs
                 await self._keep_awake(node)
 
     async def _keep_awake(self, node: UsbNode) -> None:

@@ -243,7 +243,7 @@ class HubPort:
         self._role = role
         self._opened_at: int | None = None
         self._short_sessions = 0
-        self._told_slow = False
+        self._reported_slow = False
 
     async def open(self) -> Link:
         """Wait for the device's turn, find its node, open it.
@@ -279,10 +279,10 @@ class HubPort:
         device = self._machine.dev / node.name
         latency = await self._machine.offload(lambda: set_latency(self._machine.sysfs, node, device, wanted))
         slow = latency is not None and latency > wanted
-        if slow and not self._told_slow:
+        if slow and not self._reported_slow:
             text = f"{self.name}: latency stays at {latency} ms instead of {wanted} ms; {ADVICE}"
             self._events(Reason.SLOW_LINK, Severity.WARNING, self._role or "usb", text, latency_ms=latency)
-        self._told_slow = slow
+        self._reported_slow = slow
 
     async def _cycle_if_hopeless(self) -> None:
         """Switch the port off and on when sessions on it keep ending early."""

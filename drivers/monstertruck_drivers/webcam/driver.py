@@ -96,7 +96,7 @@ class WebcamDriver:
         self._clock = clock
         self._out = out
         self._events = events
-        self._told_mode: Mode | None = None
+        self._reported_mode: Mode | None = None
         self._refusing = False
         self._doubting = False
         self._stamp = -OLDEST
@@ -119,10 +119,10 @@ class WebcamDriver:
             await self._serve(stream, ready)
 
     def _tell_mode(self, wanted: Mode, granted: Mode) -> None:
-        if granted != wanted and granted != self._told_mode:
+        if granted != wanted and granted != self._reported_mode:
             text = f"the camera gives {granted}, configured is {wanted}"
             self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, text)
-        self._told_mode = granted
+        self._reported_mode = granted
 
     async def _serve(self, stream: FrameStream, ready: Ready) -> None:
         patience = self._config.watchdog

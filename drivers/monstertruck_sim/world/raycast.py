@@ -1,4 +1,4 @@
-"""Exact ray casting and footprint contact on an occupancy grid, compiled.
+"""Exact ray casting and footprint contact on an occupancy grid, by numba.
 
 A range is the distance to the boundary of the first occupied cell, not a multiple of the cell size. A ray leaps over
 the empty square around its cell, as large as the grid's ``clearance`` there allows, to the very point at which it

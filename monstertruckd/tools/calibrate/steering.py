@@ -120,7 +120,7 @@ class SteeringWizard:
         return found
 
     @staticmethod
-    async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[Reach]":
+    async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[AxleTravel]":
         """How far each axle follows to each side."""
         speed, metres = TRAVEL
         limit = context.config.gate.angle
@@ -132,7 +132,7 @@ class SteeringWizard:
                 for direction in (1, -1):
                     move = MoveStep(f"{name} wheels far {side}", direction * speed, front, rear, metres)
                     legs.append(SteeringRun.of(await context.move(move), maps))
-                reached.append(Reach.of(axle, sign, legs, model, first))
+                reached.append(AxleTravel.of(axle, sign, legs, model, first))
         return reached
 
     async def _straights(self, context: WizardContext, maps: Maps) -> list[SteeringRun]:
@@ -153,7 +153,7 @@ class SteeringWizard:
 
     @staticmethod
     async def _circles(
-        context: WizardContext, maps: Maps, model: SteeringModel, first: Maps, travel: "list[Reach]"
+        context: WizardContext, maps: Maps, model: SteeringModel, first: Maps, travel: "list[AxleTravel]"
     ) -> list[SteeringRun]:
         """A full turn to each side with each axle and with both, which no slow error of the compass can falsify.
 
@@ -179,11 +179,16 @@ class SteeringWizard:
     # Judging
 
     def _result(
-        self, context: WizardContext, model: SteeringModel, legs: list[SteeringRun], first: Maps, travel: "list[Reach]"
+        self,
+        context: WizardContext,
+        model: SteeringModel,
+        legs: list[SteeringRun],
+        first: Maps,
+        travel: "list[AxleTravel]",
     ) -> Result:
         fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
-        travel = [Reach.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
+        travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
         halves, share = half_widths(fit), _way_error(context) + WHEELBASE
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
@@ -231,7 +236,7 @@ def steering_wizard(settings: SteeringWizard | None = None) -> Wizard:
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class AxleTravel:
     """How far an axle follows to one side."""
 
     axle: int
@@ -250,7 +255,7 @@ class Reach:
     """Arcs with the wheels far over."""
 
     @classmethod
-    def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "Reach":
+    def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
         """From arcs with the wheels far over, as far as ``maps`` tell where the other axle stood."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT

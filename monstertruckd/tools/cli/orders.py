@@ -86,11 +86,11 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
     if json_output:
         print_json(outcome.as_json())
     elif outcome.reason is Reason.OK:
-        print("; ".join(_told(outcome.state)))
+        print("; ".join(_state_texts(outcome.state)))
     finish(outcome.reason, f"{name} refused: {outcome.text}")
 
 
-def _told(state: "GateState") -> Iterator[str]:
+def _state_texts(state: "GateState") -> Iterator[str]:
     yield state.mode.value
     if state.holder is not None:
         yield f"{state.holder} drives"

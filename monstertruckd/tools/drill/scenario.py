@@ -61,7 +61,7 @@ GOALS: Final = {
 COLUMNS: Final = ("fault", "detected", "stop bytes", "standstill", "metres", "reason", "back")
 
 
-class Station:
+class DrivingStation:
     """A station that sends drive requests, 20 a second, until it is made silent.
 
     Args:
@@ -115,7 +115,7 @@ class ScenarioContext(SimContext):
     """
 
     bus: Bus
-    station: Station
+    station: DrivingStation
     began: int
 
     def poison(self, topic: Topic[Any]) -> None:
@@ -253,7 +253,7 @@ class _ScenarioRun:
         self.driven = driven
         self.clock = truck.clock
         self.observer = truck.observer
-        self.station = Station(rig.bus, truck.clock)
+        self.station = DrivingStation(rig.bus, truck.clock)
         self.context = ScenarioContext(
             config=rig.context.config,
             devices=rig.context.devices,

@@ -24,9 +24,9 @@ MODES: Final = {mode.value: mode for mode in GateMode}
 
 
 def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
-    """Install ``plan`` over the installed service and restart it; undo both unless it tells systemd that it is ready.
+    """Install ``plan`` over the installed service and restart it; undo both unless it reports READY.
 
-    The restart returns once the daemon has told READY, which it does after its first control tick, or has failed to.
+    The restart returns once the daemon has reported READY, as it does after its first control tick, or has failed to.
 
     Raises:
         InputError: the system below ``root`` does not run, or see ``install``.
@@ -85,14 +85,14 @@ def _replace(plan: InstallPlan, root: Path, before: list[_Before], run: Run) -> 
 
 
 def _refuse_armed(run: Run) -> None:
-    """By what the daemon last told systemd, at most a watchdog's third ago.
+    """By the status that systemd last got from the daemon, at most a watchdog's third ago.
 
     Raises:
         BusyError: the truck is armed, drives or is being stopped.
     """
-    told = dict(line.split("=", 1) for line in run(STATUS).splitlines() if "=" in line)
-    mode = MODES.get(told.get("StatusText", "").split(";")[0])
-    if told.get("ActiveState") == "active" and mode is not None and mode.active:
+    status = dict(line.split("=", 1) for line in run(STATUS).splitlines() if "=" in line)
+    mode = MODES.get(status.get("StatusText", "").split(";")[0])
+    if status.get("ActiveState") == "active" and mode is not None and mode.active:
         raise BusyError(f"the truck is {mode.value}: an upgrade restarts the daemon; disarm it first")
 
 

@@ -183,7 +183,7 @@ class First:
 
 
 @dataclass(frozen=True, slots=True)
-class _Output:
+class _TopicOutput:
     time: int
     """Daemon time at which it was handed over, ns."""
     payload: bytes
@@ -213,12 +213,12 @@ class TopicComparison:
     greatest: dict[Kind, Greatest] = field(default_factory=dict)
     first: First | None = None
     _count: int = 0
-    _recorded: dict[int, _Output] = field(default_factory=dict)
-    _again: dict[int, _Output] = field(default_factory=dict)
+    _recorded: dict[int, _TopicOutput] = field(default_factory=dict)
+    _again: dict[int, _TopicOutput] = field(default_factory=dict)
 
     def recorded(self, sequence: int, time: int, payload: bytes) -> None:
         """Take an output of the log: its number in the run, when (ns), its bytes."""
-        output = _Output(time, payload)
+        output = _TopicOutput(time, payload)
         if (again := self._again.pop(sequence, None)) is not None:
             self._compare(sequence, output, again)
         else:
@@ -226,7 +226,7 @@ class TopicComparison:
 
     def recomputed(self, time: int, payload: bytes) -> None:
         """Take the next output of the replay."""
-        sequence, output = self._count, _Output(time, payload)
+        sequence, output = self._count, _TopicOutput(time, payload)
         self._count += 1
         if (recorded := self._recorded.pop(sequence, None)) is not None:
             self._compare(sequence, recorded, output)
@@ -251,7 +251,7 @@ class TopicComparison:
         close = self.headers == 0 and all(one.value <= limit for one in self.greatest.values())
         return self.agrees(end) or (close and self.missing == self.surplus(end) == 0)
 
-    def _compare(self, sequence: int, recorded: _Output, again: _Output) -> None:
+    def _compare(self, sequence: int, recorded: _TopicOutput, again: _TopicOutput) -> None:
         self.compared += 1
         if recorded.payload == again.payload:
             self.equal += 1

@@ -47,14 +47,14 @@ S = TypeVar("S", bound=Schema)
 Rank = Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]
 
 
-class Station(Schema):
+class CertifiedStation(Schema):
     """One certificate that is let in."""
 
     role: AccessRole
     rank: Rank = Role.STATION
 
 
-class Register(Schema):
+class CertificateRegister(Schema):
     """What an authority has certified."""
 
     robot: str
@@ -62,7 +62,7 @@ class Register(Schema):
     """Addresses and host names of the robot."""
     place: Path = PLACE
     """Where the robot keeps its files."""
-    stations: dict[OwnerName, Station] = {}
+    stations: dict[OwnerName, CertifiedStation] = {}
 
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
         """Names with one of these roles."""
@@ -91,7 +91,7 @@ class Folder:
         self.path = path
         self.robot = path / "robot"
 
-    def register(self) -> Register:
+    def register(self) -> CertificateRegister:
         """What is certified.
 
         Raises:
@@ -101,7 +101,7 @@ class Folder:
         file = self.path / "register.yaml"
         if not file.is_file():
             raise NotFoundError(f"{self.path}: no authority here; monstertruckd security init makes one")
-        return _validated(Register, read_yaml(file), file)
+        return _validated(CertificateRegister, read_yaml(file), file)
 
     def init(self, robot: str, addresses: tuple[str, ...], place: Path, now: int, days: int = ROBOT_DAYS) -> bool:
         """Make an authority, or renew the robot's certificate; True if there was none.
@@ -119,7 +119,7 @@ class Folder:
         new = not (self.path / "register.yaml").exists()
         stations = {} if new else self.register().stations
         made = {"robot": robot, "addresses": addresses, "place": place, "stations": stations}
-        register = _validated(Register, made, self.path)
+        register = _validated(CertificateRegister, made, self.path)
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         if new:
             new_authority(f"Authority of {robot}", now, AUTHORITY_DAYS).save(*self._files("authority"))
@@ -147,7 +147,7 @@ class Folder:
         """
         before = self.register()
         made = {**before.stations, name: {"role": role, "rank": rank}}
-        register = _validated(Register, before.model_dump() | {"stations": made}, name)
+        register = _validated(CertificateRegister, before.model_dump() | {"stations": made}, name)
         files = self._files(f"issuers/{name}")
         files[0].parent.mkdir(mode=0o700, exist_ok=True)
         if not files[1].exists():
@@ -215,7 +215,7 @@ class Folder:
         """
         return _validated(ZenohConfig, _zenoh(self.register()), self.path)
 
-    def _write(self, register: Register) -> None:
+    def _write(self, register: CertificateRegister) -> None:
         """The register, and what follows from it for the robot."""
         replace_file(self.path / "register.yaml", yaml_text(register.model_dump(mode="json")))
         driving = register.of_role(AccessRole.PILOT, AccessRole.ENGINEER)
@@ -231,7 +231,7 @@ class Folder:
         return self.path / f"{name}.pem", self.path / f"{name}.key"
 
 
-def _zenoh(register: Register) -> dict[str, Any]:
+def _zenoh(register: CertificateRegister) -> dict[str, Any]:
     """The robot's configuration as plain data."""
     place = register.place
     tls: dict[str, Any] = {

@@ -27,7 +27,7 @@ VERIFIED: Final = 3e6
 """and of verifying a match."""
 
 
-class Budget:
+class ScanBudget:
     """Work left at one scan. The first piece is always done, so that every search ends."""
 
     def __init__(self, units: float = BUDGET) -> None:
@@ -43,7 +43,7 @@ class Budget:
         return True
 
 
-class Progress(Generic[T]):
+class PiecewiseSearch(Generic[T]):
     """A search that is continued scan by scan."""
 
     def __init__(self, pieces: Pieces[T]) -> None:
@@ -52,7 +52,7 @@ class Progress(Generic[T]):
         self.result: T | None = None
         """Its result once it has ended."""
 
-    def run(self, budget: Budget) -> bool:
+    def run(self, budget: ScanBudget) -> bool:
         """Do pieces while the budget allows it; True when the search has ended."""
         while budget.allows(self._cost):
             try:

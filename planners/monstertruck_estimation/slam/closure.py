@@ -25,9 +25,9 @@ from monstertruck_estimation.slam.budget import (
     EDGE_OPTIMISED,
     ELEMENT,
     VERIFIED,
-    Budget,
     Pieces,
-    Progress,
+    PiecewiseSearch,
+    ScanBudget,
     finished,
 )
 from monstertruck_estimation.slam.correlation import Submap, correlate, look_ups, merged
@@ -134,7 +134,7 @@ class LoopCloser:
         self._tried: dict[int, int] = {}
         self._fingerprints: dict[int, Array] = {}
         self._waiting: list[int] = []
-        self._progress: Progress[bool] | None = None
+        self._progress: PiecewiseSearch[bool] | None = None
         self.searches = 0
         """Searches made."""
         self.refused = 0
@@ -149,11 +149,11 @@ class LoopCloser:
         """Search from keyframe ``at`` in its turn; beyond ``MOST_WAITING`` the oldest are dropped."""
         self._waiting = [*self._waiting, at][-MOST_WAITING:]
 
-    def step(self, keyframes: KeyframeMap, budget: Budget) -> bool:
+    def step(self, keyframes: KeyframeMap, budget: ScanBudget) -> bool:
         """Continue the searches; True if a closure has moved the poses."""
         while self._progress is not None or self._waiting:
             if self._progress is None:
-                self._progress = Progress(self._close(keyframes, self._waiting.pop(0)))
+                self._progress = PiecewiseSearch(self._close(keyframes, self._waiting.pop(0)))
             if not self._progress.run(budget):
                 return False
             closed, self._progress = self._progress.result, None

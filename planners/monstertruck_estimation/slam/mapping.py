@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
-from monstertruck_estimation.slam.budget import Budget
+from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.closure import PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
@@ -237,10 +237,10 @@ class Mapper:
             return ()
         poses, place = self.map.poses, between(self.map.poses[-1], self._pose)
         events: tuple[MappingEvent, ...] = ()
-        if self._closer.step(self.map, Budget()):
+        if self._closer.step(self.map, ScanBudget()):
             events += (MappingEvent.CLOSED,)
         # A search for loops within the submap must not see it moved.
-        if self.map.begin and not self._closer.busy and self._relocation.step(self.map, self._closer, Budget()):
+        if self.map.begin and not self._closer.busy and self._relocation.step(self.map, self._closer, ScanBudget()):
             self.map.begin = 0
             events += (MappingEvent.JOINED,)
         if events or self.map.poses is not poses:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_estimation.se2 import between
-from monstertruck_estimation.slam.budget import ELEMENT, Budget, Pieces, Progress
+from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, surroundings
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import KeyframeMap
@@ -148,17 +148,17 @@ class Relocation:
 
     def __init__(self) -> None:
         self._whole: tuple[int, Submap] | None = None
-        self._progress: Progress[bool] | None = None
+        self._progress: PiecewiseSearch[bool] | None = None
         self._last = -1
 
-    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: Budget) -> bool:
+    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> bool:
         """Continue the search; True if the submap was joined, which moves poses. A place found moves the submap."""
         newest = len(keyframes) - 1
         if self._progress is None:
             if newest - keyframes.begin + 1 < FEWEST_KEYS or newest == self._last:
                 return False
             self._last = newest
-            self._progress = Progress(self._joined(keyframes, closer, newest))
+            self._progress = PiecewiseSearch(self._joined(keyframes, closer, newest))
         if not self._progress.run(budget):
             return False
         joined, self._progress = self._progress.result, None

@@ -203,13 +203,13 @@ def _faces(cells: NDArray[np.int8]) -> tuple[Array, Array]:
     wall = np.pad(cells == OCCUPIED, 1).astype(np.float64)
     rows, columns = cells.shape
 
-    def beside(dx: int, dy: int) -> Array:
+    def neighbour(dx: int, dy: int) -> Array:
         return wall[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
 
-    touching = beside(1, 0) + beside(-1, 0) + beside(0, 1) + beside(0, -1) > 0
+    touching = neighbour(1, 0) + neighbour(-1, 0) + neighbour(0, 1) + neighbour(0, -1) > 0
     # Sobel's kernel: the stairs of an oblique wall give its direction roughly.
-    x = 2 * (beside(-1, 0) - beside(1, 0)) + sum(beside(-1, k) - beside(1, k) for k in (-1, 1))
-    y = 2 * (beside(0, -1) - beside(0, 1)) + sum(beside(k, -1) - beside(k, 1) for k in (-1, 1))
+    x = 2 * (neighbour(-1, 0) - neighbour(1, 0)) + sum(neighbour(-1, k) - neighbour(1, k) for k in (-1, 1))
+    y = 2 * (neighbour(0, -1) - neighbour(0, 1)) + sum(neighbour(k, -1) - neighbour(k, 1) for k in (-1, 1))
     length = np.hypot(x, y)
     # In a gap one cell wide both sides cancel; it is left out.
     at = np.nonzero((cells == FREE) & touching & (length > 0))

@@ -104,7 +104,7 @@ def escape_motion(
 
 
 @dataclass(frozen=True)
-class LocalRoute:
+class RouteInWindow:
     """The route in the window."""
 
     band: PosePath
@@ -121,7 +121,7 @@ class CycleStart:
 
     robot_pose: Array
     """Shape (3,): the truck's pose."""
-    local: LocalRoute
+    local: RouteInWindow
     state: LocalPlannerState
     """With the new band."""
 
@@ -161,7 +161,7 @@ class LocalPlannerCore:
 
     def cut(
         self, route: PosePath, obstacles: DistanceField, pose: Array, state: LocalPlannerState
-    ) -> LocalRoute | None:
+    ) -> RouteInWindow | None:
         """The rest of the last cycle's band from the truck on, and poses of the route that entered the window since.
 
         Returns:
@@ -181,7 +181,7 @@ class LocalPlannerCore:
             entered += count
         if near is None:
             return None
-        return LocalRoute(near, entered, entered == len(route.poses))
+        return RouteInWindow(near, entered, entered == len(route.poses))
 
     def _entered(self, ahead: PosePath, near: PosePath | None, obstacles: DistanceField, pose: Array) -> int:
         """Number of route poses that join the band: up to the last free one that is in the window and in reach."""
@@ -216,7 +216,7 @@ class LocalPlannerCore:
         return float(samples.travelled[max(int(np.argmin(free)) - 1, 0)])
 
     def search(
-        self, obstacles: DistanceField, pose: Array, local: LocalRoute, failed: int
+        self, obstacles: DistanceField, pose: Array, local: RouteInWindow, failed: int
     ) -> tuple[MotionPath | None, PosePath | None, Reason]:
         """Path along the band by a search of little effort, with the margin or at least without contact.
 

@@ -19,7 +19,7 @@ from monstertruck_planners.collision import DiscFootprint, DistanceField
 from monstertruck_planners.local import elastic_band
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath
 from monstertruck_planners.local.config import BandConfig, PublishedConfig
-from monstertruck_planners.local.core import LocalPlannerCore, LocalRoute, checked_pose, ends_at
+from monstertruck_planners.local.core import LocalPlannerCore, RouteInWindow, checked_pose, ends_at
 from monstertruck_planners.local.elastic_band import band_parameters, relax_band
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
@@ -99,7 +99,7 @@ class PublishedPlanner:
         path = self._reeds_shepp.path(robot_pose, goal)
         if len(path.segments) and self._states.free(obstacles, path):
             return path
-        end = LocalRoute(PosePath(goal[None], np.ones(1)), 0, final=True)
+        end = RouteInWindow(PosePath(goal[None], np.ones(1)), 0, final=True)
         return self._states.search(obstacles, robot_pose, end, 0)[0]
 
     def _joined(self, poses: Array, obstacles: DistanceField) -> MotionPath | None:

@@ -25,7 +25,7 @@ from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.local.core import (
     PATH_CUSP_REACHED,
     LocalPlannerCore,
-    LocalRoute,
+    RouteInWindow,
     costs_of,
     ends_at,
     remaining_path,
@@ -100,7 +100,7 @@ class RsbandPlanner:
 
     def _new_path(
         self,
-        local: LocalRoute,
+        local: RouteInWindow,
         obstacles: DistanceField,
         robot_pose: Array,
         state: LocalPlannerState,

@@ -28,7 +28,7 @@ from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePa
 from monstertruck_planners.local.config import TebConfig
 from monstertruck_planners.local.core import (
     LocalPlannerCore,
-    LocalRoute,
+    RouteInWindow,
     costs_of,
     ends_at,
     remaining_path,
@@ -398,14 +398,14 @@ class TebPlanner:
         after = replace(state, band=band, path=path, failed=0)
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
-    def _usable(self, rest: MotionPath, local: LocalRoute, obstacles: DistanceField) -> bool:
+    def _usable(self, rest: MotionPath, local: RouteInWindow, obstacles: DistanceField) -> bool:
         """Whether the last path may be kept: long enough, free, and not one that ends before the band does."""
         long = rest.length > self.config.shortest
         near = long and math.hypot(*(rest.end - local.band.poses[-1])[:2]) < self.config.reach / 3
         return near and self._core.free(obstacles, rest)
 
     def _from_band(
-        self, local: LocalRoute, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
+        self, local: RouteInWindow, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
     ) -> MotionPath | None:
         """The band after optimisation; None if it is broken or not free."""
         whole = starting_at(local.band, robot_pose)

@@ -178,10 +178,10 @@ class Mpc(PathTracker[MpcConfig]):
         bend = state.segment.direction * reference.curvature
         sides, yaws = [], []
         rows = np.array((turn, slip - reference.slip, reference.turn, bend, steps)).T.tolist()
-        for body_turn, beside, wanted_turn, curvature, ahead in rows:
-            along = math.cos(turned + beside) / max(1.0 - curvature * side, 0.2)
+        for body_turn, sideways, wanted_turn, curvature, ahead in rows:
+            along = math.cos(turned + sideways) / max(1.0 - curvature * side, 0.2)
             gained = ahead * (body_turn - wanted_turn * along)
-            side += ahead * math.sin(turned + 0.5 * gained + beside)
+            side += ahead * math.sin(turned + 0.5 * gained + sideways)
             turned += gained
             sides.append(side)
             yaws.append(turned)

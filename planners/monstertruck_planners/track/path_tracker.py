@@ -22,7 +22,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.response import Response, ResponseEstimator, choose, rounded
 from monstertruck_planners.track.segments import (
-    Progress,
+    PathProgress,
     Projection,
     Reference,
     ReferenceState,
@@ -177,7 +177,7 @@ class Command:
     """Of the base point along its direction of travel, m/s; negative backwards."""
     front: float
     rear: float
-    progress: Progress
+    progress: PathProgress
     cross_track: float
     """Distance of the base point from the path, m; positive left of it, seen in the direction of travel."""
     heading_error: float
@@ -336,7 +336,7 @@ class PathTracker(ABC, Generic[C]):
     def steer(self, state: TrackingState) -> Angles:
         """Wanted angles of front and rear axle, rad, not yet limited."""
 
-    def prepare(self, path: SegmentedPath, progress: Progress) -> bool:
+    def prepare(self, path: SegmentedPath, progress: PathProgress) -> bool:
         """Compute what ``control`` needs of a path's present segment, once; whether that had to be done."""
         segment = path.segments[progress.segment]
         known = self._prepared.get(id(segment))
@@ -345,7 +345,7 @@ class PathTracker(ABC, Generic[C]):
         self._prepare(segment)
         return True
 
-    def control(self, truck: TruckState, path: SegmentedPath, progress: Progress, t: float) -> Command:
+    def control(self, truck: TruckState, path: SegmentedPath, progress: PathProgress, t: float) -> Command:
         """One control step.
 
         Args:
@@ -367,7 +367,7 @@ class PathTracker(ABC, Generic[C]):
         if ended and judged is Reason.DRIVING:
             judged = self._judge(truck, segment, last=last)
         if judged is Reason.OK:
-            progress, judged = Progress(progress.segment + 1), Reason.DRIVING
+            progress, judged = PathProgress(progress.segment + 1), Reason.DRIVING
             segment = path.segments[progress.segment]
             nearest, ended = self._project(truck, segment, 0.0), False
             last = progress.segment + 1 == len(path.segments)
@@ -388,7 +388,7 @@ class PathTracker(ABC, Generic[C]):
             speed=speed,
             front=angles[0],
             rear=angles[1],
-            progress=Progress(progress.segment, nearest.s, judged),
+            progress=PathProgress(progress.segment, nearest.s, judged),
             cross_track=math.cos(nearest.tangent) * dy - math.sin(nearest.tangent) * dx,
             heading_error=wrap_angle(truck.pose[2] - state.reference.state(nearest.s).yaw),
             outcome=outcome,

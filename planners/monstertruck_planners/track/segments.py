@@ -34,7 +34,7 @@ MANY: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class PathProgress:
     """Place on a segmented path."""
 
     segment: int = 0
@@ -181,22 +181,22 @@ class SegmentedPath:
         self.length = sum(segment.length for segment in self.segments)
         self.start = self._progress_of(steps.points, first)
 
-    def along(self, progress: Progress) -> float:
+    def along(self, progress: PathProgress) -> float:
         """Metres from the line's beginning."""
         return self.segments[progress.segment].before + progress.s
 
-    def ahead(self, progress: Progress, horizon: float, count: int) -> Array:
+    def ahead(self, progress: PathProgress, horizon: float, count: int) -> Array:
         """Poses of the truck along the present segment's next ``horizon`` metres, shape (count, 3)."""
         segment = self.segments[progress.segment]
         turned = 0.0 if segment.direction > 0 else math.pi
         projections = [segment.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
         return np.array([(*nearest.point, nearest.tangent + turned) for nearest in projections])
 
-    def _progress_of(self, points: Array, vertex: int) -> Progress:
+    def _progress_of(self, points: Array, vertex: int) -> PathProgress:
         steps = np.diff(points[: vertex + 1], axis=0)
         along = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
         i = max(i for i, segment in enumerate(self.segments) if segment.before <= along)
-        return Progress(i, along - self.segments[i].before)
+        return PathProgress(i, along - self.segments[i].before)
 
 
 def check_path(path: Path) -> None:

@@ -13,7 +13,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near, poses_relative
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
-from monstertruck_planners.track.segments import Progress, SegmentedPath
+from monstertruck_planners.track.segments import PathProgress, SegmentedPath
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
@@ -124,7 +124,7 @@ class TrackingStep:
         """Clearance ahead on that path, in that scan."""
         self._followed: Path | None = None
         self._path: SegmentedPath | None = None
-        self._progress = Progress()
+        self._progress = PathProgress()
         self._begun: tuple[float, float, float] | None = None
         """Pose the path was begun from; None for one that may have to be begun anew."""
         self._outcome = Reason.DRIVING

@@ -1,8 +1,8 @@
-"""Stanley's law for any way of steering: the leading axle is pointed back to where it belongs.
+"""Stanley controller for any way of steering: the leading axle is pointed back to where it belongs.
 
-Where it belongs is the place that axle has when the base follows the path, so curves leave no error; the law is that of
-Hoffmann, Tomlin, Montemerlo and Thrun (ACC 2007). Backwards the rear axle leads. With both axles free each returns to
-its own place. A leading axle that cannot steer is returned by the truck's heading.
+Where it belongs is the place that axle has when the base follows the path, so curves leave no error; the controller is
+that of Hoffmann, Tomlin, Montemerlo and Thrun (ACC 2007). Backwards the rear axle leads. With both axles free each
+returns to its own place. A leading axle that cannot steer is returned by the truck's heading.
 """
 
 import math

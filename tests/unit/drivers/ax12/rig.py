@@ -8,7 +8,7 @@ from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
-from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Packet, Parser, Present
+from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Ax12Parser, Packet, Present
 from monstertruck_drivers.ax12.unit import Unit
 from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.link import Link
@@ -65,7 +65,7 @@ class Host:
         return data
 
     async def ask(self, request: bytes, wait: float = 0.02) -> list[Packet]:
-        return Parser().feed(await self.raw(request, wait))
+        return Ax12Parser().feed(await self.raw(request, wait))
 
     async def status(self, request: bytes) -> Packet:
         (packet,) = await self.ask(request)
@@ -102,7 +102,7 @@ def on_bench(test, config: Ax12Config | None = None, **options):
 
 def requests(rig: Rig) -> list[p.Packet]:
     """Everything the host sent so far."""
-    return p.Parser().feed(bytes(rig.bus.received))
+    return p.Ax12Parser().feed(bytes(rig.bus.received))
 
 
 def on_wire(test, **options):

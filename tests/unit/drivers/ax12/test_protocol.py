@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monstertruck_drivers.ax12 import protocol as p
-from monstertruck_drivers.ax12.protocol import LONGEST, Alarm, Packet, Parser, Present
+from monstertruck_drivers.ax12.protocol import LONGEST, Alarm, Ax12Parser, Packet, Present
 from tests.unit.drivers.ax12.rig import instruction, reg_write
 
 
@@ -47,11 +47,11 @@ def test_published_checksums(body: str, expected: int):
 )
 def test_packets_are_the_documented_bytes(packet: bytes, expected: str):
     assert packet == bytes_of(expected)
-    assert Parser().feed(packet)[0].encode() == packet
+    assert Ax12Parser().feed(packet)[0].encode() == packet
 
 
 def test_the_documented_state_of_a_unit():
-    (packet,) = Parser().feed(bytes_of("FF FF 01 0A 00 FF 01 00 00 00 00 6F 24 61"))
+    (packet,) = Ax12Parser().feed(bytes_of("FF FF 01 0A 00 FF 01 00 00 00 00 6F 24 61"))
     assert packet.unit == 1
     assert packet.code == 0
     assert Present.decode(packet.params) == Present(position=511, speed=0, load=0, voltage=111, temperature=36)
@@ -107,7 +107,7 @@ packets = st.builds(Packet, unit=st.integers(0, 254), code=st.integers(0, 255), 
 @given(st.lists(packets, max_size=6), st.lists(st.integers(1, 9), min_size=1))
 def test_packets_come_out_however_they_are_cut(sent: list[Packet], cuts: list[int]):
     wire = b"".join(packet.encode() for packet in sent)
-    parser, got, at = Parser(), [], 0
+    parser, got, at = Ax12Parser(), [], 0
     while at < len(wire):
         size = cuts[at % len(cuts)]
         got += parser.feed(wire[at : at + size])
@@ -119,7 +119,7 @@ def test_packets_come_out_however_they_are_cut(sent: list[Packet], cuts: list[in
 @settings(max_examples=100)
 @given(st.binary(max_size=600))
 def test_garbage_is_survived_in_bounded_space(garbage: bytes):
-    parser = Parser()
+    parser = Ax12Parser()
     parser.feed(garbage)
     assert len(parser) < LONGEST + 4
 
@@ -130,7 +130,7 @@ HEAVY = st.lists(st.sampled_from((0xFF, 0xFE, 0x01, 0x02, 0x96)), max_size=300).
 @settings(max_examples=100)
 @given(HEAVY, st.binary(max_size=20).map(lambda data: Packet(1, 0, data.replace(b"\xff", b"\x00"))))
 def test_after_garbage_packets_are_found_once_a_false_header_ran_out(garbage: bytes, packet: Packet):
-    parser = Parser()
+    parser = Ax12Parser()
     again = (LONGEST + 4) // len(packet.encode()) + 2
     assert packet in parser.feed(garbage) + parser.feed(packet.encode() * again)
 
@@ -142,13 +142,13 @@ def test_after_a_cut_or_damaged_answer_the_next_one_is_found(cut: int):
     damaged[cut] ^= 0x08
     for broken in (answer[:cut], bytes(damaged)):
         # As the session does: no longer than what was asked for.
-        parser = Parser(longest=10)
+        parser = Ax12Parser(longest=10)
         got = parser.feed(broken) + parser.feed(answer) + parser.feed(answer)
         assert Packet(1, 0, answer[5:-1]) in got
 
 
 def test_a_wrong_sum_names_the_unit():
-    parser = Parser()
+    parser = Ax12Parser()
     assert parser.feed(bytes_of("FF FF 01 02 01 FA")) == []
     assert parser.damaged == [1]
     assert parser.feed(p.ping(2)) == [Packet(2, 1)]
@@ -157,4 +157,4 @@ def test_a_wrong_sum_names_the_unit():
 
 def test_header_bytes_inside_parameters_are_data():
     packet = Packet(3, 0, b"\xff\xff\x01\x02\x01\xfb")
-    assert Parser().feed(b"\xff" + packet.encode()) == [packet]
+    assert Ax12Parser().feed(b"\xff" + packet.encode()) == [packet]

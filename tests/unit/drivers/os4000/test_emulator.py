@@ -7,7 +7,7 @@ import pytest
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
-from monstertruck_drivers.os4000.protocol import Fields, Key, Parser, Sentence, key, value
+from monstertruck_drivers.os4000.protocol import Fields, Key, Os4000Parser, Sentence, key, value
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from tests.unit.drivers.os4000.rig import Rig, bench
@@ -19,7 +19,7 @@ class Terminal:
     def __init__(self, rig: Rig, link: Link) -> None:
         self.rig = rig
         self.link = link
-        self.parser = Parser()
+        self.parser = Os4000Parser()
 
     async def hear(self, seconds: float) -> list[Sentence]:
         return self.parser.feed(await self.raw(seconds))

@@ -8,7 +8,7 @@ from monstertruck_drivers.os4000.protocol import (
     SENTENCE_LIMIT,
     Fields,
     Key,
-    Parser,
+    Os4000Parser,
     Sentence,
     build,
     checksum,
@@ -111,7 +111,7 @@ sentences = st.builds(
 @settings(max_examples=100)
 def test_what_is_built_is_parsed_however_it_is_cut(items: list[Sentence], cut: int):
     stream = b"".join(build(sentence) for sentence in items)
-    parser = Parser()
+    parser = Os4000Parser()
     seen = [s for i in range(0, len(stream), cut) for s in parser.feed(stream[i : i + cut])]
     assert seen == items
     assert (parser.good, parser.bad, parser.text) == (len(items), 0, [])
@@ -128,7 +128,7 @@ def test_the_mask_chooses_the_fields(sentence: Sentence, mask: int):
 @settings(max_examples=100)
 def test_no_garbage_blocks_the_parser_and_cutting_changes_nothing(garbage: bytes, cut: int):
     stream = garbage + b"\n" + b"$C1.0P2.0R3.0*" + b"%02X\r\n" % checksum(b"C1.0P2.0R3.0")
-    whole, parts = Parser(), Parser()
+    whole, parts = Os4000Parser(), Os4000Parser()
     expected = whole.feed(stream)
     assert [s for i in range(0, len(stream), cut) for s in parts.feed(stream[i : i + cut])] == expected
     assert (whole.good, whole.bad, whole.text) == (parts.good, parts.bad, parts.text)
@@ -148,7 +148,7 @@ def test_a_flipped_bit_never_passes(line: bytes, data: st.DataObject):
 
 
 def test_a_flood_without_line_ends_is_dropped():
-    parser = Parser()
+    parser = Os4000Parser()
     assert parser.feed(b"x" * 10_000) == []
     assert parser.bad == 10_000 // (SENTENCE_LIMIT + 1)
     assert len(parser._buffer) <= SENTENCE_LIMIT
@@ -156,7 +156,7 @@ def test_a_flood_without_line_ends_is_dropped():
 
 
 def test_torn_sentences_and_prompts_are_kept_as_text():
-    parser = Parser()
+    parser = Os4000Parser()
     seen = parser.feed(b"2R-18.3T19.0*3C\r\nCMD E\r\nValue and Enter or Esc$C1.0*" + b"%02X\r\n" % checksum(b"C1.0"))
     assert seen == [Sentence(heading=1.0)]
     assert parser.text == [b"2R-18.3T19.0*3C", b"CMD E", b"Value and Enter or Esc"]

@@ -353,7 +353,7 @@ def test_without_the_service_nobody_waits(tmp_path: Path):
     play(tmp_path, scene, watched=False)
 
 
-def test_over_current_is_told_and_the_port_left_alone(tmp_path: Path):
+def test_over_current_is_reported_and_the_port_left_alone(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         async with bench.drivers("lidar") as starts:
             bench.usb.over_current("1-1.1")

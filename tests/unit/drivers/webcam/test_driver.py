@@ -150,7 +150,7 @@ def test_missing_pictures_are_gaps_in_the_sequence():
 
 
 @pytest.mark.parametrize("fault", ["corrupt", "truncate"])
-def test_damaged_pictures_are_dropped_and_told_once(fault: str):
+def test_damaged_pictures_are_dropped_and_reported_once(fault: str):
     async def test(rig: Rig) -> None:
         async with background(rig.session()):
             await rig.out.count(3)

@@ -1,6 +1,6 @@
 """What one scan may spend on long searches."""
 
-from monstertruck_estimation.slam.budget import BUDGET, Budget, Progress, finished
+from monstertruck_estimation.slam.budget import BUDGET, PiecewiseSearch, ScanBudget, finished
 from monstertruck_estimation.slam.closure import MOST_WAITING, LoopCloser
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from tests.unit.estimation.slam.test_closure import far_round
@@ -15,9 +15,9 @@ def pieces(costs, done):
 
 def test_pieces_are_done_while_the_budget_lasts_and_continued_at_the_next_scan():
     done = []
-    progress = Progress(pieces([3.0, 3.0, 3.0, 9.0, 1.0], done))
+    progress = PiecewiseSearch(pieces([3.0, 3.0, 3.0, 9.0, 1.0], done))
     amounts = []
-    while not progress.run(Budget(7.0)):
+    while not progress.run(ScanBudget(7.0)):
         amounts.append(len(done))
     assert amounts == [2, 3, 4]
     assert progress.result == 5
@@ -27,7 +27,7 @@ def test_a_search_without_limit_gives_its_result():
     assert finished(pieces([1e12, 1e12], [])) == 2
 
 
-class Counted(Budget):
+class Counted(ScanBudget):
     """Remembers the pieces it allowed."""
 
     def __init__(self):
@@ -63,7 +63,7 @@ def test_few_keyframes_wait_for_their_search():
     for at in range(len(keyframes)):
         closer.watch(at)
     for _ in range(200):
-        closer.step(keyframes, Budget())
+        closer.step(keyframes, ScanBudget())
     assert not closer.busy
     searched = sorted(closer._fingerprints)
     assert searched == list(range(len(keyframes) - MOST_WAITING, len(keyframes)))

@@ -5,7 +5,7 @@ import pytest
 
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.path_tracker import TruckState
-from monstertruck_planners.track.segments import Progress
+from monstertruck_planners.track.segments import PathProgress
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.kit import STEERING, Follower, circle, figure_eight, path, straight
 
@@ -104,25 +104,25 @@ def test_the_arc_passes_through_its_goal(mode, direction):
 
 def test_errors_are_signed():
     truck = Follower(path(straight(2.0)))
-    left = truck.tracker.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.path, Progress(0, 0.9), 0.0)
+    left = truck.tracker.control(TruckState((1.0, 0.1, 0.2), 0.1), truck.path, PathProgress(0, 0.9), 0.0)
     assert left.cross_track == pytest.approx(0.1)
     assert left.heading_error == pytest.approx(0.2)
     assert left.front < 0 < left.rear
     back = Follower(path(straight(2.0), [-1] * 41), pose=(0.0, 0.0, math.pi))
-    wrong = back.tracker.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.path, Progress(0, 0.9), 0.0)
+    wrong = back.tracker.control(TruckState((1.0, 0.1, math.pi - 0.2), -0.1), back.path, PathProgress(0, 0.9), 0.0)
     assert wrong.cross_track == pytest.approx(0.1)
     assert wrong.heading_error == pytest.approx(-0.2)
 
 
 def test_progress_never_goes_back():
     truck = Follower(path(straight(2.0)))
-    command = truck.tracker.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.path, Progress(0, 0.8), 0.0)
+    command = truck.tracker.control(TruckState((0.5, 0.0, 0.0), 0.1), truck.path, PathProgress(0, 0.8), 0.0)
     assert command.progress.s == pytest.approx(0.8)
 
 
 def test_a_truck_far_off_is_lost():
     truck = Follower(path(straight(2.0)))
-    command = truck.tracker.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.path, Progress(0, 0.9), 0.0)
+    command = truck.tracker.control(TruckState((1.0, 0.6, 0.0), 0.1), truck.path, PathProgress(0, 0.9), 0.0)
     assert (command.outcome, command.speed) == (Reason.PATH_LOST, 0.0)
 
 

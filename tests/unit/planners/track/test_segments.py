@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.track.segments import Progress, SegmentedPath
+from monstertruck_planners.track.segments import PathProgress, SegmentedPath
 from monstertruck_runtime.errors import InputError
 from tests.unit.planners.kit import circle, figure_eight, path, straight
 
@@ -43,7 +43,7 @@ def test_few_and_many_steps_are_searched_alike(low, monkeypatch):
 def test_a_lap_begins_at_the_truck_and_goes_on_where_it_began():
     lap = segmented(path(circle(), closed=True), pose=(1.0, 1.0, math.pi / 2))
     assert lap.length == pytest.approx(math.tau, abs=0.02)
-    assert lap.start == Progress(0, 0.0)
+    assert lap.start == PathProgress(0, 0.0)
     segment = lap.segments[0]
     assert segment.at(0.0).point == pytest.approx((1.0, 1.0), abs=0.05)
     assert segment.at(segment.length).point == pytest.approx(segment.at(0.0).point)
@@ -88,8 +88,10 @@ def test_joining_in_a_later_run():
 def test_poses_ahead_look_where_the_truck_looks():
     out = straight(1.0)
     forward, backward = segmented(path(out)), segmented(path(out, [-1] * 21), pose=(0, 0, math.pi))
-    assert forward.ahead(Progress(0, 0.2), 0.4, 3) == pytest.approx(np.array([[0.2, 0, 0], [0.4, 0, 0], [0.6, 0, 0]]))
-    assert backward.ahead(Progress(0, 0.2), 0.4, 2)[:, 2] == pytest.approx(math.pi)
+    assert forward.ahead(PathProgress(0, 0.2), 0.4, 3) == pytest.approx(
+        np.array([[0.2, 0, 0], [0.4, 0, 0], [0.6, 0, 0]])
+    )
+    assert backward.ahead(PathProgress(0, 0.2), 0.4, 2)[:, 2] == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(

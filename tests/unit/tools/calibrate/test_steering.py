@@ -10,7 +10,7 @@ from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePoly
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import KEYS
-from monstertruckd.tools.calibrate.steering import Reach, _deficits, _directions, _rough
+from monstertruckd.tools.calibrate.steering import AxleTravel, _deficits, _directions, _rough
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 
 CHASSIS = truck_chassis(Dimensions(DriveTrain()))
@@ -110,7 +110,7 @@ def test_wheels_that_do_not_steer_are_named():
 
 def test_a_stop_is_found_and_kept_clear_of():
     far = [leg(0.43, 0, d * 0.6, TRUE, stop=math.radians(25)) for d in (1, -1)]
-    reach = Reach.of(0, 1, far, MODEL, TRUE)
+    reach = AxleTravel.of(0, 1, far, MODEL, TRUE)
     assert reach.stopped
     assert math.degrees(reach.servo) == pytest.approx(25, abs=0.3)
     travel, limit = reach.estimates("front", TRUE.centres[0], TRUE.scales[0], None)
@@ -121,10 +121,10 @@ def test_a_stop_is_found_and_kept_clear_of():
 
 def test_a_free_axle_has_no_limit_and_a_limit_found_before_stays():
     far = [leg(0.3, 0, d * 0.6, TRUE) for d in (1, -1)]
-    reach = Reach.of(0, 1, far, MODEL, TRUE)
+    reach = AxleTravel.of(0, 1, far, MODEL, TRUE)
     assert not reach.stopped
     assert [e.name for e in reach.estimates("front", *TRUE.parameters[:2], None)] == ["front_left_travel"]
-    stopped = Reach.of(0, 1, [leg(0.43, 0, 0.6, TRUE, stop=math.radians(25))] * 2, MODEL, TRUE)
+    stopped = AxleTravel.of(0, 1, [leg(0.43, 0, 0.6, TRUE, stop=math.radians(25))] * 2, MODEL, TRUE)
     earlier = _rough(([leg(0.1, 0, 0.4)] * 4, [leg(0, 0.1, 0.4)] * 4), MODEL, BELIEVED, None)
     limit = stopped.estimates("front", *TRUE.parameters[:2], None)[1].model_copy(
         update={"date": "2026-01-01T00:00:00Z"}

@@ -1,0 +1,40 @@
+"""Names and words of the sources: one class a name, and the words of the field instead of private ones."""
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [
+    path
+    for folder in ("monstertruckd", "drivers", "planners", "schemas", "systemd")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PRIVATE = re.compile(
+    r"(?<![a-z])(told|wish(es)?|hunt(s|ed)?|lookout|rungs?|ladder|mishaps?|beside)(?![a-z])", re.IGNORECASE
+)
+"""reported, request, search, path check, recovery behaviour, fault, next to"""
+OLD_KEYS = ROOT / "monstertruckd" / "config" / "migrate.py"
+
+
+def test_every_class_has_a_name_of_its_own():
+    names = Counter(
+        node.name
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_sources_and_pages_use_the_words_of_the_field():
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line}"
+        for path in (*SOURCES, *PAGES)
+        if path != OLD_KEYS
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if PRIVATE.search(line)
+    ]
+    assert found == []
