@@ -110,6 +110,7 @@ class Daemon:
         self.bus.listen(topics.REQ_DRIVE, self.gate.request)
         self.bus.listen(topics.PLAN_DRIVE, self.gate.planner_request)
         self.bus.listen(topics.EVENT, self.gate.observe_event)
+        self.bus.listen(topics.EVENT, self._board.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self._remote_steps = RemoteWorkQueue(CODEC)

@@ -32,6 +32,10 @@ HOT: Final = 92.0
 COOL: Final = 48.0
 POST_RADIUS: Final = 0.1
 """Radius of an obstacle, m."""
+ALL_ROUND: Final = "-135 135"
+"""Directions of all the lidar's beams, degrees."""
+UNKNOWN_CODES: Final = (*range(3, 20),)
+"""The lidar's codes of beams that say nothing; 0 to 2 say that nothing is in its range."""
 
 
 class FaultKind(StrEnum):
@@ -49,6 +53,11 @@ class FaultKind(StrEnum):
     BROWN_OUT = "brown-out"
     WRONG_DEVICE = "wrong device"
     FROZEN = "frozen value"
+    BLIND = "blind lidar"
+    LATE_ANSWERS = "late answers"
+    CLOCK_DRIFT = "clock drift"
+    SUPPLY_DIP = "supply dip"
+    BLOCKED_SHAFT = "blocked shaft"
     CLOCK_JUMP = "clock jump"
     DISK_FULL = "disk full"
     RAIL_12V = "12 V lost"
@@ -203,6 +212,11 @@ def place_obstacle(gap: float) -> Action[SimContext]:
     return place
 
 
+def block_shaft(*, on: bool) -> Action[SimContext]:
+    """Hold the driven shaft, or let it go."""
+    return lambda context: context.robot.world.block_shaft(context.clock.now(), on=on)
+
+
 def clear_obstacles(context: SimContext) -> None:
     """Take everything away that was put into the world."""
     for post in context.robot.world.obstacles:
@@ -219,10 +233,12 @@ class CatalogFault(Fault[SimContext]):
     Args:
         kind: of its kind.
         must_stop: the truck must stand soon, and stay so.
+        disarms: once it stands, it must not set off again by itself.
     """
 
     kind: FaultKind
     must_stop: bool = False
+    disarms: bool = False
 
 
 def hubs_of(devices: Devices) -> tuple[str, ...]:
@@ -285,6 +301,14 @@ class FaultCatalog:
                 FaultKind.FROZEN,
                 _frozen,
             )
+        if "lidar" in self._roles:
+            yield FaultKind.BLIND, _blind
+            yield FaultKind.CLOCK_DRIFT, _clock_drift
+        if late := tuple(role for role in ("drive", "steering") if role in self._roles):
+            yield FaultKind.LATE_ANSWERS, lambda rng: _late_answers(rng, _pick(rng, late))
+        if "drive" in self._roles:
+            yield FaultKind.SUPPLY_DIP, _supply_dip
+            yield FaultKind.BLOCKED_SHAFT, _blocked_shaft
         if "stabiliser" in self._roles:
             yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
             yield FaultKind.RAIL_12V, _rail_12v
@@ -317,10 +341,11 @@ def _fault(
     hold: float,
     *,
     must_stop: bool = False,
+    disarms: bool = False,
 ) -> CatalogFault:
     """A fault at a device, hub or rail."""
     name = f"{kind.value}: {where}" if where else kind.value
-    return CatalogFault(name=name, start=start, end=end, hold=hold, kind=kind, must_stop=must_stop)
+    return CatalogFault(name=name, start=start, end=end, hold=hold, kind=kind, must_stop=must_stop, disarms=disarms)
 
 
 def _switch(words: str) -> tuple[tuple[str], tuple[str]]:
@@ -370,6 +395,45 @@ def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
 def _short_write(rng: np.random.Generator, role: str) -> CatalogFault:
     start, end = (f"line short_writes {rng.integers(1, 20)}",), ("line short_writes 0",)
     return _cable(rng, FaultKind.SHORT_WRITE, role, start, end, stops=False)
+
+
+def _blind(rng: np.random.Generator) -> CatalogFault:
+    """Covered all round, or in a part of it; the sun; a mirror."""
+    begin = rng.uniform(-110.0, 60.0)
+    part = f"{begin:.0f} {begin + rng.uniform(20.0, 60.0):.0f}"
+    where, fault = (
+        ("all round", f"cover {ALL_ROUND} {rng.choice(UNKNOWN_CODES)}"),
+        ("a part", f"cover {part} {rng.choice(UNKNOWN_CODES)}"),
+        ("hand", f"cover {part} {rng.integers(20, 60)}"),
+        ("sun", f"cover {part} {rng.choice(UNKNOWN_CODES)} {rng.uniform(0.2, 0.9):.2f}"),
+        ("mirror", f"mirror {part}"),
+    )[rng.integers(5)]
+    start, end = command("lidar", fault), command("lidar", "cover off")
+    return _fault(FaultKind.BLIND, where, start, end, _hold(rng), must_stop=where == "all round")
+
+
+def _clock_drift(rng: np.random.Generator) -> CatalogFault:
+    """A bad crystal, up to the slew of a clock that is set."""
+    ppm = float(rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(2, 5))
+    start, end = command("lidar", f"drift {ppm:.0f}"), command("lidar", "drift 0")
+    return _fault(FaultKind.CLOCK_DRIFT, f"{ppm:+.3g} ppm", start, end, float(rng.uniform(2.0, 5.0)))
+
+
+def _late_answers(rng: np.random.Generator, role: str) -> CatalogFault:
+    if role == "steering":
+        return _once(rng, FaultKind.LATE_ANSWERS, role, f"late {rng.uniform(0.05, 0.25):.3f} {rng.integers(1, 5)}")
+    start, end = (f"delay {rng.uniform(5.0, 80.0):.0f}",), ("delay 0",)
+    return _cable(rng, FaultKind.LATE_ANSWERS, role, start, end, stops=False)
+
+
+def _supply_dip(rng: np.random.Generator) -> CatalogFault:
+    """The controller restarts while the host waits for its answer; until it is up the truck coasts."""
+    return _fault(FaultKind.SUPPLY_DIP, "drive", command("drive", "restart 1"), nothing, 1.0 + _hold(rng), disarms=True)
+
+
+def _blocked_shaft(rng: np.random.Generator) -> CatalogFault:
+    held, free = block_shaft(on=True), block_shaft(on=False)
+    return _fault(FaultKind.BLOCKED_SHAFT, "", held, free, 1.0 + _hold(rng), must_stop=True, disarms=True)
 
 
 def _wrong(rng: np.random.Generator, serial: tuple[str, ...]) -> CatalogFault:

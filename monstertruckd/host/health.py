@@ -1,10 +1,11 @@
 """Health of every service as a topic, and real time against the daemon's own."""
 
 from collections.abc import Callable, Collection
+from typing import Final
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, LoopHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset
@@ -16,6 +17,9 @@ from monstertruckd.recorder.recorder import Recorder
 PERIOD = 1.0
 STEP = SECOND // 20
 """A change of the real-time offset within one period beyond this is a step, not drift (NTP slews < 1 ms/s)."""
+
+DEGRADED: Final = frozenset({Reason.SLOW_LINK})
+"""Reasons of a service that works, but badly: its warning says so, its information that it is over."""
 
 
 class HealthBoard:
@@ -51,11 +55,24 @@ class HealthBoard:
         self._unplugged: set[str] = set()
         self._rows: dict[str, ServiceHealth] = {}
         self._down: set[str] = set()
+        self._degraded: dict[str, Event] = {}
+
+    def observe_event(self, event: Event) -> None:
+        """Take any service's event: its row names what it suffers from until it says that it is over, or restarts."""
+        if event.reason not in DEGRADED:
+            return
+        if event.severity is Severity.INFO:
+            self._degraded.pop(event.source, None)
+        else:
+            self._degraded[event.source] = event
+        self._publish()
 
     def report(self, row: ServiceHealth) -> None:
         """Take in a service's new state (a ``HealthSink``)."""
         self._rows[row.name] = row
-        if row.state is ServiceState.READY:
+        if row.state is ServiceState.STARTING:
+            self._degraded.pop(row.name, None)
+        elif row.state is ServiceState.READY:
             returned = row.name in self._down | self._unplugged
             self._down.discard(row.name)
             self._unplugged.discard(row.name)
@@ -79,9 +96,11 @@ class HealthBoard:
         return tuple(self._with_reason(row) for row in self._rows.values())
 
     def _with_reason(self, row: ServiceHealth) -> ServiceHealth:
-        if row.state is not ServiceState.STARTING or (why := self._waiting(row.name)) is None:
-            return row
-        return row.model_copy(update={"detail": why})
+        if row.state is ServiceState.STARTING and (why := self._waiting(row.name)) is not None:
+            return row.model_copy(update={"detail": why})
+        if row.state is ServiceState.READY and (event := self._degraded.get(row.name)) is not None:
+            return row.model_copy(update={"reason": event.reason, "detail": event.text})
+        return row
 
     async def run(self, ready: Ready) -> None:
         """Publish the table once a second."""

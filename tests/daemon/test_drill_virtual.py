@@ -89,7 +89,12 @@ class Bare:
 
 
 def watched(
-    scene: Callable[[Bare], None], *, stops: bool = False, disarmed: bool = False, seconds: float = 3.0
+    scene: Callable[[Bare], None],
+    *,
+    stops: bool = False,
+    disarms: bool = False,
+    disarmed: bool = False,
+    seconds: float = 3.0,
 ) -> set[str]:
     """Rules broken by a scene."""
 
@@ -101,7 +106,7 @@ def watched(
         watching = asyncio.create_task(observer.run())
         try:
             world.truth(clock.now())
-            observer.begin(stops=stops)
+            observer.begin(stops=stops, disarms=disarms)
             if disarmed:
                 observer.disarm()
             scene(bare)
@@ -131,6 +136,20 @@ def test_motion_of_a_disarmed_truck_is_seen():
 
 def test_motion_after_a_fault_that_must_stop_is_seen():
     assert watched(motor(10_000), stops=True) == {"stop"}
+
+
+def test_setting_off_again_after_a_fault_that_must_disarm_is_seen():
+    assert watched(motor(10_000), disarms=True) == {"unarmed"}
+
+
+@pytest.mark.parametrize("rpm", [0, 5_000])
+def test_a_motor_driven_on_though_its_shaft_is_held_is_seen(rpm: int):
+    def scene(bare: Bare) -> None:
+        bare.world.block_shaft(bare.clock.now(), on=True)
+        bare.ports["drive"].device.take(write_request(od.TARGET_VELOCITY, rpm, 1).body)
+
+    assert watched(scene) == ({"held shaft"} if rpm else set())
+    assert watched(scene, seconds=0.9) == set()
 
 
 def test_a_truck_that_is_too_fast_is_seen():

@@ -143,6 +143,10 @@ class World:
         self._plant.advance(time_ns)
         self._plant.shafts[shaft].blocked = on
 
+    def shaft_blocked(self, shaft: int = 0) -> bool:
+        """Whether a driven shaft is held."""
+        return self._plant.shafts[shaft].blocked
+
     def set_tilt(self, time_ns: int, tilt: TiltConfig) -> None:
         """From now on tilt the truck in another way."""
         self._plant.advance(time_ns)

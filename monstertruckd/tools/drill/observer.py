@@ -42,6 +42,8 @@ TURN_ERROR: Final = 0.5
 TURN_WINDOW: Final = 2.0
 FAN: Final = np.linspace(-1.2, 1.2, 49)
 """Directions of the distances that are checked ahead, rad."""
+HELD_WITHIN: Final = 1.0
+"""Seconds for which a motor may be commanded to turn a shaft that is held."""
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -126,10 +128,15 @@ class Observer:
         self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
         """Servo angles that the newest pulses ask for, rad."""
         self._turn_errors: deque[tuple[int, float]] = deque()
+        self._target = 0
+        """Motor speed that the newest bytes ask for, rpm."""
+        self._held: int | None = None
+        """Since when the motor has been asked to turn a shaft that is held, ns."""
         self._disarmed: int | None = None
         self._began = 0
         self._read_until = 0
         self._must_stop = False
+        self._disarms = False
         self._stood: int | None = None
         self._path: list[tuple[float, float]] = []
         self.top_speed = 0.0
@@ -149,6 +156,7 @@ class Observer:
             self.top_speed = max(self.top_speed, abs(truth.v))
             self._check_motion(now, truth)
             self._check_bytes(now)
+            self._check_shaft(now)
             self._check_steering(now, truth)
             if turn % 5 == 0 and truth.v > 2 * AT_REST:
                 self._check_ahead(now)
@@ -166,10 +174,10 @@ class Observer:
         """The operator arms: the truck may move."""
         self._disarmed = None
 
-    def begin(self, *, stops: bool) -> None:
-        """A fault begins; with ``stops`` the truck must stand soon."""
+    def begin(self, *, stops: bool, disarms: bool = False) -> None:
+        """A fault begins; with ``stops`` the truck must stand soon, with ``disarms`` not set off again by itself."""
         self._began = self._clock.now()
-        self._must_stop = stops
+        self._must_stop, self._disarms = stops, disarms
         self._stood = None
         self._path.clear()
         self.top_speed = 0.0
@@ -180,7 +188,7 @@ class Observer:
 
     def end_fault(self) -> None:
         """The fault is over."""
-        self._must_stop = False
+        self._must_stop = self._disarms = False
 
     def violations(self) -> tuple[Violation, ...]:
         """What was unsafe since ``begin``: the first case of every rule."""
@@ -223,20 +231,35 @@ class Observer:
             self._violate(now, "disarmed", f"{truth.v:.3f} m/s though disarmed")
         if moving and self._must_stop and now > self._began + limit:
             self._violate(now, "stop", f"{truth.v:.3f} m/s: must stand")
+        if moving and self._disarms and self._stood is not None:
+            self._violate(now, "unarmed", f"{truth.v:.3f} m/s: set off again though nobody armed it")
 
     def _check_bytes(self, now: int) -> None:
         """Commands to motor and servos, within their limits."""
         since, self._read_until = self._read_until, now + 1
         for _, index, value in written(self.drive, since):
             rpm = value - (1 << 32) if value >= 1 << 31 else value
-            if index == od.TARGET_VELOCITY.index and abs(rpm) > self._rpm * 1.01:
-                self._violate(now, "speed bytes", f"{rpm} rpm: at most {self._rpm:.0f}")
+            if index == od.TARGET_VELOCITY.index:
+                self._target = rpm
+                if abs(rpm) > self._rpm * 1.01:
+                    self._violate(now, "speed bytes", f"{rpm} rpm: at most {self._rpm:.0f}")
+            elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
+                self._target = 0
         received, self._steering.to_device[:] = list(self._steering.to_device), []
         self._steering.to_host.clear()
         for _, data in received:
             for command in self._maestro.feed(data):
                 if isinstance(command, ServoCommand) and command.code is Code.SET_TARGET and command.value:
                     self._pulse(now, command.data[0], command.value / 4)
+
+    def _check_shaft(self, now: int) -> None:
+        """A motor that cannot turn is not driven on."""
+        if not self._target or not self._world.shaft_blocked():
+            self._held = None
+        elif self._held is None:
+            self._held = now
+        elif now - self._held > HELD_WITHIN * SECOND:
+            self._violate(now, "held shaft", f"{self._target} rpm though the shaft is held")
 
     def _pulse(self, now: int, channel: int, pulse_us: float) -> None:
         truck = self._truck

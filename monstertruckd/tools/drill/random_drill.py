@@ -300,7 +300,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Fault
         return None
     await clock.sleep(cruise)
     truck.reports()
-    observer.begin(stops=fault.must_stop)
+    observer.begin(stops=fault.must_stop, disarms=fault.disarms)
     await apply(fault.start, context)
     await clock.sleep(fault.hold)
     stop_bytes, metres = observer.stop_bytes_after(), observer.metres()

@@ -12,9 +12,11 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import (
+    ALL_ROUND,
     Action,
     Fault,
     SimContext,
+    block_shaft,
     clear_obstacles,
     command,
     exchange_cables,
@@ -153,6 +155,76 @@ def wrong_devices() -> Iterator[Scenario]:
         )
 
 
+def of_the_lidars_view() -> Iterator[Scenario]:
+    """Something before the lidar's window: scans go on coming, in time and well-formed."""
+    blind = (Reason.LIDAR_SLOW, Reason.LIDAR_BLIND)
+    for name, fault, seen in (
+        ("covered all round", f"cover {ALL_ROUND} 19", (Reason.SCAN_STALE,)),
+        ("left half covered", "cover 0 135 6", blind),
+        ("right half covered", "cover -135 0 16", blind),
+        ("hand before the window", "cover -25 25 40", (Reason.OBSTACLE_STOP,)),
+        ("mirror ahead", "mirror -30 30", blind),
+        ("sun ahead", "cover -30 30 8 0.7", blind),
+    ):
+        yield Scenario(
+            Fault(f"lidar: {name}", command("lidar", fault), command("lidar", "cover off")),
+            Expect.STOP,
+            seen=seen,
+            resumes=Reason.SCAN_STALE not in seen,
+        )
+    yield Scenario(
+        Fault("lidar: haze", command("lidar", f"cover {ALL_ROUND} 7 0.2"), command("lidar", "cover off")),
+        Expect.GO_ON,
+        resumes=True,
+    )
+
+
+def of_the_lidars_clock() -> Iterator[Scenario]:
+    """Its clock runs apart from the computer's: the scans stay fresh."""
+    for name, ppm, hold in (
+        ("1 % slow", -10_000, 45.0),
+        ("slewed by -10 %", -100_000, 5.0),
+        ("slewed by 10 %", 100_000, 5.0),
+    ):
+        yield Scenario(
+            Fault(f"lidar: clock {name}", command("lidar", f"drift {ppm}"), command("lidar", "drift 0"), hold=hold),
+            Expect.GO_ON,
+            seen=(Reason.CLOCK_DRIFT,),
+            resumes=True,
+        )
+
+
+def of_answers() -> Iterator[Scenario]:
+    """Controllers that answer late, or restart before they answer; a motor that cannot turn."""
+    yield Scenario(
+        Fault("drive: answers 40 ms late", command("drive", "delay 40"), command("drive", "delay 0"), hold=12.0),
+        Expect.STOP_AHEAD,
+        seen=(Reason.SLOW_LINK, Reason.DRIVE_STALE),
+        resumes=True,
+    )
+    yield Scenario(
+        Fault("drive: answers 80 ms late", command("drive", "delay 80"), command("drive", "delay 0"), hold=12.0),
+        Expect.STOP_AHEAD,
+        seen=(Reason.DRIVE_STALE,),
+    )
+    yield Scenario(
+        Fault("steering: one answer late", command("steering", "late 0.13")),
+        Expect.GO_ON,
+        resumes=True,
+    )
+    yield Scenario(
+        Fault("drive: supply dips within an exchange", command("drive", "restart 1")),
+        Expect.STOP_AGAIN,
+        seen=(Reason.DRIVE_STALE,),
+        down={"drive": Reason.DEVICE_RESTARTED},
+    )
+    yield Scenario(
+        Fault("drive: shaft blocked", block_shaft(on=True), block_shaft(on=False)),
+        Expect.STOP,
+        seen=(Reason.SHAFT_BLOCKED,),
+    )
+
+
 def of_the_truck() -> Iterator[Scenario]:
     """Faults of motor, ground, battery and surroundings."""
     yield Scenario(
@@ -282,6 +354,9 @@ SCENARIOS: Final[tuple[Scenario, ...]] = (
     *chain.from_iterable(map(of_device, SENSORS)),
     *with_line(),
     *wrong_devices(),
+    *of_the_lidars_view(),
+    *of_the_lidars_clock(),
+    *of_answers(),
     *of_the_truck(),
     *of_software(),
 )

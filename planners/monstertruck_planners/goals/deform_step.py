@@ -14,7 +14,15 @@ from scipy.ndimage import binary_dilation
 
 from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, placed, poses_relative, scan_points
+from monstertruck_planners.collision import (
+    OCCUPIED,
+    DistanceField,
+    first_contact,
+    placed,
+    points_relative,
+    poses_relative,
+    scan_points,
+)
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
@@ -28,6 +36,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 _NEWEST_DECIDES = (2, -2, 1)
 """Steps of a hit and of a pass, and the limit: one scan changes any cell to either."""
@@ -110,6 +119,11 @@ class Window:
     def seen(self) -> NDArray[np.bool_]:
         """Which cells were seen, of the same shape."""
         return np.asarray(self._odds != 0)
+
+    @property
+    def obstacles(self) -> Array:
+        """Middles of the cells where something was seen, shape (n, 2), m."""
+        return np.asarray((np.argwhere(self.cells)[:, ::-1] + 0.5) * self.config.resolution + self.corner)
 
     @property
     def corner(self) -> tuple[float, float]:
@@ -223,14 +237,19 @@ class DeformStep:
         self._rest, self._state = None, LocalPlannerState()
 
     def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_]]:
-        """Put a scan into the window; its points in base, and which of them the map explains.
+        """Put a scan into the window; obstacles in base, and which of them the map explains.
 
-        Beams without a return say nothing.
+        Obstacles are its points, and where the lidar does not see those that it saw before.
         """
         pose, points = task.pose, scan_points(task.scan, setup.lidar)
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
+        if len(blind := blind_beams(task.scan)):
+            before = self._window.obstacles
+            hidden = np.isin(_beams(points_relative(before, tuple(sensor)), task.scan), blind)
+            ends = np.vstack((ends, before[hidden]))
+            points = np.vstack((points, points_relative(before[hidden], pose)))
         if self._walls is None:
             return points, np.zeros(len(points), np.bool_)
         tolerance = explained_within(setup.config, task.deviation) + self._walls.resolution / 2
@@ -278,6 +297,22 @@ class DeformStep:
             return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
         answer = answer_of(path, cost=path.length)
         return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
+
+
+def blind_beams(scan: LaserScan) -> NDArray[np.intp]:
+    """Beams that say neither how far it is free nor that nothing is in range, nor do their neighbours.
+
+    Single beams fail on edges and dark surfaces.
+    """
+    blind = np.pad((scan.codes > NO_ECHO) & (scan.codes != VALID_BEAM), 1, mode="edge")
+    return np.flatnonzero(blind[:-2] & blind[1:-1] & blind[2:])
+
+
+def _beams(points: Array, scan: LaserScan) -> NDArray[np.intp]:
+    """Beam towards each point, shape (n, 2), in the lidar's frame."""
+    bearings, step = np.arctan2(points[:, 1], points[:, 0]), scan.angle_increment
+    turn = np.remainder((bearings - scan.start_angle) * math.copysign(1.0, step), 2 * math.pi)
+    return np.asarray(np.rint(turn / abs(step)), np.intp)
 
 
 class DeformingWorker(DeformStep):

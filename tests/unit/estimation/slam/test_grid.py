@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from monstertruck_drivers.hokuyo_urg.protocol import split_ranges
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.grid import PAGE_POINTS, TILE, GridBuilder, OccupancyGrid, PointPages
-from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_estimation.slam.storage import elements
+from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_schemas.sensor import LaserScan
 
 ORIGIN = np.zeros(2)
 
@@ -65,6 +68,22 @@ def test_it_grows_into_all_directions_and_keeps_what_it_knows():
     for end in ends:
         grid.add(ORIGIN, np.array([end]))
     assert [value(grid, *end) for end in ends] == [70] * 4
+
+
+@pytest.mark.parametrize("code", [0, 6, 19])
+def test_beams_without_a_range_say_nothing_to_the_map(code: int):
+    """Neither what a covered window hides nor what is out of range is known."""
+    ranges, codes = split_ranges(np.where(np.arange(683) < 341, code, 2000).astype(np.int32), 20)
+    step = np.pi / 512
+    scan = LaserScan(
+        stamp=0, received=0, seq=0, frame="lidar", start_angle=-341 * step, end_angle=341 * step,
+        time_increment=0.0, scan_time=0.1, range_min=0.02, range_max=4.1, ranges=ranges, codes=codes,
+    )  # fmt: skip
+    grid = OccupancyGrid()
+    grid.add(ORIGIN, prepare_input(ScanInput.of(scan, (0.0, 0.0, 0.0)), 4.0).points)
+    left, right = ([value(grid, x, side * 0.5) for x in np.linspace(0.3, 1.5, 9)] for side in (1, -1))
+    assert set(left) == {40}
+    assert set(right) == {-1}
 
 
 def test_marks_may_wrap_round():

@@ -9,7 +9,7 @@ import pytest
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.deform_step import DeformStep
+from monstertruck_planners.goals.deform_step import DeformStep, blind_beams
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_runtime.errors import InputError
@@ -115,6 +115,31 @@ def test_what_stands_on_the_route_is_passed_and_then_the_route_is_driven_again()
     assert found == {"kept", "new", "free"}
     assert pose[0] > 1.5
     assert abs(ROUTE[answer.place, 0] - pose[0]) < 0.06
+
+
+@pytest.mark.parametrize(("code", "finding"), [(0, "free"), (2, "free"), (3, "new"), (6, "new"), (19, "new")])
+def test_what_stood_on_the_route_is_still_there_for_a_lidar_that_does_not_see(code, finding):
+    """A hand before the window: only beams that met nothing in range show that it is gone."""
+    step, first = begun()
+    step.step(first)
+    seen = scan_of(ORIGIN, (1.2, -0.15, 1.5, 0.1), (-1.0, 1.5, 3.0, 1.6))
+    assert step.step(DeformTask(seen, ORIGIN)).finding == "new"
+    ahead = np.abs(ANGLES) < 0.3
+    covered = seen.model_copy(
+        update={
+            "ranges": np.where(ahead, math.inf, seen.ranges),
+            "codes": np.where(ahead, code, seen.codes).astype(np.uint8),
+        }
+    )
+    answer = step.step(DeformTask(covered, ORIGIN))
+    assert answer.finding in (("free",) if finding == "free" else ("new", "kept"))
+
+
+def test_single_beams_that_fail_hide_nothing():
+    scan = scan_of(ORIGIN, (1.0, -0.5, 1.2, 0.5))
+    codes = scan.codes.copy()
+    codes[[3, 10, 11, 200, 201, 202]] = 7
+    assert blind_beams(scan.model_copy(update={"codes": codes})).tolist() == [201]
 
 
 def test_where_there_is_no_way_round_the_beginning_is_driven_and_then_it_is_blocked():

@@ -1,0 +1,54 @@
+"""The health board: what a service that works suffers from."""
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.host.health import HealthBoard
+from tests.unit.drivers.kit import Events, Kept
+
+
+def event(reason: Reason, severity: Severity, source: str = "drive") -> Event:
+    return Event(stamp=1, received=1, seq=0, reason=reason, severity=severity, source=source, text="answers take 40 ms")
+
+
+def row(state: ServiceState, name: str = "drive", reason: Reason = Reason.OK) -> ServiceHealth:
+    return ServiceHealth(name=name, state=state, since=0, reason=reason)
+
+
+def after(*reports: ServiceHealth | Event) -> dict[str, tuple[Reason, str]]:
+    """Reason and detail of every service in the newest table."""
+
+    async def main(clock: VirtualClock) -> dict[str, tuple[Reason, str]]:
+        out = Kept()
+        board = HealthBoard(clock, out, Events())
+        for report in reports:
+            (board.report if isinstance(report, ServiceHealth) else board.observe_event)(report)
+        return {row.name: (row.reason, row.detail) for row in out.kept[-1].services}
+
+    return run_virtual(main)
+
+
+SLOW = event(Reason.SLOW_LINK, Severity.WARNING)
+READY = row(ServiceState.READY)
+
+
+def test_a_slow_link_is_named_in_the_row_of_its_service_alone():
+    table = after(READY, row(ServiceState.READY, "lidar"), SLOW)
+    assert table == {"drive": (Reason.SLOW_LINK, "answers take 40 ms"), "lidar": (Reason.OK, "")}
+
+
+def test_one_that_was_found_at_the_start_is_named_when_the_service_is_ready():
+    assert after(row(ServiceState.STARTING), SLOW)["drive"] == (Reason.OK, "")
+    assert after(row(ServiceState.STARTING), SLOW, READY)["drive"][0] is Reason.SLOW_LINK
+
+
+def test_it_is_forgotten_when_the_link_is_quick_again_or_the_service_starts_anew():
+    assert after(READY, SLOW, event(Reason.SLOW_LINK, Severity.INFO))["drive"] == (Reason.OK, "")
+    assert after(READY, SLOW, row(ServiceState.STARTING), READY)["drive"] == (Reason.OK, "")
+
+
+def test_a_loss_is_worse_and_other_events_are_no_state():
+    lost = row(ServiceState.BACKOFF, reason=Reason.DEVICE_LOST)
+    assert after(READY, SLOW, lost)["drive"][0] is Reason.DEVICE_LOST
+    assert after(READY, event(Reason.DEVICE_FAULT, Severity.WARNING))["drive"][0] is Reason.OK
