@@ -15,14 +15,12 @@ from monstertruck_drivers.epos.protocol import (
     REFUSED,
     Frame,
     FrameError,
-    NmtCommand,
     Opcode,
     body_size,
     decode_body,
     decode_segment,
     error_of,
     join,
-    nmt_request,
     read_request,
     segment_request,
     segmented_read_request,
@@ -173,14 +171,6 @@ class Exchanger:
             toggle = not toggle
         raise ProtocolError(f"{self._link.name}: {entry}: more than {SEGMENT_LIMIT} segments")
 
-    async def network(self, command: NmtCommand) -> None:
-        """Send a network management command, which has no answer.
-
-        Raises:
-            DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
-        """
-        await self._transact(self._run(nmt_request(command, self._node), answered=False))
-
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
         if self._flight is not None:
@@ -251,12 +241,12 @@ class Exchanger:
             if not take(self._value(entry, self._checked(frame, entry))) or self._hurried:
                 return
 
-    def _run(self, request: Frame, *, answered: bool = True) -> Steps[Frame | None]:
+    def _run(self, request: Frame) -> Steps[Frame]:
         """One exchange; whatever goes wrong in its middle is followed by silence."""
         self.began = self._clock.now()
         self._answer_awaited = False
         try:
-            frame = yield from self._converse(request, answered)
+            frame = yield from self._converse(request)
         except (_BusyError, _HeldUpError) as error:
             raise DeviceTimeoutError(str(error)) from None
         except BaseException:
@@ -268,11 +258,9 @@ class Exchanger:
         self.durations.append(self.ended - self.began)
         return frame
 
-    def _converse(self, request: Frame, answered: bool) -> Steps[Frame | None]:
+    def _converse(self, request: Frame) -> Steps[Frame]:
         for _ in range(2):
             yield from self._send(request)
-            if not answered:
-                return None
             frame = yield from self._receive(_ANSWER_LENGTHS.get(request.opcode))
             if frame is not None:
                 return frame

@@ -122,11 +122,6 @@ def write_request(entry: ObjectEntry, value: int, node: int) -> Frame:
     return Frame(Opcode.WRITE, (entry.index, (node << 8) | entry.sub, *split(entry.encode(value))))
 
 
-def nmt_request(command: NmtCommand, node: int) -> Frame:
-    """SendNMTService; has no answer."""
-    return Frame(Opcode.NMT, (node, command))
-
-
 def segmented_read_request(entry: ObjectEntry, node: int) -> Frame:
     """InitiateSegmentedRead: the segments follow with ``segment_request``."""
     return Frame(Opcode.INITIATE_SEGMENTED_READ, (entry.index, (node << 8) | entry.sub))

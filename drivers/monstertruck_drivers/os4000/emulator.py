@@ -3,7 +3,7 @@
 import asyncio
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -31,8 +31,6 @@ LOOK: Final = 50_000_000
 BOOT: Final = 200_000_000
 """Nanoseconds from power-up to the first sentence."""
 VERSION: Final = b"OS4000-T Ver 2.1\r\n"
-
-Switch = Literal["on", "off"]
 
 
 @dataclass(slots=True)

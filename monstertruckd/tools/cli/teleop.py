@@ -191,11 +191,6 @@ class Teleop:
         """Drift of the hybrid mode, rad, left positive."""
         return self._drift / STEPS * self.angle
 
-    @property
-    def throttle(self) -> int:
-        """1 forward, -1 back, 0 none."""
-        return self._throttle
-
     def press(self, key: str, now: int) -> Command | None:
         """Take a key; returns the command it gives, if any."""
         if key in ENDS:

@@ -7,17 +7,17 @@ seed, so that legs can run in parallel, here or on a cluster, and still give the
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
@@ -25,11 +25,15 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
 from monstertruckd import __version__
-from monstertruckd.tools.drill.cluster import on_cluster
 from monstertruckd.tools.drill.observer import STOPS_WITHIN, Violation
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
+T = TypeVar("T")
+U = TypeVar("U")
+
+CONNECT: Final = 10.0
+"""Seconds in which the scheduler of a cluster must answer."""
 LEG: Final = 25
 """Faults of one truck."""
 PATIENCE: Final = 15.0
@@ -353,3 +357,39 @@ def _reasons(report: Event | GateState | HealthTable) -> Iterator[Reason]:
         case HealthTable():
             named = (service.reason for service in report.services if service.name not in OPTIONAL)
     yield from (reason for reason in named if reason not in QUIET)
+
+
+@contextmanager
+def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Iterator[Iterator[U]]:
+    """Results of ``step`` in the order of ``inputs``; those of a worker that dies are computed by another one.
+
+    Args:
+        address: of the scheduler, ``tcp://HOST:PORT``.
+        step: importable on the workers.
+        inputs: one each.
+
+    Raises:
+        InputError: dask.distributed is not installed.
+        NoAnswerError: no scheduler answers.
+        WorkerError: workers died of one input three times in a row.
+        Exception: what ``step`` raised.
+    """
+    try:
+        from distributed import Client, KilledWorker  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise InputError("--cluster needs dask.distributed: install monstertruckd[cluster]") from error
+    try:
+        client = Client(address, timeout=CONNECT)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
+    with client:
+        futures = client.map(step, inputs, pure=False)
+
+        def results() -> Iterator[U]:
+            try:
+                for future in futures:
+                    yield future.result()
+            except KilledWorker as error:
+                raise WorkerError(f"{address}: {error}") from error
+
+        yield results()

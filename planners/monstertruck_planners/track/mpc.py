@@ -239,7 +239,6 @@ class Solver:
         self._m = m
         self._upper = np.nonzero(np.triu(np.ones((n, n))).T)[::-1]
         self._low = np.concatenate((np.full(n, -config.angle), np.full(n, -config.steering_rate * period)))
-        self._scale = 1.0
         self._problem: Any = osqp.OSQP()
         self._problem.setup(
             P=sparse.csc_matrix(np.triu(np.ones((n, n)) + n * np.eye(n))),

@@ -13,8 +13,11 @@ from monstertruck_drivers.epos.exchange import Exchanger
 from monstertruck_drivers.epos.firmware import Firmware, FreeMotor
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import (
+    READY,
     Control,
+    Frame,
     NmtCommand,
+    Opcode,
     State,
     read_request,
 )
@@ -283,15 +286,22 @@ def test_power_lost_in_the_middle_of_an_exchange_ends_it():
 
 
 def test_network_reset_restarts_it_without_an_answer():
-    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+    async def test(emulator: EposEmulator, link: Link, clock: VirtualClock) -> None:
+        async def send(command: NmtCommand) -> None:
+            request = Frame(Opcode.NMT, (1, command))
+            link.write(request.head)
+            await link.exactly(1)
+            link.write(request.body)
+            assert await heard(link, clock, 0.5) == bytes((READY,))
+
+        line = Exchanger(link, clock, 1)
         await line.write(od.ACCELERATION, 30_000)
-        await line.network(NmtCommand.START)
+        await send(NmtCommand.START)
         assert await line.read(od.ACCELERATION) == 30_000
-        await line.network(NmtCommand.RESET_NODE)
-        await clock.sleep(0.5)
+        await send(NmtCommand.RESET_NODE)
         assert await line.read(od.ACCELERATION) == 10_000
 
-    on_line(test)
+    on_cable(test)
 
 
 def test_it_keeps_its_speed_when_the_host_dies():

@@ -26,7 +26,6 @@ from monstertruck_drivers.epos.protocol import (
     error_of,
     join,
     next_control,
-    nmt_request,
     read_request,
     segment_request,
     segmented_read_request,
@@ -114,7 +113,7 @@ def test_answers_without_data():
 
 
 def test_network_and_segment_requests():
-    reset = nmt_request(NmtCommand.RESET_NODE, 1)
+    reset = Frame(Opcode.NMT, (1, NmtCommand.RESET_NODE))
     assert reset.head + reset.body == bytes.fromhex("0E 01 01 00 81 00 6B 9C")
     assert segmented_read_request(od.SERIAL_NUMBER, 1) == Frame(Opcode.INITIATE_SEGMENTED_READ, (0x2004, 0x0100))
     assert segment_request(False).words == (0x00,)

@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
-from monstertruckd.tools.calibrate.drive_response import drive_estimates, drive_response
+from monstertruckd.tools.calibrate.drive import drive_estimates, drive_response
 from monstertruckd.tools.calibrate.steps import MoveRecord
 
 STEP = 0.001
