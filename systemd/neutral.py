@@ -3,7 +3,7 @@
     python3 neutral.py /dev/truck/drive[=NODE[@BAUD]] ...
 
 One argument for each driven shaft, all stopped at once. NODE and BAUD must equal ``driver.node`` and ``port.baud`` of
-the configuration's drive; left out they are 1 and 38400, as the controller is delivered. Needs nothing but Python's
+the configuration's drive; left out they are those of the controller as delivered. Needs nothing but Python's
 standard library and the codec installed with it. Exit code 0 once every controller has accepted both commands, 1 if
 one did not within five seconds, for whatever reason.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve()
 sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checkout's, an installation's
 
-from monstertruck_drivers.epos.protocol import Frame, FrameError, decode_body, stop_frames
+from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_body, stop_frames
 
 TIMEOUT = 5.0
 FRAME_TIMEOUT = 0.55
@@ -52,7 +52,7 @@ def drive(argument: str) -> tuple[str, int, int]:
     """Port, node and baud rate that an argument names."""
     port, _, rest = argument.partition("=")
     node, _, baud = rest.partition("@")
-    return port, int(node or 1), int(baud or 38400)
+    return port, int(node or 1), int(baud or BAUD)
 
 
 def insist(port: str, node: int, baud: int, stopped: list[str]) -> None:

@@ -13,7 +13,7 @@ from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.link import BAUD
-from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.config import Baud, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
@@ -36,7 +36,7 @@ class PortConfig(Schema):
 
     path: Path
     """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
-    baud: Annotated[int, Field(ge=4800, le=1_000_000)] | None = None
+    baud: Baud | None = None
     """Bits per second; null = the device's own. USB-CDC devices ignore it"""
 
 

@@ -466,7 +466,7 @@ class Gate:
     def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:
         slow = sorted(limits, key=limits.__getitem__)
         reasons = tuple(dict.fromkeys((*self._states.reasons, *blocks, *slow)))
-        moving_allowed = self.mode in (GateMode.ARMED, GateMode.DRIVING) and not blocks
+        moving_allowed = self.mode.accepts_motion and not blocks
         motion, holder = self._motion, self._states.holder
         front, rear = motion.axle_angles
         return GateOutput(

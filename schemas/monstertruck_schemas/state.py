@@ -125,6 +125,11 @@ class GateMode(StrEnum):
         return self in (GateMode.ARMED, GateMode.DRIVING, GateMode.STOPPING)
 
     @property
+    def accepts_motion(self) -> bool:
+        """Whether a request of motion is carried out."""
+        return self in (GateMode.ARMED, GateMode.DRIVING)
+
+    @property
     def moving(self) -> bool:
         """Whether the truck drives or is being stopped."""
         return self in (GateMode.DRIVING, GateMode.STOPPING)

@@ -10,6 +10,8 @@ from monstertruck_drivers.usb.tree import device_name
 from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
+Baud = Annotated[int, Field(ge=4800, le=1_000_000)]
+"""Of a serial line, bits per second."""
 
 
 class UsbPortConfig(Schema):
@@ -21,7 +23,7 @@ class UsbPortConfig(Schema):
     """Port of that hub"""
     interface: Annotated[int, Field(ge=0, le=31)] = 0
     """USB interface that is the serial line; a Maestro's commands are 0"""
-    baud: Annotated[int, Field(ge=4800, le=1_000_000)] | None = None
+    baud: Baud | None = None
     """Bits per second; null = the device's own. USB-CDC devices ignore it"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
