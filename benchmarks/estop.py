@@ -1,0 +1,284 @@
+"""How long from an emergency stop to the quick-stop bytes on the drive controller's wire, whatever else arrives.
+
+    python benchmarks/estop.py [--trials 300] [--quick] [--flood NAME ...]
+
+Emulated truck, its daemon in a process of its own, pinned to one core; world, emulators, the operator and the flooder
+on the other. The truck drives to and fro at 0.1 m/s; each trial sends one emergency stop by topic and counts from then
+to the first quick stop on the wire. One that is not on the wire within ``MISSED`` s is missed. Floods, as fast as the
+flooder can, at most ``RATE`` a second; the rate that it achieved is reported:
+
+    none     nothing else
+    nonce    orders to arm with another run's nonce
+    orders   orders with the right nonce and growing sequence, of a role that may not give them
+    rubbish  bytes that are no order
+    calls    remote calls, each with an answer
+    forged   states of the gate and scans that the flooder publishes under the robot's keys
+
+``--quick`` makes 40 trials of none, nonce and rubbish. The last line is JSON.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from monstertruck_drivers.cable import PtyPort
+from monstertruck_drivers.epos import objects as od
+from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
+from monstertruckd.tools.simulation import simulate
+from monstertruckd.tools.simulation.config import load_simulated
+
+ROOT = Path(__file__).resolve().parents[1]
+FLOODS = ("none", "nonce", "orders", "rubbish", "calls", "forged")
+QUICK = ("none", "nonce", "rubbish")
+RATE = 10_000
+MISSED = 1.0
+DRIVEN = 0.3
+"""Seconds of driving before each emergency stop, and a random share of a tick more."""
+PATIENCE = 20.0
+GOAL_MS = 35.0
+
+
+# World and emulators
+
+
+class TappedPort(PtyPort):
+    """Prints when a quick stop reached the drive controller, ns."""
+
+    def __init__(self, link: Path) -> None:
+        super().__init__(link)
+        if link.name == "drive":
+            self.device.on_bytes = self._pass
+
+    @staticmethod
+    def _pass(to_device: bool, data: bytes) -> None:
+        at = time.monotonic_ns()
+        if not to_device:
+            return
+        with suppress(FrameError):
+            words = decode_body(Opcode.WRITE, data).words
+            written = len(words) == 4 and words[0] == od.CONTROLWORD.index
+            if written and join(words[2], words[3]) == Control.QUICK_STOP:
+                print(f"stop {at}", flush=True)
+
+
+def serve(config: Path) -> None:
+    """``monstertruckd simulate`` with a tap on the drive's wire."""
+    simulate.PtyPort = TappedPort  # type: ignore[misc]
+    run_wall(lambda clock: simulate.serve(clock, load_simulated(config), None))
+
+
+# Flooder
+
+
+def flood(kind: str, endpoint: str, nonce: str) -> None:
+    """Flood until standard input ends; prints how many were sent, and in how many seconds."""
+    import select  # noqa: PLC0415 - of this process only
+
+    import zenoh  # noqa: PLC0415
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    rng = np.random.default_rng(1)
+    with zenoh.open(config) as session:
+        order = {"source": "flood", "role": "station", "lease": 1.0, "nonce": "another", "order": "arm"}
+        if kind == "orders":
+            order |= {"nonce": nonce, "role": "tracker"}
+        count, began = 0, time.monotonic()
+        while not select.select([sys.stdin], [], [], 0)[0]:
+            now = time.monotonic_ns()
+            header = {"stamp": now, "received": now, "seq": now, "gate_stamp": now}
+            match kind:
+                case "nonce" | "orders":
+                    session.put("mt/truck/req/control", json.dumps(order | header))
+                case "rubbish":
+                    session.put("mt/truck/req/control", rng.bytes(200))
+                case "calls":
+                    session.get("mt/truck/rpc/versions", lambda _: None, timeout=0.5)
+                case "forged":
+                    state = GateState(
+                        stamp=now, received=now, seq=count, mode=GateMode.DISARMED, nonce="forged", speed_limit=0.0
+                    )
+                    session.put("mt/truck/state/gate", state.model_dump_json())
+                    session.put("mt/truck/sensor/scan", rng.bytes(2000))
+            count += 1
+            wait = began + count / RATE - time.monotonic()
+            if wait > 0.001:
+                time.sleep(wait)
+        print(json.dumps({"count": count, "seconds": time.monotonic() - began}), flush=True)
+
+
+# Operator
+
+
+class Stops:
+    """Instants of quick stops on the wire, as the simulator prints them."""
+
+    def __init__(self, stream: asyncio.StreamReader) -> None:
+        self._stream = stream
+        self._instants: asyncio.Queue[int] = asyncio.Queue()
+
+    async def run(self) -> None:
+        """Read until the simulator ends."""
+        while line := await self._stream.readline():
+            if line.startswith(b"stop "):
+                self._instants.put_nowait(int(line[5:]))
+
+    async def first_after(self, instant: int) -> int | None:
+        """The first one after ``instant``, ns; None if it is missed."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(MISSED):
+                while (at := await self._instants.get()) < instant:
+                    pass
+                return at
+        return None
+
+
+@asynccontextmanager
+async def process(core: int, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A Python process on one core while the context lasts."""
+    pipe = asyncio.subprocess.PIPE
+    with output.open("ab") as errors:
+        running = await asyncio.create_subprocess_exec(
+            sys.executable, *arguments, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=errors
+        )
+    os.sched_setaffinity(running.pid, {core})
+    try:
+        yield running
+    finally:
+        if running.returncode is None:
+            running.terminate()
+        await running.communicate()
+
+
+async def order(client: TruckClient, what: Order) -> None:
+    """Give an order until it is carried out; no tracker drives."""
+    async with asyncio.timeout(PATIENCE):
+        while True:
+            with suppress(RequestRefusedError, TimeoutError):
+                await client.order(what, hold=what is Order.ARM)
+                return
+            await asyncio.sleep(0.05)
+
+
+async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -> float | None:
+    """Drive, then one emergency stop; seconds to its quick stop, None if it is missed. Leaves the truck disarmed."""
+    await order(client, Order.ARM)
+    with client.subscribe(topics.GATE, latest()) as gate:
+        async with asyncio.timeout(PATIENCE):
+            driven: int | None = None
+            while driven is None or time.monotonic_ns() < driven + (DRIVEN + more) * SECOND:
+                await client.drive(0.1 if forward else -0.1, 0.0)
+                state = gate.latest
+                if driven is None and state is not None and state.holder == client.source:
+                    driven = time.monotonic_ns()
+                await asyncio.sleep(0.03)
+    await asyncio.sleep(more)
+    pressed = time.monotonic_ns()
+    outcome = client.order(Order.ESTOP)
+    at = await stops.first_after(pressed)
+    with suppress(Exception):
+        await outcome
+    await order(client, Order.RESET)
+    return None if at is None else (at - pressed) / SECOND
+
+
+async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str, Any]:
+    """All trials of one flood."""
+    endpoint = free_endpoint()
+    config = write_overlay(ROOT / "configs" / "emulated.yaml", folder, endpoint)
+    cores = sorted(os.sched_getaffinity(0))
+    own, other = cores[0], cores[-1]
+    here = str(Path(__file__).resolve())
+    rng = np.random.default_rng(1)
+    async with (
+        process(other, folder / "simulate.txt", here, "--serve", str(config)) as simulator,
+        process(own, folder / "daemon.txt", "-m", "monstertruckd", "run", "--config", str(config)),
+        await connect(clock, "truck", endpoint) as client,
+    ):
+        assert simulator.stdout is not None
+        stops = Stops(simulator.stdout)
+        reading = asyncio.create_task(stops.run())
+        await press(client, stops, True, 0.0)  # everything is warm then
+        async with contextlib.AsyncExitStack() as flooded:
+            flooder = None
+            if kind != "none":
+                state = await client.get_retained(topics.GATE)
+                assert state is not None
+                words = (here, "--flooder", kind, endpoint, state.nonce)
+                flooder = await flooded.enter_async_context(process(other, folder / "flood.txt", *words))
+                await asyncio.sleep(2.0)
+            found = [await press(client, stops, n % 2 == 1, float(rng.uniform(0, 0.02))) for n in range(count)]
+            sent = {"count": 0, "seconds": 1.0}
+            if flooder is not None:
+                told, _ = await flooder.communicate(b"\n")
+                sent = json.loads(told.splitlines()[-1])
+        reading.cancel()
+    known = np.array([1e3 * seconds for seconds in found if seconds is not None])
+    p50, p99, most = np.percentile(known, (50, 99, 100)).tolist() if len(known) else (0.0, 0.0, 0.0)
+    return {
+        "trials": count,
+        "missed": count - len(known),
+        "p50_ms": round(p50, 1),
+        "p99_ms": round(p99, 1),
+        "max_ms": round(most, 1),
+        "rate": round(sent["count"] / sent["seconds"]),
+    }
+
+
+def main() -> int:
+    """Press; 0 = all goals met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--trials", type=int, default=300)
+    parser.add_argument("--quick", action="store_true", help="40 trials, fewer floods")
+    parser.add_argument("--flood", nargs="*", choices=FLOODS, help="only these")
+    parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--flooder", nargs=3, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve is not None:
+        serve(options.serve)
+        return 0
+    if options.flooder is not None:
+        flood(*options.flooder)
+        return 0
+    count = 40 if options.quick else options.trials
+    figures: dict[str, dict[str, Any]] = {}
+    print("| flood | rate, 1/s | trials | missed | p50 ms | p99 ms | greatest ms |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    for kind in options.flood or (QUICK if options.quick else FLOODS):
+        with TemporaryDirectory(prefix="estop-") as folder:
+            done = run_wall(lambda clock, kind=kind, folder=folder: trials(clock, Path(folder), kind, count))
+        figures[kind] = done
+        print(
+            f"| {kind} | {done['rate']} | {done['trials']} | {done['missed']} | {done['p50_ms']} | {done['p99_ms']} | "
+            f"{done['max_ms']} |",
+            flush=True,
+        )
+    met = all(done["p99_ms"] <= GOAL_MS and done["missed"] == 0 for done in figures.values())
+    goals = {"p99_ms": GOAL_MS, "missed": 0}
+    print(json.dumps({"bench": "estop", "figures": figures, "goals": goals, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,276 @@
+"""Do the tests of the gate and of the way to standstill notice a fault? Single-point faults, one after the other.
+
+    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART] [--results FILE] [--again] [--list]
+
+Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``), or a seeded sample of them, meets
+the unit tests that reach its line, quickest first; which those are is measured once with coverage contexts. Mutants
+at a line that runs on import meet all tests of their part. A mutant that outlasts its time (three times its tests',
+and 10 s) is counted apart. Results are kept, so a run that was interrupted goes on; ``--again`` judges survivors anew.
+``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
+The score is killed of killed and survived, with its 95 % interval (Wilson).
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.mutation_parts.equivalents import EQUIVALENTS
+from benchmarks.mutation_parts.mutants import OPERATORS, Mutant, mutants
+from benchmarks.mutation_parts.runner import (
+    BROKEN,
+    KILLED,
+    ROOT,
+    SURVIVED,
+    TIMED_OUT,
+    Server,
+    copy_project,
+    environment,
+)
+
+TARGETS = {
+    **{
+        f"monstertruckd/gate/{name}.py": ("tests/unit/gate", "tests/unit/daemon")
+        for name in (
+            "ceilings", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "sources", "states",
+            "stops", "visibility",
+        )
+    },
+    "drivers/monstertruck_drivers/epos/driver.py": ("tests/unit/drivers/epos",),
+    "drivers/monstertruck_drivers/maestro/driver.py": ("tests/unit/drivers/maestro",),
+}  # fmt: skip
+"""Sources, and the tests that are asked about them."""
+
+GOAL = 0.97
+MARGIN = 10.0
+"""Seconds a mutant may take beyond three times its tests'."""
+NO_TEST = "no test reaches it"
+OUTPUT = ROOT / "runs" / "mutation.jsonl"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What the sound project's tests reach."""
+
+    lines: dict[str, dict[int, list[str]]]
+    """Tests by file and line."""
+    seconds: dict[str, float]
+    """Of every test."""
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Tests that reach a mutant, quickest first; all of its part for a line that runs on import."""
+        lines = self.lines[mutant.file]
+        found = lines.get(mutant.line) or lines.get(mutant.statement) or []
+        if "" in found:
+            found = [test for test in self.seconds if test.startswith(TARGETS[mutant.file])]
+        return sorted(found, key=lambda test: (self.seconds.get(test, 0.0), test))
+
+
+MEASURE = """
+import json, sys
+import coverage, pytest
+
+class Durations:
+    def __init__(self):
+        self.seconds, self.failed = {}, []
+    def pytest_runtest_logreport(self, report):
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if report.failed:
+            self.failed.append(report.nodeid)
+
+out, files, tests = sys.argv[1], json.loads(sys.argv[2]), json.loads(sys.argv[3])
+told = Durations()
+measured = coverage.Coverage(data_file=None, config_file=False, include=files)
+measured.start()
+class Contexts:
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        measured.switch_context(item.nodeid)
+        try:
+            return (yield)
+        finally:
+            measured.switch_context("")
+pytest.main(["-q", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *tests], plugins=[told, Contexts()])
+measured.stop()
+data = measured.get_data()
+lines = {file: data.contexts_by_lineno(file) for file in data.measured_files()}
+json.dump({"lines": lines, "seconds": told.seconds, "failed": told.failed}, open(out, "w"))
+"""
+
+
+def measured(folder: Path, sources: Iterable[str]) -> Baseline:
+    """Run the tests of the sources once in a copy of the project."""
+    out = folder / "baseline.json"
+    files = [str(folder / file) for file in TARGETS]
+    tests = sorted({test for source in sources for test in TARGETS[source]})
+    subprocess.run(
+        [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps(tests)],
+        cwd=folder, env=environment(folder), check=True, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    found = json.loads(out.read_text(encoding="utf-8"))
+    failed = set(found["failed"])
+    if failed:
+        print(f"left out, for they fail without any fault: {', '.join(sorted(failed))}", file=sys.stderr)
+    lines = {
+        str(Path(file).relative_to(folder)): {
+            int(line): [t for t in tests if t not in failed] for line, tests in by_line.items()
+        }
+        for file, by_line in found["lines"].items()
+    }
+    seconds = {test: spent for test, spent in found["seconds"].items() if test not in failed}
+    return Baseline({file: lines.get(file, {}) for file in TARGETS}, seconds)
+
+
+def interval(killed: int, total: int) -> tuple[float, float]:
+    """95 % interval of a share, by Wilson."""
+    if total == 0:
+        return 0.0, 1.0
+    z, share = 1.96, killed / total
+    middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
+    half = z / (1 + z**2 / total) * math.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def digest(source: bytes, mutant: Mutant) -> str:
+    """Name of a mutant of this very source."""
+    return hashlib.blake2s(source + repr((mutant.span, mutant.after)).encode(), digest_size=10).hexdigest()
+
+
+def known(file: Path, *, again: bool) -> dict[str, dict[str, str]]:
+    """Verdicts of earlier runs; with ``again`` without the survivors."""
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    verdicts = {entry["id"]: entry for entry in map(json.loads, lines)}
+    return {name: entry for name, entry in verdicts.items() if not (again and entry["verdict"] in (SURVIVED, NO_TEST))}
+
+
+def sample(all_of_them: list[Mutant], count: int, seed: int) -> list[Mutant]:
+    """So many of them, drawn with a seed; all of them for 0."""
+    if not 0 < count < len(all_of_them):
+        return all_of_them
+    chosen = np.random.default_rng(seed).choice(len(all_of_them), count, replace=False)
+    return [all_of_them[index] for index in sorted(chosen.tolist())]
+
+
+def judged(
+    todo: list[Mutant], sources: dict[str, bytes], jobs: int, scratch: Path
+) -> Iterator[tuple[Mutant, str, str]]:
+    """Verdict of every mutant, and the test that found it."""
+    copies = [scratch / f"job{number}" for number in range(jobs)]
+    for copy in copies:
+        copy.mkdir()
+        copy_project(copy)
+    baseline = measured(copies[0], {mutant.file for mutant in todo})
+    print(f"{len(baseline.seconds)} tests, {sum(baseline.seconds.values()):.0f} s", file=sys.stderr)
+    idle: SimpleQueue[Server] = SimpleQueue()
+    servers = [Server(copy) for copy in copies]
+    for server in servers:
+        _check(server, baseline, sources)
+        idle.put(server)
+
+    def judge(mutant: Mutant) -> tuple[Mutant, str, str]:
+        tests = baseline.tests(mutant)
+        if not tests:
+            return mutant, NO_TEST, ""
+        faulty = mutant.applied(sources[mutant.file]).decode()
+        seconds = 3 * sum(baseline.seconds[test] for test in tests if test in baseline.seconds) + MARGIN
+        server = idle.get()
+        try:
+            return mutant, *server.judge(mutant.file, faulty, tests, seconds)
+        finally:
+            idle.put(server)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        yield from pool.map(judge, todo)
+    for server in servers:
+        server.close()
+
+
+def _check(server: Server, baseline: Baseline, sources: dict[str, bytes]) -> None:
+    """A server must find nothing wrong with a sound source."""
+    file, source = next(iter(sources.items()))
+    test = next(test for test in baseline.seconds if test.startswith(TARGETS[file]))
+    if (verdict := server.judge(file, source.decode(), [test], 60.0)[0]) != SURVIVED:
+        sys.exit(f"{test} of the sound project: {verdict}")
+
+
+def main() -> int:
+    """Judge the mutants; 0 = goal met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sample", type=int, default=600, help="mutants drawn; 0 = all")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) - 1, 1))
+    parser.add_argument("--file", default="", help="only sources whose name contains this")
+    parser.add_argument("--results", type=Path, default=OUTPUT, help="JSON lines, kept from run to run")
+    parser.add_argument("--again", action="store_true", help="judge earlier survivors anew, as after new tests")
+    parser.add_argument("--list", action="store_true", help="print the mutants and end")
+    options = parser.parse_args()
+    sources = {file: (ROOT / file).read_bytes() for file in TARGETS if options.file in file}
+    every = [mutant for file, source in sources.items() for mutant in mutants(file, source)]
+    countable = [mutant for mutant in every if mutant.key not in EQUIVALENTS]
+    chosen = sample(countable, options.sample, options.seed)
+    if options.list:
+        for mutant in chosen:
+            print(f"{mutant.file}:{mutant.line} [{mutant.operator}] {mutant.where}: {mutant.before} -> {mutant.after}")
+        return 0
+    options.results.parent.mkdir(parents=True, exist_ok=True)
+    before = known(options.results, again=options.again)
+    ids = {mutant: digest(sources[mutant.file], mutant) for mutant in chosen}
+    verdicts = {mutant: before[ids[mutant]]["verdict"] for mutant in chosen if ids[mutant] in before}
+    todo = [mutant for mutant in chosen if mutant not in verdicts]
+    print(f"{len(every)} mutants, {len(every) - len(countable)} equivalent, {len(chosen)} drawn, {len(todo)} to judge")
+    with tempfile.TemporaryDirectory(prefix="mutation-") as scratch, options.results.open("a") as kept:
+        for mutant, verdict, test in judged(todo, sources, options.jobs, Path(scratch)) if todo else ():
+            verdicts[mutant] = verdict
+            entry = {"id": ids[mutant], "verdict": verdict, "test": test, "mutant": mutant.key, "line": mutant.line}
+            print(json.dumps(entry), file=kept, flush=True)
+    return report(verdicts, len(every), len(every) - len(countable))
+
+
+def report(verdicts: dict[Mutant, str], total: int, equivalent: int) -> int:
+    """Print survivors, the score of every operator and the sums; 0 = goal met."""
+    for mutant, verdict in verdicts.items():
+        if verdict in (SURVIVED, NO_TEST):
+            print(
+                f"{verdict}: {mutant.file}:{mutant.line} [{mutant.operator}] {mutant.where}: "
+                f"{mutant.before} -> {mutant.after}"
+            )
+    counts = Counter(verdicts.values())
+    killed = counts[KILLED] + counts[BROKEN]
+    lived = counts[SURVIVED] + counts[NO_TEST]
+    for operator in OPERATORS:
+        own = Counter(verdict for mutant, verdict in verdicts.items() if mutant.operator == operator)
+        print(f"{operator:12} {own[KILLED] + own[BROKEN]:5} killed {own[SURVIVED] + own[NO_TEST]:4} survived")
+    score = killed / max(killed + lived, 1)
+    low, high = interval(killed, killed + lived)
+    figures = {
+        "mutants": total,
+        "equivalent": equivalent,
+        "judged": len(verdicts),
+        "killed": killed,
+        "survived": lived,
+        "timed_out": counts[TIMED_OUT],
+        "score": round(score, 4),
+        "score_low": round(low, 4),
+        "score_high": round(high, 4),
+    }
+    met = score >= GOAL
+    print(json.dumps({"bench": "mutation", "figures": figures, "goals": {"score": GOAL}, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
