@@ -1,11 +1,12 @@
 """Do the tests of the gate and of the way to standstill notice a fault? Single-point faults, one after the other.
 
-    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART] [--results FILE] [--again] [--list]
+    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART ...] [--results FILE] [--again] [--list]
 
 Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``), or a seeded sample of them, meets
-the unit tests that reach its line, quickest first; which those are is measured once with coverage contexts. Mutants
-at a line that runs on import meet all tests of their part. A mutant that outlasts its time (three times its tests',
-and 10 s) is counted apart. Results are kept, so a run that was interrupted goes on; ``--again`` judges survivors anew.
+the unit tests that reach its line, those that found others of its function first, then the quick ones; which tests
+reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet all tests of their
+part, those that reach a line with the same names first. A mutant that outlasts its time (three times its tests', and
+10 s) is counted apart. Results are kept, so a run that was interrupted goes on; ``--again`` judges survivors anew.
 ``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
 The score is killed of killed and survived, with its 95 % interval (Wilson).
 """
@@ -15,10 +16,11 @@ import hashlib
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -33,18 +35,18 @@ from benchmarks.mutation_parts.equivalents import EQUIVALENTS
 from benchmarks.mutation_parts.mutants import OPERATORS, Mutant, mutants
 from benchmarks.mutation_parts.runner import (
     BROKEN,
+    COLD,
     KILLED,
+    OPTIONS,
     ROOT,
     SURVIVED,
     TIMED_OUT,
     Server,
-    copy_project,
-    environment,
 )
 
 TARGETS = {
     **{
-        f"monstertruckd/gate/{name}.py": ("tests/unit/gate", "tests/unit/daemon")
+        f"monstertruckd/gate/{name}.py": ("tests/unit/gate",)
         for name in (
             "ceilings", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "sources", "states",
             "stops", "visibility",
@@ -52,12 +54,15 @@ TARGETS = {
     },
     "drivers/monstertruck_drivers/epos/driver.py": ("tests/unit/drivers/epos",),
     "drivers/monstertruck_drivers/maestro/driver.py": ("tests/unit/drivers/maestro",),
+    "systemd/neutral.py": ("tests/unit/systemd",),
 }  # fmt: skip
 """Sources, and the tests that are asked about them."""
 
 GOAL = 0.97
 MARGIN = 10.0
 """Seconds a mutant may take beyond three times its tests'."""
+COMMON = frozenset(("self", "Final", "None", "True", "False", "float", "Annotated", "Field", "Positive", "Reason"))
+"""Words that say nothing about what a line is for."""
 NO_TEST = "no test reaches it"
 OUTPUT = ROOT / "runs" / "mutation.jsonl"
 
@@ -71,13 +76,25 @@ class Baseline:
     seconds: dict[str, float]
     """Of every test."""
 
-    def tests(self, mutant: Mutant) -> list[str]:
-        """Tests that reach a mutant, quickest first; all of its part for a line that runs on import."""
+    def tests(self, mutant: Mutant, sources: dict[str, bytes]) -> tuple[list[str], bool]:
+        """Tests that reach a mutant, likely and quick ones first, and whether its line runs on import."""
         lines = self.lines[mutant.file]
-        found = lines.get(mutant.line) or lines.get(mutant.statement) or []
-        if "" in found:
-            found = [test for test in self.seconds if test.startswith(TARGETS[mutant.file])]
-        return sorted(found, key=lambda test: (self.seconds.get(test, 0.0), test))
+        found = set(lines.get(mutant.line) or lines.get(mutant.statement) or ())
+        likely: set[str] = set()
+        if on_import := "" in found:
+            found = {test for test in self.seconds if test.startswith(TARGETS[mutant.file])}
+            text = sources[mutant.file].decode().splitlines()
+            names = {name for name in re.findall(r"\w{4,}", text[mutant.statement - 1]) if name not in COMMON}
+            for file, source in sources.items():
+                for number, line in enumerate(source.decode().splitlines(), 1):
+                    if names & set(re.findall(r"\w{4,}", line)):
+                        likely.update(self.lines[file].get(number, ()))
+        return sorted(found, key=lambda test: (test not in likely, self.seconds[test], test)), on_import
+
+    def first(self, tests: list[str], most: float) -> list[str]:
+        """As many of the tests as take ``most`` seconds, at least one."""
+        ends = np.cumsum([self.seconds[test] for test in tests])
+        return tests[: max(int(np.searchsorted(ends, most)), 1)]
 
 
 MEASURE = """
@@ -104,7 +121,7 @@ class Contexts:
             return (yield)
         finally:
             measured.switch_context("")
-pytest.main(["-q", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *tests], plugins=[told, Contexts()])
+pytest.main(tests, plugins=[told, Contexts()])
 measured.stop()
 data = measured.get_data()
 lines = {file: data.contexts_by_lineno(file) for file in data.measured_files()}
@@ -112,22 +129,20 @@ json.dump({"lines": lines, "seconds": told.seconds, "failed": told.failed}, open
 """
 
 
-def measured(folder: Path, sources: Iterable[str]) -> Baseline:
-    """Run the tests of the sources once in a copy of the project."""
-    out = folder / "baseline.json"
-    files = [str(folder / file) for file in TARGETS]
-    tests = sorted({test for source in sources for test in TARGETS[source]})
+def measured(out: Path, tests: Iterable[str]) -> Baseline:
+    """Run tests once."""
+    files = [str(ROOT / file) for file in TARGETS]
     subprocess.run(
-        [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps(tests)],
-        cwd=folder, env=environment(folder), check=True, stdout=subprocess.DEVNULL,
+        [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps([*OPTIONS, *tests])],
+        cwd=ROOT, check=True, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     found = json.loads(out.read_text(encoding="utf-8"))
     failed = set(found["failed"])
     if failed:
         print(f"left out, for they fail without any fault: {', '.join(sorted(failed))}", file=sys.stderr)
     lines = {
-        str(Path(file).relative_to(folder)): {
-            int(line): [t for t in tests if t not in failed] for line, tests in by_line.items()
+        str(Path(file).relative_to(ROOT)): {
+            int(line): [test for test in reached if test not in failed] for line, reached in by_line.items()
         }
         for file, by_line in found["lines"].items()
     }
@@ -166,45 +181,55 @@ def sample(all_of_them: list[Mutant], count: int, seed: int) -> list[Mutant]:
 
 
 def judged(
-    todo: list[Mutant], sources: dict[str, bytes], jobs: int, scratch: Path
+    todo: list[Mutant], sources: dict[str, bytes], jobs: int, scratch: Path, most: float
 ) -> Iterator[tuple[Mutant, str, str]]:
     """Verdict of every mutant, and the test that found it."""
-    copies = [scratch / f"job{number}" for number in range(jobs)]
-    for copy in copies:
-        copy.mkdir()
-        copy_project(copy)
-    baseline = measured(copies[0], {mutant.file for mutant in todo})
+    tests = sorted({test for mutant in todo for test in TARGETS[mutant.file]})
+    baseline = measured(scratch / "baseline.json", tests)
     print(f"{len(baseline.seconds)} tests, {sum(baseline.seconds.values()):.0f} s", file=sys.stderr)
-    idle: SimpleQueue[Server] = SimpleQueue()
-    servers = [Server(copy) for copy in copies]
-    for server in servers:
-        _check(server, baseline, sources)
-        idle.put(server)
+    every = {file: (ROOT / file).read_bytes() for file in TARGETS}
+    idle: SimpleQueue[dict[str, Server]] = SimpleQueue()
+    servers = [{kind: Server(kind, tests) for kind in ("warm", "cold")} for _ in range(jobs)]
+    for pair in servers:
+        _check(pair, baseline, sources)
+        idle.put(pair)
+
+    killers: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
 
     def judge(mutant: Mutant) -> tuple[Mutant, str, str]:
-        tests = baseline.tests(mutant)
-        if not tests:
+        reached, on_import = baseline.tests(mutant, every)
+        if not reached:
             return mutant, NO_TEST, ""
-        faulty = mutant.applied(sources[mutant.file]).decode()
-        seconds = 3 * sum(baseline.seconds[test] for test in tests if test in baseline.seconds) + MARGIN
-        server = idle.get()
+        before = killers[mutant.file, mutant.where]
+        reached = baseline.first(sorted(reached, key=lambda test: -before[test]), most)
+        sound, faulty = sources[mutant.file].decode(), mutant.applied(sources[mutant.file]).decode()
+        seconds = 3 * sum(baseline.seconds[test] for test in reached) + MARGIN
+        pair = idle.get()
         try:
-            return mutant, *server.judge(mutant.file, faulty, tests, seconds)
+            verdict, test = COLD, ""
+            if not on_import:
+                verdict, test = pair["warm"].judge(mutant.file, sound, faulty, reached, seconds)
+            if verdict == COLD:
+                verdict, test = pair["cold"].judge(mutant.file, sound, faulty, reached, seconds)
+            before[test] += 1
+            return mutant, verdict, test
         finally:
-            idle.put(server)
+            idle.put(pair)
 
     with ThreadPoolExecutor(jobs) as pool:
         yield from pool.map(judge, todo)
-    for server in servers:
-        server.close()
+    for pair in servers:
+        for server in pair.values():
+            server.close()
 
 
-def _check(server: Server, baseline: Baseline, sources: dict[str, bytes]) -> None:
+def _check(pair: dict[str, Server], baseline: Baseline, sources: dict[str, bytes]) -> None:
     """A server must find nothing wrong with a sound source."""
     file, source = next(iter(sources.items()))
     test = next(test for test in baseline.seconds if test.startswith(TARGETS[file]))
-    if (verdict := server.judge(file, source.decode(), [test], 60.0)[0]) != SURVIVED:
-        sys.exit(f"{test} of the sound project: {verdict}")
+    for kind, server in pair.items():
+        if (verdict := server.judge(file, source.decode(), source.decode(), [test], 120.0)[0]) != SURVIVED:
+            sys.exit(f"{test} of the sound project, {kind}: {verdict}")
 
 
 def main() -> int:
@@ -213,12 +238,13 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=600, help="mutants drawn; 0 = all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) - 1, 1))
-    parser.add_argument("--file", default="", help="only sources whose name contains this")
+    parser.add_argument("--file", nargs="*", default=[""], help="only sources whose name contains one of these")
     parser.add_argument("--results", type=Path, default=OUTPUT, help="JSON lines, kept from run to run")
     parser.add_argument("--again", action="store_true", help="judge earlier survivors anew, as after new tests")
+    parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each: a lower bound")
     parser.add_argument("--list", action="store_true", help="print the mutants and end")
     options = parser.parse_args()
-    sources = {file: (ROOT / file).read_bytes() for file in TARGETS if options.file in file}
+    sources = {file: (ROOT / file).read_bytes() for file in TARGETS if any(part in file for part in options.file)}
     every = [mutant for file, source in sources.items() for mutant in mutants(file, source)]
     countable = [mutant for mutant in every if mutant.key not in EQUIVALENTS]
     chosen = sample(countable, options.sample, options.seed)
@@ -233,7 +259,7 @@ def main() -> int:
     todo = [mutant for mutant in chosen if mutant not in verdicts]
     print(f"{len(every)} mutants, {len(every) - len(countable)} equivalent, {len(chosen)} drawn, {len(todo)} to judge")
     with tempfile.TemporaryDirectory(prefix="mutation-") as scratch, options.results.open("a") as kept:
-        for mutant, verdict, test in judged(todo, sources, options.jobs, Path(scratch)) if todo else ():
+        for mutant, verdict, test in judged(todo, sources, options.jobs, Path(scratch), options.most) if todo else ():
             verdicts[mutant] = verdict
             entry = {"id": ids[mutant], "verdict": verdict, "test": test, "mutant": mutant.key, "line": mutant.line}
             print(json.dumps(entry), file=kept, flush=True)

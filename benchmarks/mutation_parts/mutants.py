@@ -48,6 +48,8 @@ ARITHMETIC: dict[type[ast.operator], str] = {
     ast.BitAnd: "|",
 }
 SWAPPED = {"min": "max", "max": "min", "any": "all", "all": "any"}
+ATOMS = (ast.Name, ast.Attribute, ast.Constant, ast.Call, ast.Subscript)
+"""Operands that need no parentheses."""
 SILENT = ("log.", "_log.")
 """Calls whose loss nobody can see."""
 
@@ -199,8 +201,9 @@ class _Finder(ast.NodeVisitor):
             for operator, other in COMPARISONS[type(op)]:
                 signs = [SYMBOLS[type(each)] for each in node.ops]
                 signs[index] = other
-                rest = "".join(f" {sign} {self._text(part)}" for sign, part in zip(signs, parts[1:], strict=True))
-                self._add(operator, node, self._text(parts[0]) + rest)
+                texts = [self._text(part) if isinstance(part, ATOMS) else f"({self._text(part)})" for part in parts]
+                rest = "".join(f" {sign} {text}" for sign, text in zip(signs, texts[1:], strict=True))
+                self._add(operator, node, texts[0] + rest)
         for part in node.comparators:
             if isinstance(part, ast.Tuple):
                 self._drop(part)

@@ -1,29 +1,33 @@
-"""Runs tests against mutants: a copy of the project for each job, in which a server forks one process for each mutant.
+"""Runs tests against mutants: two servers for each job, which fork one process for each mutant.
 
-    python -m benchmarks.mutation_parts.runner FOLDER      (what ``mutation.py`` starts; speaks JSON lines)
+    python -m benchmarks.mutation_parts.runner warm|cold TEST ...      (what ``mutation.py`` starts; speaks JSON lines)
 
-The server has imported everything that no mutant changes, so a mutant costs the tests it is judged by and little more.
+The warm server has collected all tests; a fork of it takes the faulty functions' code in and runs the tests that reach
+them. What runs on import cannot be exchanged like that: a fork of the cold server imports the faulty source itself.
 """
 
 import contextlib
+import gc
 import importlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from importlib.machinery import SourceFileLoader
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from types import CodeType, FunctionType
+from typing import IO, Any, Final
+
+import pytest
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-SOURCES: Final = ("monstertruckd", "drivers", "planners", "schemas", "tests", "systemd", "configs", "pyproject.toml")
-PATHS: Final = (".", "drivers", "planners", "schemas")
 IMPORTED: Final = (
     "asyncio",
-    "pytest",
     "hypothesis",
     "numpy",
     "pydantic",
@@ -33,59 +37,38 @@ IMPORTED: Final = (
     "monstertruck_runtime.actors.actor",
     "monstertruck_kinematics.chassis",
 )
-"""Packages below everything that is mutated."""
+"""Modules below everything that is mutated; the cold server has imported them."""
 
 OPTIONS: Final = (
-    *("-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist"),
-    *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # the server has imported them already
+    *("-q", "--no-header", "-m", "not wall", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist"),
+    *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # the servers have imported some plug-ins already
 )
 
-SURVIVED, KILLED, TIMED_OUT, BROKEN = "survived", "killed", "timed out", "does not import"
-
-
-def copy_project(folder: Path) -> None:
-    """A copy of the project's sources and tests, without compiled files."""
-    skip = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc", "*.mcap", "replay")
-    for name in SOURCES:
-        source = ROOT / name
-        if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=skip)
-        else:
-            shutil.copy(source, folder / name)
-
-
-def environment(folder: Path) -> dict[str, str]:
-    """Environment in which the copy is what is imported."""
-    return os.environ | {
-        "PYTHONPATH": ":".join(str(folder / path) for path in PATHS),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
+SURVIVED, KILLED, TIMED_OUT, BROKEN, COLD = "survived", "killed", "timed out", "does not import", "cold"
+ENDS: Final = {0: SURVIVED, 1: KILLED, 2: COLD}
+"""Verdicts by exit code of a fork; any other: the source does not import."""
 
 
 class Server:
-    """A process that judges mutants in a copy of the project.
+    """A process that judges mutants.
 
     Args:
-        folder: of the copy.
+        kind: warm or cold.
+        tests: files and folders of tests, for the warm one.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, kind: str, tests: Iterable[str]) -> None:
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__)), str(folder)],
-            cwd=folder,
-            env=environment(folder),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+            [sys.executable, "-m", "benchmarks.mutation_parts.runner", kind, *tests],
+            cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
 
-    def judge(self, file: str, source: str, tests: list[str], seconds: float) -> tuple[str, str]:
-        """What becomes of a faulty ``file`` within the time given, and the test that found it."""
+    def judge(self, file: str, sound: str, faulty: str, tests: list[str], seconds: float) -> tuple[str, str]:
+        """What becomes of a faulty ``file`` within the time given, and the test that found it; COLD: it cannot say."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        order = {"file": file, "source": source, "tests": tests, "seconds": seconds}
+        order = {"file": file, "sound": sound, "faulty": faulty, "tests": tests, "seconds": seconds}
         print(json.dumps(order), file=self._process.stdin, flush=True)
         verdict, test = json.loads(self._process.stdout.readline())
         return verdict, test
@@ -98,34 +81,110 @@ class Server:
 
 
 class _FirstFailure:
-    """Pytest plug-in: the first test that fails."""
+    """Pytest plug-in: the first test that fails; runs the tests given before others."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: list[str]) -> None:
         self.test = ""
+        self._rank = {test: rank for rank, test in enumerate(first)}
 
-    def pytest_runtest_logreport(self, report: Any) -> None:
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=lambda item: self._rank.get(item.nodeid, len(self._rank)))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed and not self.test:
             self.test = report.nodeid
 
 
-def _forked(tests: list[str], seconds: float) -> tuple[str, str]:
-    """Run tests in a process of its own group."""
+class _Served:
+    """Pytest plug-in of the warm server: forks run the tests that were collected."""
+
+    def __init__(self, orders: Iterator[dict[str, Any]], answers: IO[str]) -> None:
+        self._orders = orders
+        self._answers = answers
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        items = {item.nodeid: item for item in session.items}
+        functions: dict[str, list[FunctionType]] = defaultdict(list)
+        for found in gc.get_objects():
+            if isinstance(found, FunctionType):
+                functions[found.__code__.co_filename].append(found)
+        gc.freeze()
+
+        def run(order: dict[str, Any]) -> tuple[int, str]:
+            path = str(ROOT / order["file"])
+            try:
+                _exchange(functions[path], order["sound"], order["faulty"], path)
+            except ValueError:  # other free variables
+                return 2, ""
+            found = _FirstFailure([])
+            session.config.pluginmanager.register(found)
+            for item, following in pairwise([*(items[test] for test in order["tests"]), None]):
+                session.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+                if found.test:
+                    return 1, found.test
+            return 0, ""
+
+        _serve(self._orders, self._answers, run)
+        return True
+
+
+def _exchange(functions: Iterable[FunctionType], sound: str, faulty: str, path: str) -> None:
+    """Give the functions of a file the code of its faulty source."""
+    old, new = (_codes(compile(source, path, "exec", dont_inherit=True)) for source in (sound, faulty))
+    names = {code: name for name, code in old.items()}
+    for function in functions:
+        if (name := names.get(function.__code__)) is not None and new[name] != function.__code__:
+            function.__code__ = new[name]
+
+
+def _codes(module: CodeType) -> dict[tuple[str, int], CodeType]:
+    """Code objects by qualified name, and its number where several have the same."""
+    found: dict[tuple[str, int], CodeType] = {}
+    seen: Counter[str] = Counter()
+    waiting = [module]
+    while waiting:
+        code = waiting.pop()
+        found[code.co_qualname, seen[code.co_qualname]] = code
+        seen[code.co_qualname] += 1
+        waiting += [constant for constant in code.co_consts if isinstance(constant, CodeType)]
+    return found
+
+
+def _cold(order: dict[str, Any]) -> tuple[int, str]:
+    """Import the faulty source and run tests."""
+    path, source = str(ROOT / order["file"]), order["faulty"]
+    sound = SourceFileLoader.get_code
+
+    def get_code(loader: SourceFileLoader, fullname: str) -> CodeType | None:
+        faulty = loader.get_filename(fullname) == path
+        return compile(source, path, "exec", dont_inherit=True) if faulty else sound(loader, fullname)
+
+    SourceFileLoader.get_code = get_code  # type: ignore[method-assign, assignment]
+    found = _FirstFailure(order["tests"])
+    files = sorted({test.split("::")[0] for test in order["tests"]})
+    return int(pytest.main(["-x", *OPTIONS, *files], plugins=[found])), found.test
+
+
+def _serve(
+    orders: Iterator[dict[str, Any]], answers: IO[str], run: Callable[[dict[str, Any]], tuple[int, str]]
+) -> None:
+    """Judge mutants until the orders end."""
+    for order in orders:
+        print(json.dumps(_forked(lambda order=order: run(order), order["seconds"])), file=answers, flush=True)
+
+
+def _forked(run: Callable[[], tuple[int, str]], seconds: float) -> tuple[str, str]:
+    """Run in a process of its own group; a verdict and the test behind it."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         os.setsid()
         os.close(read)
-        null = os.open(os.devnull, os.O_RDWR)
-        for stream in (0, 1, 2):
-            os.dup2(null, stream)
-        import pytest  # noqa: PLC0415 - in the child
-
-        found = _FirstFailure()
-        code = 3
+        code, test = 3, ""
         with contextlib.suppress(BaseException):
-            code = int(pytest.main([*OPTIONS, *tests], plugins=[found]))
-        os.write(write, found.test.encode()[:4000])
-        os._exit(code)
+            code, test = run()
+        os.write(write, test.encode()[:4000])
+        os._exit(1 if test else code)
     os.close(write)
     deadline = time.monotonic() + seconds
     status: int | None = None
@@ -142,33 +201,22 @@ def _forked(tests: list[str], seconds: float) -> tuple[str, str]:
         return TIMED_OUT, ""
     with os.fdopen(read) as told:
         test = told.read()
-    code = os.waitstatus_to_exitcode(status)
-    if code == 0:
-        return SURVIVED, ""
-    return (KILLED, test) if code == 1 else (BROKEN, "")
+    return ENDS.get(os.waitstatus_to_exitcode(status), BROKEN), test
 
 
-def _orders() -> Iterator[dict[str, Any]]:
-    for line in sys.stdin:
-        yield json.loads(line)
-
-
-def serve(folder: Path) -> None:
-    """Judge mutants until the end of standard input."""
-    sys.path[:] = [str(folder / path) for path in PATHS] + [path for path in sys.path if path]
-    os.chdir(folder)
+def main(kind: str, tests: list[str]) -> None:
+    """Serve until the end of standard input."""
+    orders, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1):
+        os.dup2(null, stream)
+    read = (json.loads(line) for line in orders)
+    if kind == "warm":
+        sys.exit(pytest.main([*OPTIONS, *tests], plugins=[_Served(read, answers)]))
     for name in IMPORTED:
         importlib.import_module(name)
-    for order in _orders():
-        file = folder / order["file"]
-        sound = file.read_bytes()
-        file.write_text(order["source"], encoding="utf-8")
-        try:
-            verdict = _forked(order["tests"], order["seconds"])
-        finally:
-            file.write_bytes(sound)
-        print(json.dumps(verdict), flush=True)
+    _serve(read, answers, _cold)
 
 
 if __name__ == "__main__":
-    serve(Path(sys.argv[1]))
+    main(sys.argv[1], sys.argv[2:])

@@ -56,7 +56,7 @@ class Source:
     """End of its lease, ns."""
     arrived: int
     """When the request came, ns."""
-    inside: bool = False
+    inside: bool
     """One of the robot's own planners."""
     held: bool = False
     """Must send a neutral request before it may drive."""
@@ -152,8 +152,6 @@ class Sources:
             holder: key of the driving source.
         """
         able = [source for source in self.live(now) if not source.held and source.rank >= self._min_rank]
-        if len(able) == 1:
-            return able[0]
         return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
 
     def priority(self, source: Source, now: int, holder: Key | None) -> Reason:

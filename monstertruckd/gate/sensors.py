@@ -160,7 +160,7 @@ class SensorMonitor:
         """Take the services' health: samples from before the loss of a service become stale."""
         for service in table.services:
             if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
-                self._lost[stale] = max(service.since, self._lost.get(stale, -1))
+                self._lost[stale] = max(service.since, self._lost.get(stale, service.since))
                 self._speed = None
         self._restarted = any(
             service.reason is Reason.DEVICE_RESTARTED and self._services.get(service.name) is Reason.DRIVE_STALE
@@ -376,7 +376,7 @@ class SteeringCheck:
         if heading is None or speed is None or abs(speed) < self._config.speed:
             self._window.clear()
             return
-        if not self._window or not 0 < stamp - self._window[-1][0] <= GAP:
+        if not self._window or stamp - self._window[-1][0] > GAP:
             self._begin(stamp, heading)
             return
         before, commanded, measured = self._window[-1]

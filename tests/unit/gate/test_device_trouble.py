@@ -2,11 +2,15 @@
 
 import pytest
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import Rig, feedback, health
+from monstertruckd.gate.config import ShaftCheckConfig
+from monstertruckd.gate.sensors import ShaftCheck
+from tests.unit.gate.rig import Rig, Robot, feedback, health
 
 
 def held(rig, ticks):
@@ -74,3 +78,102 @@ def test_short_faults_that_repeat_disarm(faults, mode):
         rig.tick(60)
     assert rig.out.mode is mode
     assert (Reason.FAULTS_REPEAT in {event.reason for event in rig.events}) is (mode is GateMode.DISARMED)
+
+
+# The check of the shafts alone
+
+
+def shown(check, at, shaft=0, commanded=0.2, measured=0.0, mode=DriveMode.ENABLED, current=None):
+    """Whether a shaft is blocked after feedback of it, ``at`` seconds."""
+    message = feedback(round(at * SECOND), mode=mode).model_copy(update={"current": current})
+    check.observe(message, shaft, commanded, measured)
+    return check.blocked is not None
+
+
+def shafts(**config):
+    return ShaftCheck(ShaftCheckConfig(**config))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_shaft_is_blocked_after_its_time_and_stays_so_until_the_reset(sign):
+    check = shafts()
+    assert not shown(check, 1.0, commanded=sign * 0.2)
+    assert not shown(check, 1.599, commanded=sign * 0.2)
+    assert shown(check, 1.6, commanded=sign * 0.2)
+    assert shown(check, 1.7, commanded=sign * 0.2, measured=sign * 0.2)
+    check.reset()
+    assert check.blocked is None
+    assert not shown(check, 1.8, commanded=sign * 0.2), "the time begins anew"
+    assert not shown(check, 2.399, commanded=sign * 0.2)
+
+
+@pytest.mark.parametrize(
+    ("commanded", "measured", "turns"),
+    [
+        (0.2, 0.1, True),
+        (0.2, 0.0999, False),
+        (-0.2, -0.1, True),
+        (-0.2, -0.0999, False),
+        (0.2, -0.2, False),
+        (-0.2, 0.2, False),
+        (0.03, 0.0, False),
+        (-0.03, 0.0, False),
+        (0.0299, 0.0, True),
+        (-0.0299, 0.0, True),
+        (0.0, 0.0, True),
+    ],
+)
+def test_a_shaft_turns_at_a_share_of_its_command_or_needs_not(commanded, measured, turns):
+    check = shafts(share=0.5)
+    shown(check, 1.0, commanded=commanded, measured=measured)
+    assert shown(check, 1.7, commanded=commanded, measured=measured) is not turns
+
+
+@pytest.mark.parametrize("mode", [mode for mode in DriveMode if mode is not DriveMode.ENABLED])
+def test_a_drive_that_is_not_enabled_may_stand(mode):
+    check = shafts()
+    shown(check, 1.0, mode=mode)
+    assert not shown(check, 1.7, mode=mode)
+
+
+def test_a_shaft_that_turned_in_between_begins_anew():
+    check = shafts()
+    shown(check, 1.0)
+    shown(check, 1.5, measured=0.2)
+    assert not shown(check, 1.7)
+    assert not shown(check, 2.29)
+    assert shown(check, 2.3)
+
+
+def test_every_shaft_has_its_own_time_and_the_first_blocked_one_is_named():
+    check = shafts()
+    shown(check, 1.0, shaft=1)
+    shown(check, 1.3, shaft=0)
+    assert shown(check, 1.6, shaft=1, current=2.5)
+    shown(check, 1.9, shaft=0, current=1.5)
+    assert (check.blocked, check.current) == (1, 2.5)
+    assert shown(check, 2.0, shaft=1)
+    assert check.current == 2.5, "the newest one measured"
+
+
+def test_nothing_blocked_has_no_current():
+    check = shafts()
+    shown(check, 1.0, current=2.5)
+    assert check.current is None
+
+
+def test_of_two_shafts_the_second_one_alone_stops_the_robot():
+    robot = Robot("differential").armed()
+    robot.driver = {"vx": 0.15}
+    robot.tick(40)
+    obey = robot._obey
+
+    def held_second():
+        obey()
+        robot.shafts[1] = 0.0
+
+    robot._obey = held_second
+    robot.tick(40)
+    assert robot.told(Reason.SHAFT_BLOCKED)
+    assert robot.gate._shaft_check.blocked in (1, None)
+    assert robot.trips[-1].reason is Reason.SHAFT_BLOCKED

@@ -82,6 +82,83 @@ def test_headings_far_apart_are_not_compared(check):
     assert not check.dead
 
 
+def turned(check, commanded, measured, seconds=0.4, speed=SPEED):
+    """Two headings ``seconds`` apart, the turns between them in rad, left positive."""
+    check.observe(0, 1.0, speed, 0.0)
+    check.observe(round(seconds * SECOND), 1.0 - measured, speed, commanded / seconds)
+    return check.dead
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("commanded", "measured"), [(0.2, 0.34 / 0.7), (0.4, 0.14), (0.0, 0.2), (0.1, -0.07)])
+def test_the_difference_tolerated_is_a_fixed_part_and_a_share_of_the_larger_turn(sign, commanded, measured):
+    outwards = 1e-6 if measured > commanded else -1e-6
+    config = SteeringCheckConfig()
+    assert turned(SteeringCheck(config), sign * commanded, sign * (measured + outwards))
+    assert not turned(check := SteeringCheck(config), sign * commanded, sign * (measured - outwards))
+    assert check.difference == pytest.approx(sign * (measured - commanded), abs=2e-6)
+
+
+def test_a_heading_may_change_by_a_radian_and_a_half_a_second_before_it_counts_as_a_jump(check):
+    assert turned(check, 0.0, 0.599)
+    assert not turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.601)
+
+
+def test_the_window_begins_anew_at_a_jump(check):
+    turned(check, 0.1, 0.601)
+    assert check.difference == 0.0
+    check.observe(round(0.8 * SECOND), 1.0 - 0.601 - 0.05, SPEED, 0.0)
+    assert check.difference == pytest.approx(0.05)
+
+
+def test_headings_half_a_second_apart_are_compared_and_no_further(check):
+    assert turned(check, 0.0, 0.4, 0.5)
+    check = SteeringCheck(SteeringCheckConfig())
+    assert not turned(check, 0.0, 0.4, 0.5 + 2e-9)
+    check.observe(round(0.9 * SECOND), 1.0 - 0.4 - 0.1, SPEED, 0.0)
+    assert check.difference == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_truck_is_checked_from_its_least_speed_on(sign):
+    assert turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.03)
+    assert not turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.0299)
+
+
+def test_what_lies_before_a_heading_that_is_not_known_is_forgotten(check):
+    check.observe(0, 1.0, SPEED, 0.0)
+    check.observe(SECOND // 10, None, SPEED, 0.0)
+    check.observe(SECOND // 5, 0.7, SPEED, 0.0)
+    assert check.difference == 0.0
+    assert not check.dead
+
+
+def test_turns_are_compared_over_the_window_and_not_longer(check):
+    assert check.difference == 0.0
+    drive(check, 1.0, turning=1.2)
+    assert check.difference == pytest.approx(0.2 * RATE * 1.0)
+    drive(check, 6.0, turning=1.2, start=60 * SECOND)
+    assert check.difference == pytest.approx(0.2 * RATE * 2.0)
+    check.reset()
+    assert check.difference == 0.0
+    check.observe(66 * SECOND, 0.0, SPEED, RATE)
+    assert check.difference == 0.0, "a reset forgets the window"
+
+
+def test_dead_steering_stays_so_until_the_reset(check):
+    drive(check, 5.0, turning=0.0)
+    drive(check, 5.0, start=60 * SECOND)
+    assert check.dead
+
+
+def test_headings_out_of_order_are_not_compared(check):
+    check.observe(SECOND, 1.0, SPEED, 0.0)
+    check.observe(SECOND - 1, 0.2, SPEED, 0.0)
+    check.observe(SECOND - 1, 0.9, SPEED, 0.0)
+    assert not check.dead
+    assert check.difference == 0.0
+
+
 class Straight(Rig):
     """A truck whose servos turn on paper alone: it drives straight on."""
 
