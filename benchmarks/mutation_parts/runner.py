@@ -10,7 +10,9 @@ import contextlib
 import gc
 import importlib
 import json
+import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -43,6 +45,9 @@ OPTIONS: Final = (
     *("-q", "--no-header", "-m", "not wall", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist"),
     *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # the servers have imported some plug-ins already
 )
+
+SHARE: Final = 10
+"""Times its processor time that a fork may take by the clock: the machine may be busy."""
 
 SURVIVED, KILLED, TIMED_OUT, BROKEN, COLD = "survived", "killed", "timed out", "does not import", "cold"
 ENDS: Final = {0: SURVIVED, 1: KILLED, 2: COLD}
@@ -174,19 +179,20 @@ def _serve(
 
 
 def _forked(run: Callable[[], tuple[int, str]], seconds: float) -> tuple[str, str]:
-    """Run in a process of its own group; a verdict and the test behind it."""
+    """Run in a process of its own group, for some seconds of processor time; a verdict and the test behind it."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         os.setsid()
         os.close(read)
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
         code, test = 3, ""
         with contextlib.suppress(BaseException):
             code, test = run()
         os.write(write, test.encode()[:4000])
         os._exit(1 if test else code)
     os.close(write)
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + SHARE * seconds
     status: int | None = None
     while status is None and time.monotonic() < deadline:
         ended, code = os.waitpid(child, os.WNOHANG)
@@ -197,6 +203,7 @@ def _forked(run: Callable[[], tuple[int, str]], seconds: float) -> tuple[str, st
         os.killpg(child, signal.SIGKILL)  # also what it started
     if status is None:
         os.waitpid(child, 0)
+    if status is None or os.WIFSIGNALED(status):
         os.close(read)
         return TIMED_OUT, ""
     with os.fdopen(read) as told:

@@ -188,8 +188,7 @@ class ObstacleGuard:
         if self._checked != rounded:
             self._checked = rounded
             self._look(rounded)
-            distances = (self._free_distance(*way) for way in rounded)
-            self._free = min(distances) if len(self._points) else math.inf
+            self._free = min(self._free_distance(*way) for way in rounded)
         return self._free
 
     def _look(self, ways: frozenset[tuple[int, int, int]]) -> None:
@@ -319,7 +318,7 @@ class Motion:
     def _target_of_twist(self, request: RequestedTwist) -> Target:
         chassis = self._chassis
         asked = request.vx, request.vy, request.wz
-        asked = _scaled(asked, min(1.0, MAX_SPEED / max(*map(abs, asked), MAX_SPEED)))
+        asked = _scaled(asked, MAX_SPEED / max(*map(abs, asked), MAX_SPEED))
         twist = chassis.possible(asked)
         angles, clipped = chassis.limited_steering(chassis.steering_for(twist, self.angles), self._config.angle)
         angles, saturated = self._reached(angles)
@@ -434,7 +433,7 @@ class CommandLimiter:
             limits[Reason.CLIPPED] = max_pace
         if pace > 0 or not motion.standing:
             self._check_obstacles(now, wanted, limits)
-        allowed = min(*limits.values(), max_pace) if limits else max_pace
+        allowed = min((*limits.values(), max_pace))
         if allowed == 0:
             motion.halt()
         else:
