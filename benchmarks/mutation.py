@@ -1,6 +1,6 @@
 """Do the tests of the gate and of the way to standstill notice a fault? Single-point faults, one after the other.
 
-    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART ...] [--results FILE] [--again] [--list]
+    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART ...] [--again] [--list]
 
 Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``), or a seeded sample of them, meets
 the unit tests that reach its line, those that found others of its function first, then the quick ones; which tests
@@ -47,10 +47,7 @@ from benchmarks.mutation_parts.runner import (
 TARGETS = {
     **{
         f"monstertruckd/gate/{name}.py": ("tests/unit/gate",)
-        for name in (
-            "ceilings", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "sources", "states",
-            "stops", "visibility",
-        )
+        for name in ("arbitration", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "stops")
     },
     "drivers/monstertruck_drivers/epos/driver.py": ("tests/unit/drivers/epos",),
     "drivers/monstertruck_drivers/maestro/driver.py": ("tests/unit/drivers/maestro",),

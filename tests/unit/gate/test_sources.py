@@ -6,8 +6,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.requests import MAX_SOURCES, OPERATORS
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruckd.gate.arbitration import Sources
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.sources import Sources
 from tests.unit.gate.rig import NONCE, header
 
 NOW = 100 * SECOND
