@@ -35,7 +35,7 @@ PROGRAM_SHA256 = {
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 GATED = (
-    *("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/test_wire.py", "tests/unit/drivers"),
+    *("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers"),
     *("-m", "not wall and not virtual", "-k", "protocol or parser or codec or not drivers"),
 )
 """Tests of the parts whose coverage is a gate, run a second time under the tracer, which would slow all others."""
