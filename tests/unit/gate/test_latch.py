@@ -2,6 +2,7 @@
 
 import os
 import stat
+from pathlib import Path
 
 import pytest
 
@@ -20,7 +21,7 @@ def latch(tmp_path, run):
 
 
 def open_files():
-    return len(os.listdir("/proc/self/fd"))
+    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def mode(path):
@@ -87,7 +88,7 @@ def test_what_is_no_file_of_its_user_alone_is_no_mark(run, what, monkeypatch):
             path.write_bytes(b"0")
             monkeypatch.setattr(os, "geteuid", lambda: 12345)
     before = open_files()
-    with pytest.raises(OSError):
+    with pytest.raises(OSError, match="mark"):
         Mark(path)
     assert open_files() == before
 
@@ -108,9 +109,9 @@ def test_preparing_leaves_a_mark_and_no_draft(latch, tmp_path, run):
 
 def test_a_place_where_nothing_can_be_stored_is_found_when_preparing(tmp_path, run):
     (tmp_path / "file").touch()
-    with pytest.raises(OSError):
+    with pytest.raises(FileExistsError):
         EstopLatch(tmp_path / "file" / "estop", run).prepare()
-    with pytest.raises(OSError):
+    with pytest.raises(FileNotFoundError):
         EstopLatch(tmp_path / "estop", tmp_path / "nowhere").prepare()
 
 
