@@ -19,6 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TurnDeficitConfig
+from monstertruckd.config.edit import check_size
 from monstertruckd.config.truck import TruckConfig
 
 C = TypeVar("C", bound=TruckConfig)
@@ -164,9 +165,10 @@ class CalibrationStore:
         """Read one file.
 
         Raises:
-            ConfigError: it is damaged, or of another truck; names the file and what to do.
+            ConfigError: it is damaged, too long, or of another truck; names the file and what to do.
         """
         try:
+            check_size(path)
             file = CalibrationFile.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
             what = error.strerror if isinstance(error, OSError) else _first_mistake(error)

@@ -79,6 +79,20 @@ def _check_directives(text: str, path: Path) -> None:
             raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; leave this line out")
 
 
+def check_size(path: Path) -> None:
+    """Refuse what would take for ever, or too much memory, to read.
+
+    Raises:
+        ConfigError: a pipe, a device, or longer than ``MOST_BYTES``.
+        OSError: there is nothing to read.
+    """
+    status = path.stat()
+    if stat.S_ISFIFO(status.st_mode) or stat.S_ISCHR(status.st_mode):
+        raise ConfigError(f"{path}: cannot be read: not a file of text")
+    if (size := status.st_size) > MOST_BYTES:
+        raise ConfigError(f"{path}:1: {size} bytes: expected at most {MOST_BYTES}")
+
+
 class YamlText:
     """A YAML mapping, or nothing, as text.
 
@@ -102,11 +116,7 @@ class YamlText:
             ConfigError: it cannot be read, is longer than ``MOST_BYTES``, or is refused as above.
         """
         try:
-            status = path.stat()
-            if stat.S_ISFIFO(status.st_mode) or stat.S_ISCHR(status.st_mode):
-                raise ConfigError(f"{path}: cannot be read: not a file of text")
-            if (size := status.st_size) > MOST_BYTES:
-                raise ConfigError(f"{path}:1: {size} bytes: expected a configuration of at most {MOST_BYTES}")
+            check_size(path)
             return cls(path.read_text(encoding="utf-8"), path)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"

@@ -92,12 +92,10 @@ class Robot:
         """Arm, and wait until the tracker drives at ``speed``."""
         with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.ODOMETRY, latest()) as odometry:
             async with asyncio.timeout(30):
-                while gate.latest is None or gate.latest.mode is not GateMode.DRIVING:
+                while gate.latest is None or odometry.latest is None or odometry.latest.twist.vx < speed:
                     if gate.latest is None or gate.latest.mode is GateMode.DISARMED:
                         with contextlib.suppress(RequestRefusedError):
                             await client.arm()
-                    await asyncio.sleep(0.1)
-                while odometry.latest is None or odometry.latest.twist.vx < speed:
                     await asyncio.sleep(0.05)
 
     async def truth(self) -> np.ndarray:

@@ -115,7 +115,7 @@ BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(
         ("version: 2\nname: a\0b\n", 2, r"not valid YAML: character '\x00' is not allowed"),
         ("version: 2\nname:\n  " + "[" * 5000, 3, "nested more than 50 times"),
         ("version: 2\nname:\n" + "".join(f"{' ' * n}a:\n" for n in range(1, 900)), 51, "nested more than 50 times"),
-        ("name: " + "x" * 50_000_000, 1, "50000006 bytes: expected a configuration of at most 1000000"),
+        ("name: " + "x" * 50_000_000, 1, "50000006 bytes: expected at most 1000000"),
         (
             "version: 2\n" + "".join(f"k{n}: &a{n} {n}\n" for n in range(19_000)),
             5000,
