@@ -129,9 +129,10 @@ async def test_the_keyboard_and_a_client_turn_a_robot_on_the_spot_by_twist(tmp_p
                 assert (gate.latest.role, gate.latest.form) == (Role.KEYBOARD, DriveForm.TWIST)
                 assert abs(_speed(odometry)) < 0.05
                 await _stopped_and_disarmed(gate, odometry)
-            await client.arm()
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(40):
                 while _turning(odometry) < 0.3:
+                    if _mode(gate) is GateMode.DISARMED:  # at first, and where a busy machine made samples stale
+                        await client.arm()
                     await client.drive_twist(0.0, wz=0.5)
                     await asyncio.sleep(0.05)
             await client.stop()
@@ -161,7 +162,7 @@ async def _orders(endpoint: str) -> None:
             answers.append((done.returncode, done.stdout.strip()))
             assert len(answers) < 5, f"{order}: {answers}, {done.stderr}"
     done = await command("arm", "--robot", "nobody", "--endpoint", endpoint)
-    assert done.returncode == Reason.TIMEOUT.exit_code
+    assert done.returncode == Reason.NOT_FOUND.exit_code
     silent = await command("echo", "sensor/drive_4", "--timeout", "3", "--endpoint", endpoint)
     assert silent.returncode == Reason.TIMEOUT.exit_code
     assert silent.stderr.splitlines() == [

@@ -51,6 +51,9 @@ INSTEAD = {
     "monstertruckd drill --count 10000 --cluster tcp://HOST:8786": Instead(
         None, "needs a cluster; tests/daemon/test_drill_cluster.py starts one"
     ),
+    "monstertruckd security check --endpoint tls/192.168.1.7:7447": Instead(
+        None, "needs a robot with certificates; tests/unit/tools/security/test_security.py checks one"
+    ),
     "monstertruckd uninstall-service": Instead("monstertruckd uninstall-service --root system --dry-run", SYSTEM),
     "monstertruckd doctor": Instead("monstertruckd doctor --root system", "looks at this computer", code=None),
     "monstertruckd usb --local": Instead("monstertruckd usb --local", "looks at this computer", code=None),
