@@ -31,8 +31,14 @@ def lap(kind: str, **tracker: float) -> tuple[np.ndarray, AxleResponse, list[Rea
     servos = {
         f"{axle}_servo": {"channel": channel, "dead_time": HIDDEN} for channel, axle in enumerate(("rear", "front"))
     }
-    overlay = {"recorder": None, "blackbox": None, "tracker": {"kind": kind, **tracker}}
-    config = with_overlay(base, overlay | {"sim": {"world": {"truck": servos}}})
+    overlay = {
+        "recorder": None,
+        "blackbox": None,
+        "tracker": {"kind": kind, **tracker},
+        "devices": {"steering": {"driver": {"dead_time": None, "lag": None}}},
+        "sim": {"world": {"truck": servos}},
+    }
+    config = with_overlay(base, overlay)
 
     async def main(clock: VirtualClock) -> tuple[np.ndarray, AxleResponse, list[Reason]]:
         rig = VirtualRig(config, clock)
