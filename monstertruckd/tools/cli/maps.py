@@ -2,17 +2,26 @@
 
 from collections import Counter
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruckd.tools.cli.options import ENDPOINT, with_parameters
+from monstertruckd.tools.cli.options import ENDPOINT, ConfigOption, EndpointOption, RobotOption, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
     from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
+
+
+class FrontChoice(StrEnum):
+    """Scan matchers."""
+
+    PLANAR = "planar"
+    KISS = "kiss"
+
 
 app = command_group("Build, show, save and use occupancy maps.")
 
@@ -63,7 +72,7 @@ def build(
     log: Log,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
     png: Png = None,
-    front: Annotated[str, typer.Option(help="Scan matcher: planar or kiss.")] = "planar",
+    front: Annotated[FrontChoice, typer.Option(help="Scan matcher.")] = FrontChoice.PLANAR,
     trajectory: Trajectory = None,
     json_output: JsonOption = False,
     *,
@@ -76,11 +85,9 @@ def build(
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.logs.trajectory import write_tum
 
-    if front not in ("planar", "kiss"):
-        raise InputError(f"--front {front}: expected planar or kiss")
     scans = _read(log, geometry)
     worker = SlamWorker()
-    facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front}))
+    facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front.value}))
     done: WorkerOutput = worker.step(
         WorkerInput(finish=True, whole=True, save=output, trajectory=trajectory is not None)
     )
@@ -127,8 +134,8 @@ def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> N
 @app.command("save")
 def save(
     output: Annotated[Path, typer.Argument(help="YAML file; its PNG is written next to it.", show_default=False)],
-    robot: Annotated[str, typer.Option(help="Name in the keys.")] = "truck",
-    endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the robot.")] = ENDPOINT,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = ENDPOINT,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the map.")] = 5.0,
 ) -> None:
     """Save the map of a running robot as map_server files."""
@@ -160,7 +167,7 @@ def save(
 @app.command("load")
 def load_command(
     place: MapPlace,
-    config: Annotated[Path, typer.Option("--config", "-c", help="The robot's configuration.")],
+    config: ConfigOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
     """Write a configuration with which the robot localises in a saved map."""
