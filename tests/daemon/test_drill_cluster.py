@@ -13,7 +13,7 @@ import pytest
 
 from monstertruck_runtime.errors import InputError, NoAnswerError
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill import cluster, random_drill
+from monstertruckd.tools.drill import random_drill
 from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, run_leg
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.daemon.wall_kit import ROOT
@@ -89,6 +89,6 @@ def test_a_leg_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_without_a_scheduler_it_says_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cluster, "CONNECT", 0.2)
+    monkeypatch.setattr(random_drill, "CONNECT", 0.2)
     with pytest.raises(NoAnswerError, match=r"tcp://127.0.0.1:1: no dask scheduler answers"):
         drill(1).run(cluster="tcp://127.0.0.1:1")
