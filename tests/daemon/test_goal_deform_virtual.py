@@ -89,6 +89,23 @@ def test_where_all_ways_are_blocked_the_ladder_is_climbed_to_its_end():
     assert not travel(story).truth.array()[:, 5].any(), "collided"
 
 
+def test_the_way_to_the_next_goal_does_not_back_into_what_was_seen_on_the_way_to_the_last():
+    async def story(trip: Trip) -> None:
+        await trip.goal(3.0, 6.0, 1.5)
+        await trip.arm()
+        async with trip.clock.deadline(60.0):
+            while trip.rig.world.truth(trip.clock.now()).y < 4.94:
+                await trip.clock.sleep(0.1)
+        trip.rig.world.add(trip.clock.now(), Box(2.58, 5.83, 0.12, 0.12))
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+        await trip.goal(2.0, 2.0, -1.5)
+        await trip.arm()
+        await trip.clock.sleep(20.0)
+        assert trip.reasons()
+
+    assert not travel(story).truth.array()[:, 5].any(), "collided"
+
+
 def test_the_published_set_up_comes_near_its_goal_and_touches_nothing():
     """The yardstick keeps its published faults: at the goal it drives to and fro."""
 

@@ -239,17 +239,17 @@ class DeformStep:
     def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_]]:
         """Put a scan into the window; obstacles in base, and which of them the map explains.
 
-        Obstacles are its points, and where the lidar does not see those that it saw before.
+        Obstacles are its points, and where the lidar does not see or look those that it saw before.
         """
         pose, points = task.pose, scan_points(task.scan, setup.lidar)
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
-        if len(blind := blind_beams(task.scan)):
-            before = self._window.obstacles
-            hidden = np.isin(_beams(points_relative(before, tuple(sensor)), task.scan), blind)
-            ends = np.vstack((ends, before[hidden]))
-            points = np.vstack((points, points_relative(before[hidden], pose)))
+        before = self._window.obstacles
+        beams = _beams(points_relative(before, tuple(sensor)), task.scan)
+        hidden = np.isin(beams, blind_beams(task.scan)) | (beams >= len(task.scan.codes))
+        ends = np.vstack((ends, before[hidden]))
+        points = np.vstack((points, points_relative(before[hidden], pose)))
         if self._walls is None:
             return points, np.zeros(len(points), np.bool_)
         tolerance = explained_within(setup.config, task.deviation) + self._walls.resolution / 2

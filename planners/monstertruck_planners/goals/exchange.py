@@ -34,6 +34,16 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenScan:
+    """A scan taken on the way, in the map's frame."""
+
+    points: Array
+    """Shape (n, 2): its returns, m."""
+    sensor: Array
+    """Shape (2,): where it was taken, m."""
+
+
+@dataclass(frozen=True, slots=True)
 class PlanTask:
     """One thing to plan."""
 
@@ -57,6 +67,8 @@ class PlanTask:
     """Places of the base to be passed before the goal."""
     deviation: float = 0.0
     """Standard deviation of the position, m."""
+    seen: tuple[SeenScan, ...] = ()
+    """Scans taken since the task before, oldest first."""
 
 
 @dataclass(frozen=True, slots=True)

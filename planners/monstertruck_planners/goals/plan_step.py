@@ -275,6 +275,9 @@ class PlanningStep:
     def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
         """Take in a scan, and what has become of the map."""
         memory = self._memory
+        for scan in task.seen:
+            memory.look(scan.points, scan.sensor)
+            memory.keep(scan.points)
         if task.clear:
             memory.doubt(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
         memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])

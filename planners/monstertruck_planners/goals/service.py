@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
@@ -16,6 +17,8 @@ from monstertruck_planners.goals.exchange import (
     Finding,
     PlanAnswer,
     PlanTask,
+    Pose,
+    SeenScan,
     Setup,
     deviation_of,
     level,
@@ -51,6 +54,14 @@ CHANGES: Final = ("phase", "outcome", "number", "routes", "recoveries")
 """Fields of the report whose change is reported at once."""
 FIRST_ROUTE: Final = 4.0
 """Seconds a remote call waits for the first route; the goal is pursued further."""
+SEEN: Final = 40
+"""Scans kept for the next plan, the newest."""
+SEEN_STEP: Final = 0.25
+"""Metres between two of them..."""
+SEEN_TURN: Final = 0.4
+"""...or radians."""
+JUMP: Final = 0.5
+"""Metres between the poses of two ticks after which the kept scans are not where they were taken."""
 
 R = TypeVar("R", bound=Request)
 
@@ -101,6 +112,9 @@ class GoalService:
         self._sent_ground: Ground | None = None
         self._scanned: LaserScan | None = None
         self._points: Array = np.empty((0, 2))
+        self._seen: deque[tuple[Pose, Array]] = deque(maxlen=SEEN)
+        """Poses and returns in base of scans since the last plan."""
+        self._before: Pose | None = None
         self._changed = asyncio.Event()
 
     async def run(self, ready: Ready) -> None:
@@ -196,6 +210,7 @@ class GoalService:
     # Observations
 
     def _tick(self, now: int) -> None:
+        self._keep_scan(now)
         run = self._goal
         if run is not None and run.active:
             if self._paths.displaced:
@@ -252,6 +267,18 @@ class GoalService:
         ahead = poses_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, pose)
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
+    def _keep_scan(self, now: int) -> None:
+        """Keep a scan every few steps for the next plan: what is behind by then has been seen."""
+        odometry = self._odometry(now)
+        pose = None if odometry is None else pose_of(odometry)
+        if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
+            self._seen.clear()
+        self._before = pose
+        if pose is None or (self._seen and not _moved_on(self._seen[-1][0], pose)):
+            return
+        if len(points := self._scan(now)):
+            self._seen.append((pose, points))
+
     def _scan(self, now: int) -> Array:
         """Returns of the newest scan in base; none if it is old or tilted."""
         scan = None if self._in.scan is None else self._in.scan.latest
@@ -287,16 +314,18 @@ class GoalService:
             self._planning = self._tasks.create_task(_known(PlanAnswer(Reason.NO_MAP, "no fresh pose")))
             return
         pose = pose_of(odometry)
-        points = placed(np.column_stack((points := self._scan(now), np.zeros(len(points)))), pose)[:, :2]
         grid = None if self._in.grid is None else self._in.grid.latest
         ground = None if self._in.ground is None else self._in.ground.latest
         if ground is not None and ground.frame != odometry.frame:
             ground = None
+        lidar = np.array([self._setup.lidar])
+        seen = tuple(SeenScan(_in_map(points, at), placed(lidar, at)[0, :2]) for at, points in self._seen)
+        self._seen.clear()
         task = PlanTask(
             plan.what,
             pose,
             run.goal,
-            points,
+            _in_map(self._scan(now), pose),
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             ground=ground if ground is not self._sent_ground or self._fresh else None,
@@ -304,6 +333,7 @@ class GoalService:
             afresh=plan.afresh,
             via=run.via,
             deviation=deviation_of(odometry),
+            seen=seen,
         )
         self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
         self._planning = self._tasks.create_task(self._ask(task))
@@ -364,6 +394,16 @@ class GoalService:
 
     def _seconds(self) -> float:
         return self._clock.now() / SECOND
+
+
+def _in_map(points: Array, pose: Pose) -> Array:
+    """Points in base, shape (n, 2), in the frame of the pose."""
+    return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+
+
+def _moved_on(before: Pose, pose: Pose) -> bool:
+    turned = abs(math.remainder(pose[2] - before[2], math.tau))
+    return math.dist(before[:2], pose[:2]) > SEEN_STEP or turned > SEEN_TURN
 
 
 async def _known(answer: PlanAnswer) -> PlanAnswer:

@@ -135,6 +135,22 @@ def test_what_stood_on_the_route_is_still_there_for_a_lidar_that_does_not_see(co
     assert answer.finding in (("free",) if finding == "free" else ("new", "kept"))
 
 
+def test_a_route_does_not_back_into_what_was_seen_before_the_truck_turned_away():
+    """A box seen ahead; then the truck stands with its back to it, and the route leads backward."""
+    step, first = begun()
+    box = (1.2, -0.15, 1.5, 0.1)
+    away = (0.4, 0.0, math.pi)
+    back = np.column_stack((np.arange(0.4, 3.01, 0.05), np.zeros(53), np.full(53, math.pi)))
+    step.step(first)
+    step.step(DeformTask(scan_of(ORIGIN, box), ORIGIN))
+    way = LocalRoute(2, back, -np.ones(len(back)))
+    answer = step.step(DeformTask(scan_of(away, box), away, way=way))
+    assert answer.finding != "free"
+    never, first = begun()
+    never.step(first)
+    assert never.step(DeformTask(scan_of(away, box), away, way=way)).finding == "free", "it saw nothing"
+
+
 def test_single_beams_that_fail_hide_nothing():
     scan = scan_of(ORIGIN, (1.0, -0.5, 1.2, 0.5))
     codes = scan.codes.copy()

@@ -13,7 +13,7 @@ from monstertruck_planners.collision import Footprint, clearance_to_points, plac
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import blocked_sides, escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, SeenScan, Setup
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import kept_poses, path_blocked, poses_ahead
 from monstertruck_planners.goals.plan_step import PlanningStep, shortened, stop_poses
@@ -319,6 +319,20 @@ def test_routes_round_what_the_scan_shows_until_that_is_forgotten(route):
     assert clearance_to_points(BODY, round_it.poses, np.array(post)).min() > 0.0
     assert step.step(task()).length > straight.length + 0.02, "remembered"
     assert step.step(task(clear=True)).length == pytest.approx(straight.length, abs=0.05)
+
+
+def test_what_scans_on_the_way_showed_counts_though_the_newest_does_not():
+    step = PlanningStep()
+    straight = step.step(task(setup=setup(), grid=hall()))
+    post = np.array([(2.75, y) for y in np.arange(1.3, 1.75, 0.05)])
+    sensor = np.array([1.0, 1.5])
+    round_it = step.step(task(seen=(SeenScan(post, sensor),)))
+    assert round_it.poses is not None
+    assert round_it.length > straight.length + 0.02
+    assert clearance_to_points(BODY, round_it.poses, post).min() > 0.0
+    beyond = np.array([(5.95, y) for y in np.arange(0.5, 2.5, 0.01)])
+    gone = step.step(task(seen=(SeenScan(post, sensor), SeenScan(beyond, sensor))))
+    assert gone.length == pytest.approx(straight.length, abs=0.05), "a later one saw through"
 
 
 def test_what_no_scan_sees_behind_the_truck_is_not_forgotten():
