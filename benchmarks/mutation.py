@@ -1,12 +1,14 @@
 """Do the tests of the gate and of the way to standstill notice a fault? Single-point faults, one after the other.
 
-    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART ...] [--again] [--list]
+    python benchmarks/mutation.py [--sample 600] [--seed 1] [--jobs N] [--file PART ...]
+                                  [--minutes M] [--again] [--list]
 
 Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``), or a seeded sample of them, meets
 the unit tests that reach its line, those that found others of its function first, then the quick ones; which tests
 reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet all tests of their
 part, those that reach a line with the same names first. A mutant that outlasts its time (three times its tests', and
-10 s) is counted apart. Results are kept, so a run that was interrupted goes on; ``--again`` judges survivors anew.
+10 s) is counted apart. Mutants are judged in the order drawn, so those of a run that ended early (``--minutes``) are a sample as well. Results
+are kept, so an interrupted run goes on; ``--again`` judges survivors anew.
 ``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
 The score is killed of killed and survived, with its 95 % interval (Wilson).
 """
@@ -20,10 +22,12 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -171,24 +175,23 @@ def known(file: Path, *, again: bool) -> dict[str, dict[str, str]]:
     return {name: entry for name, entry in verdicts.items() if not (again and entry["verdict"] in (SURVIVED, NO_TEST))}
 
 
-def sample(all_of_them: list[Mutant], count: int, seed: int) -> list[Mutant]:
-    """So many of them, drawn with a seed; all of them for 0."""
-    if not 0 < count < len(all_of_them):
-        return all_of_them
-    chosen = np.random.default_rng(seed).choice(len(all_of_them), count, replace=False)
-    return [all_of_them[index] for index in sorted(chosen.tolist())]
+def sample(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
+    """So many of them, drawn with a seed, in the order drawn; all of them for 0."""
+    order = np.random.default_rng(seed).permutation(len(every))
+    return [every[index] for index in order[: count or None].tolist()]
 
 
 def judged(
-    todo: list[Mutant], sources: dict[str, bytes], jobs: int, scratch: Path, most: float
+    todo: list[Mutant], sources: dict[str, bytes], options: argparse.Namespace, scratch: Path
 ) -> Iterator[tuple[Mutant, str, str]]:
-    """Verdict of every mutant, and the test that found it."""
+    """Verdict of every mutant that the time allows, and the test that found it."""
+    end = time.monotonic() + 60 * options.minutes
     tests = sorted({test for mutant in todo for test in TARGETS[mutant.file]})
     baseline = measured(scratch / "baseline.json", tests)
     print(f"{len(baseline.seconds)} tests, {sum(baseline.seconds.values()):.0f} s", file=sys.stderr)
     every = {file: (ROOT / file).read_bytes() for file in TARGETS}
     idle: SimpleQueue[dict[str, Server]] = SimpleQueue()
-    servers = [{kind: Server(kind, tests) for kind in ("warm", "cold")} for _ in range(jobs)]
+    servers = [{kind: Server(kind, tests) for kind in ("warm", "cold")} for _ in range(options.jobs)]
     for pair in servers:
         _check(pair, baseline, sources)
         idle.put(pair)
@@ -200,7 +203,7 @@ def judged(
         if not reached:
             return mutant, NO_TEST, ""
         before = killers[mutant.file, mutant.where]
-        reached = baseline.first(sorted(reached, key=lambda test: -before[test]), most)
+        reached = baseline.first(sorted(reached, key=lambda test: -before[test]), options.most)
         sound, faulty = sources[mutant.file].decode(), mutant.applied(sources[mutant.file]).decode()
         seconds = 3 * sum(baseline.seconds[test] for test in reached) + MARGIN
         pair = idle.get()
@@ -218,8 +221,15 @@ def judged(
         finally:
             idle.put(pair)
 
-    with ThreadPoolExecutor(jobs) as pool:
-        yield from pool.map(judge, todo)
+    waiting = iter(todo)
+    with ThreadPoolExecutor(options.jobs) as pool:
+        running = {pool.submit(judge, mutant) for mutant in islice(waiting, options.jobs)}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for judgement in done:
+                yield judgement.result()
+                if time.monotonic() < end and (mutant := next(waiting, None)) is not None:
+                    running.add(pool.submit(judge, mutant))
     for pair in servers:
         for server in pair.values():
             server.close()
@@ -243,6 +253,7 @@ def main() -> int:
     parser.add_argument("--file", nargs="*", default=[""], help="only sources whose name contains one of these")
     parser.add_argument("--results", type=Path, default=OUTPUT, help="JSON lines, kept from run to run")
     parser.add_argument("--again", action="store_true", help="judge earlier survivors anew, as after new tests")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end after this time with what is judged")
     parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each: a lower bound")
     parser.add_argument("--list", action="store_true", help="print the mutants and end")
     options = parser.parse_args()
@@ -261,7 +272,7 @@ def main() -> int:
     todo = [mutant for mutant in chosen if mutant not in verdicts]
     print(f"{len(every)} mutants, {len(every) - len(countable)} equivalent, {len(chosen)} drawn, {len(todo)} to judge")
     with tempfile.TemporaryDirectory(prefix="mutation-") as scratch, options.results.open("a") as kept:
-        for mutant, verdict, test in judged(todo, sources, options.jobs, Path(scratch), options.most) if todo else ():
+        for mutant, verdict, test in judged(todo, sources, options, Path(scratch)) if todo else ():
             verdicts[mutant] = verdict
             entry = {"id": ids[mutant], "verdict": verdict, "test": test, "mutant": mutant.key, "line": mutant.line}
             print(json.dumps(entry), file=kept, flush=True)
