@@ -2,5 +2,27 @@
 
 from typing import Final
 
-EQUIVALENTS: Final[dict[str, str]] = {}
+GATE: Final = "monstertruckd/gate/"
+NANOSECOND: Final = "a nanosecond, at the very beginning of time"
+CACHE: Final = "the cached value is computed once more"
+
+EQUIVALENTS: Final[dict[str, str]] = {
+    f"{GATE}arbitration.py::Sources.__init__: 0 -> (1)": "nobody drives before an ARM order, which sets it",
+    f"{GATE}config.py::weakened: 1 -> (2)": "a sign: only whether it is positive counts",
+    f"{GATE}limiter.py::ObstacleGuard.__init__: 0 -> (1)": NANOSECOND,
+    f"{GATE}limiter.py::ObstacleGuard._look: 0 -> (1)": NANOSECOND,
+    f"{GATE}limiter.py::ObstacleGuard._delay: 0 -> (1)": NANOSECOND,
+    f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
+    f"{GATE}limiter.py::Motion.servos: self._servos[0] != self.angles -> True": CACHE,
+    f"{GATE}limiter.py::Motion.shaft_speeds: self._shafts[0] != command -> True": CACHE,
+    f"{GATE}limiter.py::Motion.shaft_speeds: 0 -> (1)": CACHE,
+    f"{GATE}limiter.py::Motion.servos: 0 -> (1)": CACHE,
+    f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the way",
+    f"{GATE}limiter.py::CommandLimiter.update: pace <= allowed -> (pace < allowed)": "scaled by 1",
+    f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
+    f"{GATE}sensors.py::SteeringCheck.__init__: self._heading = 0.0 -> pass": "set before it is read",
+    f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": "set before it is read",
+    f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",
+    f"{GATE}latch.py::Mark.engaged: 2 -> (3)": "any second byte is damage",
+}
 """By ``Mutant.key``."""
