@@ -7,8 +7,8 @@ Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.
 the unit tests that reach its line, those that found others of its function first, then the quick ones; which tests
 reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet all tests of their
 part, those that reach a line with the same names first. A mutant that outlasts its time (three times its tests', and
-10 s) is counted apart. Mutants are judged in the order drawn, so those of a run that ended early (``--minutes``) are a sample as well. Results
-are kept, so an interrupted run goes on; ``--again`` judges survivors anew.
+10 s) is counted apart. Mutants are judged in the order drawn, so those of a run that ended early (``--minutes``) are a
+sample as well. Results are kept, so an interrupted run goes on; ``--again`` judges survivors anew.
 ``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
 The score is killed of killed and survived, with its 95 % interval (Wilson).
 """
@@ -24,8 +24,8 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -68,6 +68,10 @@ COMMON = frozenset(("self", "Final", "None", "True", "False", "float", "Annotate
 """Words that say nothing about what a line is for."""
 NO_TEST = "no test reaches it"
 OUTPUT = ROOT / "runs" / "mutation.jsonl"
+
+
+Judgement = tuple[Mutant, str, str]
+"""A mutant, its verdict, and the test that found it."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +187,7 @@ def sample(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
 
 def judged(
     todo: list[Mutant], sources: dict[str, bytes], options: argparse.Namespace, scratch: Path
-) -> Iterator[tuple[Mutant, str, str]]:
+) -> Iterator[Judgement]:
     """Verdict of every mutant that the time allows, and the test that found it."""
     end = time.monotonic() + 60 * options.minutes
     tests = sorted({test for mutant in todo for test in TARGETS[mutant.file]})
@@ -198,7 +202,7 @@ def judged(
 
     killers: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
 
-    def judge(mutant: Mutant) -> tuple[Mutant, str, str]:
+    def judge(mutant: Mutant) -> Judgement:
         reached, on_import = baseline.tests(mutant, every)
         if not reached:
             return mutant, NO_TEST, ""
@@ -221,18 +225,25 @@ def judged(
         finally:
             idle.put(pair)
 
-    waiting = iter(todo)
     with ThreadPoolExecutor(options.jobs) as pool:
-        running = {pool.submit(judge, mutant) for mutant in islice(waiting, options.jobs)}
-        while running:
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for judgement in done:
-                yield judgement.result()
-                if time.monotonic() < end and (mutant := next(waiting, None)) is not None:
-                    running.add(pool.submit(judge, mutant))
+        yield from _until(end, pool, judge, todo, options.jobs)
     for pair in servers:
         for server in pair.values():
             server.close()
+
+
+def _until(
+    end: float, pool: Executor, judge: Callable[[Mutant], Judgement], todo: Iterable[Mutant], jobs: int
+) -> Iterator[Judgement]:
+    """Judgements begun before ``end``, as they come."""
+    waiting = iter(todo)
+    running = {pool.submit(judge, mutant) for mutant in islice(waiting, jobs)}
+    while running:
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for judgement in done:
+            yield judgement.result()
+            if time.monotonic() < end and (mutant := next(waiting, None)) is not None:
+                running.add(pool.submit(judge, mutant))
 
 
 def _check(pair: dict[str, Server], baseline: Baseline, sources: dict[str, bytes]) -> None:

@@ -20,7 +20,6 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the way",
     f"{GATE}limiter.py::CommandLimiter.update: pace <= allowed -> (pace < allowed)": "scaled by 1",
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
-    f"{GATE}sensors.py::SteeringCheck.__init__: self._heading = 0.0 -> pass": "set before it is read",
     f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": "set before it is read",
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",
     f"{GATE}latch.py::Mark.engaged: 2 -> (3)": "any second byte is damage",
