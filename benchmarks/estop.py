@@ -37,7 +37,7 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
-from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
@@ -53,7 +53,7 @@ RATE = 10_000
 MISSED = 1.0
 DRIVEN = 0.3
 """Seconds of driving before each emergency stop, and a random share of a tick more."""
-PATIENCE = 20.0
+PATIENCE = 40.0
 GOAL_MS = 35.0
 
 
@@ -104,23 +104,26 @@ def flood(kind: str, endpoint: str, nonce: str) -> None:
         order = {"source": "flood", "role": "station", "lease": 1.0, "nonce": "another", "order": "arm"}
         if kind == "orders":
             order |= {"nonce": nonce, "role": "tracker"}
+        requests = topics.REQ_CONTROL.key("truck", "flood")
+        call = topics.rpc_key("truck", "versions", "flood")
         count, began = 0, time.monotonic()
+        print("flooding", flush=True)
         while not select.select([sys.stdin], [], [], 0)[0]:
             now = time.monotonic_ns()
             header = {"stamp": now, "received": now, "seq": now, "gate_stamp": now}
             match kind:
                 case "nonce" | "orders":
-                    session.put("mt/truck/req/control", json.dumps(order | header))
+                    session.put(requests, json.dumps(order | header))
                 case "rubbish":
-                    session.put("mt/truck/req/control", rng.bytes(200))
+                    session.put(requests, rng.bytes(200))
                 case "calls":
-                    session.get("mt/truck/rpc/versions", lambda _: None, timeout=0.5)
+                    session.get(call, lambda _: None, timeout=0.5)
                 case "forged":
                     state = GateState(
                         stamp=now, received=now, seq=count, mode=GateMode.DISARMED, nonce="forged", speed_limit=0.0
                     )
-                    session.put("mt/truck/state/gate", state.model_dump_json())
-                    session.put("mt/truck/sensor/scan", rng.bytes(2000))
+                    session.put(topics.GATE.key("truck"), state.model_dump_json())
+                    session.put(topics.SCAN.key("truck"), rng.bytes(2000))
             count += 1
             wait = began + count / RATE - time.monotonic()
             if wait > 0.001:
@@ -168,17 +171,25 @@ async def process(core: int, output: Path, *arguments: str) -> AsyncIterator[asy
     finally:
         if running.returncode is None:
             running.terminate()
-        await running.communicate()
+        await running.wait()
 
 
 async def order(client: TruckClient, what: Order) -> None:
-    """Give an order until it is carried out; no tracker drives."""
-    async with asyncio.timeout(PATIENCE):
-        while True:
-            with suppress(RequestRefusedError, TimeoutError):
-                await client.order(what, hold=what is Order.ARM)
-                return
+    """Give an order until it is carried out; no tracker drives.
+
+    Raises:
+        TruckError, TimeoutError: why it was not carried out in the end.
+    """
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            await client.order(what, hold=what is Order.ARM)
+        except (TruckError, TimeoutError):
+            if time.monotonic() > end:
+                raise
             await asyncio.sleep(0.05)
+        else:
+            return
 
 
 async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -> float | None:
@@ -227,7 +238,9 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
                 assert state is not None
                 words = (here, "--flooder", kind, endpoint, state.nonce)
                 flooder = await flooded.enter_async_context(process(other, folder / "flood.txt", *words))
-                await asyncio.sleep(2.0)
+                assert flooder.stdout is not None
+                await flooder.stdout.readline()
+                await asyncio.sleep(1.0)
             found = [await press(client, stops, n % 2 == 1, float(rng.uniform(0, 0.02))) for n in range(count)]
             sent = {"count": 0, "seconds": 1.0}
             if flooder is not None:
@@ -275,7 +288,8 @@ def main() -> int:
             flush=True,
         )
     met = all(done["p99_ms"] <= GOAL_MS and done["missed"] == 0 for done in figures.values())
-    goals = {"p99_ms": GOAL_MS, "missed": 0}
+    met = met and all(done["rate"] > 0 for kind, done in figures.items() if kind != "none")
+    goals = {"p99_ms": GOAL_MS, "missed": 0, "trials": 300}
     print(json.dumps({"bench": "estop", "figures": figures, "goals": goals, "met": met}))
     return 0 if met else 1
 

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from importlib.machinery import SourceFileLoader
 from itertools import pairwise
 from pathlib import Path
@@ -119,7 +119,7 @@ class _Served:
             path = str(ROOT / order["file"])
             try:
                 _exchange(functions[path], order["sound"], order["faulty"], path)
-            except ValueError:  # other free variables
+            except ValueError:
                 return 2, ""
             found = _FirstFailure([])
             session.config.pluginmanager.register(found)
@@ -133,8 +133,15 @@ class _Served:
         return True
 
 
-def _exchange(functions: Iterable[FunctionType], sound: str, faulty: str, path: str) -> None:
-    """Give the functions of a file the code of its faulty source."""
+def _exchange(functions: Collection[FunctionType], sound: str, faulty: str, path: str) -> None:
+    """Give the functions of a file the code of its faulty source.
+
+    Raises:
+        ValueError: that is not possible: the file is imported by the tests themselves, or a function's free variables
+            are others.
+    """
+    if not functions:
+        raise ValueError(path)
     old, new = (_codes(compile(source, path, "exec", dont_inherit=True)) for source in (sound, faulty))
     names = {code: name for name, code in old.items()}
     for function in functions:

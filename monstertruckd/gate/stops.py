@@ -211,7 +211,7 @@ class Outages:
         if event.source == DeviceRole.LINK:
             self._link = event if event.severity is not Severity.INFO else None
         if event.reason in HUB_EVENTS:
-            for role in str(event.values.get("roles") or "").split(","):
+            for role in str(event.values.get("roles", "")).split(","):
                 self._hubs[role] = event
 
     def explain(self, causes: Sequence[Cause]) -> tuple[Cause, ...]:

@@ -2,7 +2,9 @@
 
 import importlib.util
 import os
+import runpy
 import select
+import sys
 import termios
 import threading
 import tty
@@ -247,3 +249,16 @@ def test_the_line_is_raw_at_its_rate_and_what_was_waiting_on_it_is_forgotten(neu
     assert not settings["local"] & (termios.ECHO | termios.ICANON)
     assert len(closed) == 1
     controller.close()
+
+
+def test_as_a_program_it_ends_with_the_code_and_needs_the_ports(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert end.value.code == 1
+    controller = Controller(0, 0)
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), f"{controller.path}=3"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+    controller.close()
+    assert end.value.code == 0
