@@ -197,7 +197,7 @@ def of_the_lidars_clock() -> Iterator[Scenario]:
 def of_answers() -> Iterator[Scenario]:
     """Controllers that answer late, or restart before they answer; a motor that cannot turn."""
     yield Scenario(
-        Fault("drive: answers 40 ms late", command("drive", "delay 40"), command("drive", "delay 0"), hold=12.0),
+        Fault("drive: answers 40 ms late", command("drive", "delay 40"), command("drive", "delay 0"), hold=9.0),
         Expect.STOP_AHEAD,
         seen=(Reason.SLOW_LINK, Reason.DRIVE_STALE),
         resumes=True,
