@@ -1,9 +1,9 @@
 """What the black box costs: memory of a full minute, processor time per message, and the loop's wait while it writes.
 
 The traffic is that of the whole emulated truck (virtual clock, camera 640x480 at 15 Hz), played over and over until
-the ring is full. Memory is the ring's pages, and what grows on the heap beside them. Writing is measured by the
+the ring is full. Memory is the ring's pages, and what grows on the heap as well. Writing is measured by the
 processor time between two of the writer's pauses, which bounds what the loop waits for the interpreter whatever else
-the machine does, and beside an event loop that wakes every millisecond, in rounds with and without it. The last line
+the machine does, and next to an event loop that wakes every millisecond, in rounds with and without it. The last line
 is JSON.
 
     python benchmarks/black_box.py [ROUNDS]

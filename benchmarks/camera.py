@@ -1,6 +1,6 @@
 """What the camera costs the control tick, on the wall clock: the whole truck over ptys, with and without its camera.
 
-Daemon and simulator run as processes, as on the desk; runs with and without 640x480 at 15 Hz alternate, so that what
+Daemon and simulator run as processes, as on a robot; runs with and without 640x480 at 15 Hz alternate, so that what
 else the machine does weighs on both. A tick is as late as the stamp of its command is behind the 50 Hz grid; the figure
 is the difference of the medians of the runs' 99th percentiles. That is worth something on a quiet machine only, so the
 processor time one picture takes on the daemon's loop is measured, too. The last line is JSON.

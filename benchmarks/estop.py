@@ -244,8 +244,8 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
             found = [await press(client, stops, n % 2 == 1, float(rng.uniform(0, 0.02))) for n in range(count)]
             sent = {"count": 0, "seconds": 1.0}
             if flooder is not None:
-                told, _ = await flooder.communicate(b"\n")
-                sent = json.loads(told.splitlines()[-1])
+                printed, _ = await flooder.communicate(b"\n")
+                sent = json.loads(printed.splitlines()[-1])
         reading.cancel()
     known = np.array([1e3 * seconds for seconds in found if seconds is not None])
     p50, p99, most = np.percentile(known, (50, 99, 100)).tolist() if len(known) else (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""How punctual the control tick is beside everything else the daemon does, and what the daemon costs.
+"""How punctual the control tick is during everything else the daemon does, and what the daemon costs.
 
     python benchmarks/loop.py [--rounds N] [--seconds S] [--with slam|planning]
 

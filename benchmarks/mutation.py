@@ -117,7 +117,7 @@ class Durations:
             self.failed.append(report.nodeid)
 
 out, files, tests = sys.argv[1], json.loads(sys.argv[2]), json.loads(sys.argv[3])
-told = Durations()
+reported = Durations()
 measured = coverage.Coverage(data_file=None, config_file=False, include=files)
 measured.start()
 class Contexts:
@@ -128,11 +128,11 @@ class Contexts:
             return (yield)
         finally:
             measured.switch_context("")
-pytest.main(tests, plugins=[told, Contexts()])
+pytest.main(tests, plugins=[reported, Contexts()])
 measured.stop()
 data = measured.get_data()
 lines = {file: data.contexts_by_lineno(file) for file in data.measured_files()}
-json.dump({"lines": lines, "seconds": told.seconds, "failed": told.failed}, open(out, "w"))
+json.dump({"lines": lines, "seconds": reported.seconds, "failed": reported.failed}, open(out, "w"))
 """
 
 

@@ -3,13 +3,13 @@
     python benchmarks/recording.py [--rounds N] [--kills N]
 
 Cost: processor time per 1000 messages of a second's mix (100 poses, 10 scans, 2 pictures of 100 kB), from
-``record()`` to the closed chunks in the file, compressed by zstd, beside the Python writer of rosbag 1 (Debian's
+``record()`` to the closed chunks in the file, compressed by zstd, compared with the Python writer of rosbag 1 (Debian's
 ``python3-rosbag``, which need not be there) that writes the same bytes, by default uncompressed; both in turn. The
 codec's cost is not in it, as the bus pays it. Both run in the system's Python, where it is of our version.
 
-Stall: lateness of a 1 ms ticker on the loop that records the mix in real time, beside the same ticker without
+Stall: lateness of a 1 ms ticker on the loop that records the mix in real time, compared with the same ticker without
 recording; the figure is the difference of the greatest ones, in the median of the rounds. That is worth something
-on a quiet machine only, so the recorder's longest turn is told, too: the greatest processor time its thread takes
+on a quiet machine only, so the recorder's longest turn is reported, too: the greatest processor time its thread takes
 between two waits for work, for which it may keep the interpreter from the loop.
 
 Crash: a recording process is killed -9 at a random instant; the file is repaired as at the next start and read by
@@ -248,11 +248,11 @@ async def record_for_ever(clock: WallClock, folder: Path) -> None:
     messages = mix()
     sync = LogFile.sync
 
-    def told(file: LogFile) -> None:
+    def reported(file: LogFile) -> None:
         sync(file)
         print(f"synced {file.size}", flush=True)
 
-    LogFile.sync = told  # type: ignore[method-assign]
+    LogFile.sync = reported  # type: ignore[method-assign]
     async with Recorder(config(folder), clock, _no_failure) as recorder:
         while recorder.path is None:
             await clock.sleep(0.01)

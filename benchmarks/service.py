@@ -59,7 +59,7 @@ WantedBy=multi-user.target
 SPEED = 0.1
 """True speed from which the truck counts as driving, m/s."""
 OFF_GOALS = {"killed": 2.0, "process_frozen": 5.5, "loop_frozen": 5.5, "gate_frozen": 5.5, "stopped": 1.5}
-"""Seconds until the drive's controller has been told to switch off, which the stop script does last."""
+"""Seconds until the drive's controller has been commanded to switch off, which the stop script does last."""
 STAND_GOALS = OFF_GOALS | {"gate_frozen": 1.0}
 """Seconds until the truck stands; without a gate the drive's own driver stops it."""
 READY_GOAL = 20.0
@@ -99,7 +99,7 @@ class Wire:
     speeds: list[tuple[float, float]]
     """(s, m/s)"""
 
-    def told(self, control: Control) -> float | None:
+    def reported(self, control: Control) -> float | None:
         """Instant of the first such control word, s."""
         words = (at for at, index, value in written(self, 0) if (index, value) == (od.CONTROLWORD.index, control))
         return next((at / SECOND for at in words), None)
@@ -149,7 +149,7 @@ class Bench:
         return self.machine.show(SERVICE, *names)
 
     def active(self) -> bool:
-        """Whether systemd has been told READY."""
+        """Whether systemd has got READY."""
         return self.show("ActiveState")["ActiveState"] == "active"
 
     def exec_start(self) -> str:
@@ -178,7 +178,7 @@ class Bench:
         return [entry for entry in entries if int(entry["__MONOTONIC_TIMESTAMP"]) >= since * 1e6]
 
     def dies(self, name: str, action: Callable[[], object], *, says: tuple[str, ...], restarts: bool = True) -> None:
-        """Something ends the daemon of a driving truck: the wire is told to stop, the journal why, it runs again."""
+        """Something ends the daemon of a driving truck: the wire gets the stop, the journal why, it runs again."""
         if not self.drive():
             self.holds(f"{name}_drives", fact=False, text=self.machine.run("systemctl", "status", SERVICE, check=False))
             return
@@ -191,14 +191,14 @@ class Bench:
             self.within(f"{name}_ready_again_s", started - began if self.active() else None, READY_GOAL)
         until(lambda: self.wire.since(began).stood() is not None, 10)
         wire = self.wire.since(began)
-        off, stood = wire.told(Control.DISABLE_VOLTAGE), wire.stood()
-        self.holds(f"{name}_quick_stop", wire.told(Control.QUICK_STOP) is not None)
+        off, stood = wire.reported(Control.DISABLE_VOLTAGE), wire.stood()
+        self.holds(f"{name}_quick_stop", wire.reported(Control.QUICK_STOP) is not None)
         self.within(f"{name}_power_off_s", None if off is None else off - began, OFF_GOALS[name])
         self.within(f"{name}_stands_s", None if stood is None else stood - began, STAND_GOALS[name])
         self.figures[f"{name}_metres"] = round(wire.metres(stood or monotonic()), 2)
-        told = [str(entry.get("MESSAGE")) for entry in self.journal(began)]
+        reported = [str(entry.get("MESSAGE")) for entry in self.journal(began)]
         for words in says:
-            self.holds(f"{name}_journal: {words}", any(words in line for line in told), "\n".join(told[-40:]))
+            self.holds(f"{name}_journal: {words}", any(words in line for line in reported), "\n".join(reported[-40:]))
 
 
 # What is tried, in this order
@@ -349,7 +349,7 @@ def uninstall(bench: Bench) -> None:
     bench.holds("uninstalled", done.returncode == 0, done)
     until(lambda: bench.wire.since(began).stood() is not None, 10)
     wire = bench.wire.since(began)
-    off = wire.told(Control.DISABLE_VOLTAGE)
+    off = wire.reported(Control.DISABLE_VOLTAGE)
     bench.within("uninstall_power_off_s", None if off is None else off - began, OFF_GOALS["stopped"] + 2)
     bench.holds("unit_gone", bench.show("LoadState")["LoadState"] == "not-found")
     root = bench.machine.root

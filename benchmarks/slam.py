@@ -1,4 +1,4 @@
-"""SLAM on recorded logs, one configuration for all: accuracy beside wheels and kiss-icp, URG-04LX maps, and costs.
+"""SLAM on recorded logs, one configuration for all: accuracy against wheels and kiss-icp, URG-04LX maps, costs.
 
     python benchmarks/slam.py --data DIR [--only LOG|PART ...] [--quick]
 

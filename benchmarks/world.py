@@ -10,7 +10,7 @@ are quoted.
 
 The daemon is the fast demo's: daemon, emulated devices, world and recorder in one process. Two runs of one seed
 must record the same. Its speed is simulated per real time; as the machine may be shared, that per processor time is
-told, too. The last line is JSON.
+reported, too. The last line is JSON.
 """
 
 import argparse

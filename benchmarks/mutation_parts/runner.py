@@ -213,8 +213,8 @@ def _forked(run: Callable[[], tuple[int, str]], seconds: float) -> tuple[str, st
     if status is None or os.WIFSIGNALED(status):
         os.close(read)
         return TIMED_OUT, ""
-    with os.fdopen(read) as told:
-        test = told.read()
+    with os.fdopen(read) as reported:
+        test = reported.read()
     return ENDS.get(os.waitstatus_to_exitcode(status), BROKEN), test
 
 

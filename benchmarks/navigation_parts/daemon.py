@@ -68,7 +68,7 @@ def run(options: Options) -> Part:
         row = drive(goal, number, surprise=surprise)
         row["equal"] = number >= twice or row["digest"] == drive(goal, number, surprise=surprise)["digest"]
         rows.append(row)
-        print(f"{number:3} {np.round(goal, 2)} {told(row)}", flush=True)
+        print(f"{number:3} {np.round(goal, 2)} {reported(row)}", flush=True)
     part = Part()
     possible = [row for row in rows if row["outcome"] != Reason.GOAL_UNREACHABLE.value or row["routes"]]
     reached = [row for row in possible if row["reached"]]
@@ -109,8 +109,8 @@ def drive(goal: Goal, seed: int, *, surprise: bool) -> dict[str, Any]:
         async with rig.running():
             await clock.sleep(3.0)
             state = await pursue(rig, clock, goal, surprise=surprise)
-        told = events.drain()
-        for event in told:
+        reported = events.drain()
+        for event in reported:
             digest.update(f"{event.stamp} {event.source} {event.reason} {event.text}\n".encode())
         true = rig.truth.array()
         x, y, yaw = true[-1, 1:4]
@@ -118,7 +118,7 @@ def drive(goal: Goal, seed: int, *, surprise: bool) -> dict[str, Any]:
             outcome=state.outcome.value, text=state.text, routes=state.routes, recoveries=state.recoveries,
             elapsed=round(state.elapsed, 2), collided=bool(true[:, 5].any()), away=math.dist((x, y), goal[:2]),
             turned=abs(math.remainder(yaw - goal[2], math.tau)), digest=digest.hexdigest(),
-            deformed=any(event.reason is Reason.ROUTE_DEFORMED for event in told),
+            deformed=any(event.reason is Reason.ROUTE_DEFORMED for event in reported),
         )  # fmt: skip
         row["reached"] = state.outcome is Reason.GOAL_REACHED and row["away"] <= 0.2 and row["turned"] <= 0.2
 
@@ -187,7 +187,7 @@ def way_remains(world: Any, post: np.ndarray, here: Goal, goal: Goal) -> bool:
     return planner.plan(ground, start, end).path is not None
 
 
-def told(row: dict[str, Any]) -> str:
+def reported(row: dict[str, Any]) -> str:
     what = "reached" if row["reached"] else f"{row['outcome']} ({row['text']})"
     more = ", collided" * row["collided"] + ", decisions differ" * (not row["equal"])
     return f"{what}, {row['away']:.3f} m {row['turned']:.3f} rad, {row['elapsed']:.0f} s{more}"

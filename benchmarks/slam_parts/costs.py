@@ -1,4 +1,4 @@
-"""What mapping costs: grid beside a plain Bresenham in numba, front end, and the whole daemon on the virtual clock."""
+"""What mapping costs: grid against a plain Bresenham in numba, front end, whole daemon on the virtual clock."""
 
 import time
 from pathlib import Path

@@ -63,18 +63,18 @@ def run() -> tuple[dict[str, float], dict[str, float], bool]:
         scan = ScanInput(
             round(k * PERIOD * SECOND), ranges, ANGLES[0], ANGLES[1] - ANGLES[0], 0.02, RANGE, odom=tuple(odom)
         )
-        told = worker.step(WorkerInput(scan=scan))
-        assert told.estimate is not None
-        off.append(np.hypot(*between(between(poses[0], pose), np.array(told.estimate.pose))[:2]))
+        reported = worker.step(WorkerInput(scan=scan))
+        assert reported.estimate is not None
+        off.append(np.hypot(*between(between(poses[0], pose), np.array(reported.estimate.pose))[:2]))
         if (k + 1) % round(count / (6 * HOURS)) == 0:
             memory.append(resident())
-            keys, minute = told.counts["keys"], (k + 1) * PERIOD / 60
+            keys, minute = reported.counts["keys"], (k + 1) * PERIOD / 60
             late = float(np.mean(off[-round(count / (6 * HOURS)) :]))
             print(f"minute {minute:3.0f}: {memory[-1]:.1f} MB, {keys} keyframes, off by {late:.3f} m", flush=True)
     figures = {f"endurance_{10 * (n + 1)}min_mb": round(value, 1) for n, value in enumerate(memory)}
     figures |= {
         "endurance_growth_mb": round(max(memory[-4:]) - memory[-5], 1),
-        "endurance_keys": told.counts["keys"],
+        "endurance_keys": reported.counts["keys"],
         "endurance_off_m": float(np.mean(off[-count // 2 :])),
     }
     return figures, GOALS, figures["endurance_growth_mb"] <= GOALS["endurance_growth_mb"]

@@ -1,4 +1,4 @@
-"""The recorded URG-04LX end to end: emulator, driver, daemon and worker on the virtual clock, beside kiss-icp.
+"""The recorded URG-04LX end to end: emulator, driver, daemon and worker on the virtual clock, compared with kiss-icp.
 
 Both trajectories are drawn by one renderer: 5 cm cells, points within 4 m, every beam from where the trajectory was
 when it was measured. kiss-icp never learns of the sweep, so its poses are those of the middle. Fewer occupied cells,
@@ -6,7 +6,7 @@ lower entropy and fewer points that were later seen through mean a sharper map; 
 leaving out. A wall that falls on the edge of a cell is two cells wide, and seen through or not by chance: every map is
 drawn in ``PLACEMENTS`` random places of the grid, the figures are means, ``spread`` their standard deviation. Ours is
 the trajectory as the saved graph has it at the end, the correction of its keyframes spread over the scans between; what
-was told while driving is drawn too (``online``), and ours with every scan drawn at the pose of its middle (``rigid``).
+was seen while driving is drawn too (``online``), and ours with every scan drawn at the pose of its middle (``rigid``).
 
 Entropy is that of all cells of one frame round both maps, a bit for each that was not seen: it is lower by
 ``information``, the bits that the known cells say. ``known_entropy`` leaves the unknown cells out, so that whoever saw
@@ -70,7 +70,7 @@ LEAST = {"information_ratio": 1.0, "free_ratio": 1.0}
 
 
 def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float]:
-    """Scans as the daemon saw them; stamps (n,) and poses (n, 3) that it told; seconds of real time per second."""
+    """Scans as the daemon saw them; stamps (n,) and poses (n, 3) that it reported; seconds of real time per second."""
     config, _ = load_config(CONFIG, SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "slam": SlamConfig(save=folder)})
     recording = RecordedRanges.load(config.sim.recording)
@@ -90,12 +90,12 @@ def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float
     return scans, np.array([pose.stamp for pose in poses], float), rows, speed
 
 
-def settled(folder: Path, stamps: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """The poses that were told, moved as the saved graph has moved the keyframes before and after each."""
+def settled(folder: Path, stamps: np.ndarray, reported: np.ndarray) -> np.ndarray:
+    """The poses that were reported, moved as the saved graph has moved the keyframes before and after each."""
     graph = load(folder).graph
     at = np.clip(np.searchsorted(graph.stamps, stamps, side="right") - 1, 0, len(graph.stamps) - 2)
-    then = interpolate(stamps, told, graph.stamps.astype(float))
-    before, after = (compose(graph.poses[k], between(then[k], told)) for k in (at, at + 1))
+    then = interpolate(stamps, reported, graph.stamps.astype(float))
+    before, after = (compose(graph.poses[k], between(then[k], reported)) for k in (at, at + 1))
     share = np.clip((stamps - graph.stamps[at]) / (graph.stamps[at + 1] - graph.stamps[at]), 0.0, 1.0)
     off = after - before
     off[:, 2] = wrap(off[:, 2])
@@ -203,8 +203,8 @@ def against_wheels(recording: Path, poses: np.ndarray) -> tuple[float, float, fl
     yaw = np.unwrap(poses[:, 2])
     way = np.append(0.0, np.cumsum(between(poses[:-1], poses[1:])[:, 0]))
     residuals = []
-    for told, ticks in ((yaw, right - left), (way, (right + left) / 2)):
-        moved = told[SPAN:] - told[:-SPAN]
+    for reported, ticks in ((yaw, right - left), (way, (right + left) / 2)):
+        moved = reported[SPAN:] - reported[:-SPAN]
         rows = []
         for delay in DELAYS:
             then = np.interp(time_us / 1e6 - delay, time_us / 1e6, ticks)
@@ -233,10 +233,10 @@ def run(picture: Path | None = None) -> tuple[dict[str, float], dict[str, float]
     """Figures, goals, and whether all are met."""
     mount = 0.145
     with TemporaryDirectory() as folder:
-        scans, stamps, told, speed = played(Path(folder))
-        final = settled(Path(folder), stamps, told)
+        scans, stamps, reported, speed = played(Path(folder))
+        final = settled(Path(folder), stamps, reported)
     at = np.array([middle(scan) for scan in scans])
-    tracks = {"ours": (stamps, final), "online": (stamps, told), "kiss": (at, kiss_poses(scans, mount))}
+    tracks = {"ours": (stamps, final), "online": (stamps, reported), "kiss": (at, kiss_poses(scans, mount))}
     results = {name: rendered(scans, track, mount) for name, track in tracks.items()}
     results["rigid"] = rendered(scans, tracks["ours"], mount, rigid=True)
     figures = {f"exp2_{who}_{key}": value.mean() for who, values in results.items() for key, value in values.items()}
@@ -251,7 +251,7 @@ def run(picture: Path | None = None) -> tuple[dict[str, float], dict[str, float]
     for name, track in tracks.items():
         turn, way, scale = against_wheels(recording, interpolate(*track, at))
         figures |= {f"exp2_{name}_wheels_turn": turn, f"exp2_{name}_wheels_way": way, f"exp2_{name}_scale": scale}
-    figures |= {"exp2_scans": len(scans), "exp2_told": len(told), "exp2_daemon_speed": speed}
+    figures |= {"exp2_scans": len(scans), "exp2_reported": len(reported), "exp2_daemon_speed": speed}
     (_, one), (_, other) = (mapped(scans, mount, "kiss") for _ in range(2))
     figures["exp2_kiss_runs_apart"] = np.abs(one - other).max()
     if picture is not None:

@@ -142,9 +142,9 @@ def wrong_odometry(folder: Path, *, quick: bool) -> Found:
         rows = dict(zip(kinds, in_parallel(partial(misled, folder, name, quick), list(kinds)), strict=True))
         alone = rows["scans alone"][0]
         for kind, (off, reported) in rows.items():
-            told = f", reported after {reported:.1f} s" if kind in FAULTS else ""
+            delay = f", reported after {reported:.1f} s" if kind in FAULTS else ""
             print(
-                f"wrong_odometry {name} {kind}: error {off:.4f} m, {off / alone:.2f} of scans alone{told}", flush=True
+                f"wrong_odometry {name} {kind}: error {off:.4f} m, {off / alone:.2f} of scans alone{delay}", flush=True
             )
             figures[f"wrong_odometry.{name}.{kind.replace(' ', '_')}_m"] = off
         prefix = f"wrong_odometry.{name}"

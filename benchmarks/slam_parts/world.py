@@ -3,7 +3,7 @@
 Absolute error (ATE): root mean square of the position in odom, which begins at the truth; no alignment. Relative error
 (RPE): of the motion over every metre driven. After a kidnapping odom goes on from where it was, so that part of the
 drive counts from its own beginning. ``reckoning`` is the daemon's default: wheels, its heading held by the compass.
-The scans are matched by the mapper itself, on the odometry under test (without wheels: on nothing), and told
+The scans are matched by the mapper itself, on the odometry under test (without wheels: on nothing), and reported
 30 ms after their end; in kidnapped drives by the localisation in a map that another drive has saved, and by all
 sensors once more in the plain grid the world is drawn from.
 """
@@ -56,12 +56,12 @@ GOALS = {
     "corridor_nees": 8.0,
     "kidnap_found": 1.0,
     "kidnap_plain_found": 1.0,
-    "slip_told": 0.8,
+    "slip_reported": 0.8,
     "slip_false": 0.0,
     "greatest_step_m": 0.025,
 }
 """At most but for ``AT_LEAST``; degenerate is a share of the scans. NEES of 3 degrees of freedom, their mean."""
-AT_LEAST = ("corridor_degenerate", "kidnap_found", "kidnap_plain_found", "slip_told")
+AT_LEAST = ("corridor_degenerate", "kidnap_found", "kidnap_plain_found", "slip_reported")
 
 
 @dataclass
@@ -141,7 +141,7 @@ def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path |
         reckoner = DeadReckoning(OdometryConfig(start=start), chassis)
     matching = Matching(drive, saved) if "scans" in sensors else None
     run, waiting, due, truth = Run(), deque[tuple[int, ScanMotion]](), SECOND, np.array(drive.truth)
-    for now, message in drive.told:
+    for now, message in drive.reported:
         while due <= now:
             while waiting and waiting[0][0] <= due:
                 fusion.observe_scan(waiting.popleft()[1])
@@ -305,8 +305,8 @@ def _figures(
         seconds = [second for second in found if second is not None]
         figures[f"{name}_found"] = round(len(seconds) / len(found), 4)
         figures[f"{name}_seconds"] = round(float(np.mean(seconds or [0.0])), 2)
-    told, bursts = _slips(robots["slip"])
-    figures["slip_told"] = round(told / bursts, 4)
+    reported, bursts = _slips(robots["slip"])
+    figures["slip_reported"] = round(reported / bursts, 4)
     others = (run for name, runs in robots.items() if name not in ("slip", "kidnap", "kidnap_plain") for _, run in runs)
     figures["slip_false"] = float(sum(len(run.slips) for run in others))
     steps = [row["step"] for (_, which), rows in cells.items() if which == "all" for row in rows]
@@ -315,9 +315,9 @@ def _figures(
 
 
 def _slips(runs: list[tuple[Drive, Run]]) -> tuple[int, int]:
-    """Bursts of slip that were told, and all of them."""
-    told = sum(any(abs(slip - burst) < 1.0 for slip in run.slips) for drive, run in runs for burst in drive.bursts)
-    return told, sum(len(drive.bursts) for drive, _ in runs)
+    """Bursts of slip that were reported, and all of them."""
+    reported = sum(any(abs(slip - burst) < 1.0 for slip in run.slips) for drive, run in runs for burst in drive.bursts)
+    return reported, sum(len(drive.bursts) for drive, _ in runs)
 
 
 def _draw(robots: dict[str, list[tuple[Drive, Run]]], file: Path) -> None:

@@ -68,11 +68,11 @@ SCENARIOS = (
 
 @dataclass
 class Drive:
-    """Everything that was measured, in the order in which it was told, and the truth."""
+    """Everything that was measured, in the order in which it was reported, and the truth."""
 
     start: tuple[float, float, float]
-    told: list[tuple[int, object]] = field(default_factory=list)
-    """Instant at which it was told, ns; message, or stamp and ranges (769,), m, of a scan."""
+    reported: list[tuple[int, object]] = field(default_factory=list)
+    """Instant at which it was reported, ns; message, or stamp and ranges (769,), m, of a scan."""
     truth: list[tuple[float, ...]] = field(default_factory=list)
     """Stamp in s, x, y, yaw."""
     carried: int | None = None
@@ -157,16 +157,16 @@ def _leg(
                 slipped += 0.9 * (reading.turns - before)
             before = reading.turns
             angle = (turns + reading.turns + slipped) * 2 * math.pi
-            drive.told.append((now, _steering(now, pilot.servos)))
-            drive.told.append((now, _drive(now, angle, reading.rpm * math.pi / 30)))
+            drive.reported.append((now, _steering(now, pilot.servos)))
+            drive.reported.append((now, _drive(now, angle, reading.rpm * math.pi / 30)))
         if count % 5 == 2:
             reading = world.compass.compass(now)
             north = pose[2] + math.radians(reading.heading_deg)
-            drive.told.append((now, _attitude(now, reading, _magnet(scenario.magnet, pose, north))))
+            drive.reported.append((now, _attitude(now, reading, _magnet(scenario.magnet, pose, north))))
         if now >= swept + SWEEP:
             ranges = world.lidar.scan(swept).astype(np.float64) / 1000
             ranges[ranges < 0.02] = np.inf
-            drive.told.append((now, (swept, ranges)))
+            drive.reported.append((now, (swept, ranges)))
             swept = now
     return turns + before + slipped
 

@@ -140,7 +140,7 @@ def test_a_calibration_makes_the_next_start_right(tmp_path: Path):
 
 
 class Falling(LocalTruck):
-    """Falls silent when told to."""
+    """Falls silent when asked to."""
 
     silent = False
 

@@ -1,4 +1,4 @@
-"""`monstertruckd calibrate` as a process beside the daemon: killed and interrupted half-way, scripted to the end."""
+"""`monstertruckd calibrate` as a process next to the daemon: killed and interrupted half-way, scripted to the end."""
 
 import asyncio
 import json
@@ -22,7 +22,7 @@ from tests.daemon.wall_kit import ROOT, Robot, end, robot
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
 YARD = ROOT / "configs" / "yard.yaml"
-PATIENT = {
+LONG_WAITS = {
     "gate": {sensor: {"stale_after": 1.5} for sensor in ("scan", "drive", "steering", "attitude")}
     | {"max_latency": 1.0, "tick_stall": 1.0, "leases": {"station": 1.0}}
 }
@@ -31,7 +31,7 @@ PATIENT = {
 
 @asynccontextmanager
 async def truck_with_a_calibration(folder: Path) -> AsyncIterator[tuple[Robot, TruckClient, dict[Path, bytes]]]:
-    async with robot(folder, PATIENT, YARD) as truck:
+    async with robot(folder, LONG_WAITS, YARD) as truck:
         await truck.start_simulator()
         await truck.start_daemon()
         async with truck.client() as client:
@@ -123,11 +123,11 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
         assert await end(truck.daemon) == 0
         await truck.start_daemon()
         async with truck.client() as client:
-            told: dict[str, Any] = await client.call("calibration")
+            reported: dict[str, Any] = await client.call("calibration")
             config = await client.call("config")
         gain = json.loads(next(iter(before.values())))["results"]["battery"]["estimates"][0]["value"]
         assert config["devices"]["steering"]["driver"]["battery"]["gain"] == gain != 1.0
-        assert told["loaded"] == told["newest"] == str(next(iter(before)))
+        assert reported["loaded"] == reported["newest"] == str(next(iter(before)))
         undone = await command(truck, "battery", "--undo", "--json")
         assert undone.returncode == 0, undone.stderr
         newest = Path(json.loads(undone.stdout)["file"])
@@ -137,7 +137,7 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
         assert len(files(tmp_path)) == 3
 
 
-async def test_a_script_that_cannot_answer_is_told_which_question(tmp_path: Path):
+async def test_a_script_that_cannot_answer_gets_the_question(tmp_path: Path):
     async with truck_with_a_calibration(tmp_path) as (truck, _, before):
         unanswered = await command(truck, "drive", "--yes", "--sign-only")
         assert unanswered.returncode == Reason.BAD_INPUT.exit_code

@@ -184,7 +184,7 @@ def test_target_speeds_beyond_the_limit_are_seen():
     assert watched(lambda bare: bare.ports["drive"].device.take(frame.body)) == {"speed bytes"}
 
 
-def test_a_truck_before_something_is_told_from_one_in_the_open():
+def test_a_truck_before_something_is_distinguished_from_one_in_the_open():
     async def main(clock: VirtualClock) -> tuple[bool, bool]:
         world = World(demo().sim.world, seed=1)
         ports = {role: MemoryPort(role) for role in ("drive", "steering")}
@@ -222,8 +222,8 @@ def test_a_configuration_can_let_faults_happen_by_themselves():
             await clock.sleep_until(20 * SECOND)
         return {event.reason for event in events.drain()}
 
-    told = run_virtual(main)
-    assert told & {Reason.DEVICE_LOST, Reason.DEVICE_TIMEOUT, Reason.DEVICE_WRONG, Reason.DEVICE_FAULT}, told
+    reported = run_virtual(main)
+    assert reported & {Reason.DEVICE_LOST, Reason.DEVICE_TIMEOUT, Reason.DEVICE_WRONG, Reason.DEVICE_FAULT}, reported
 
 
 # The computer's supply

@@ -55,9 +55,9 @@ def test_the_way_is_that_of_the_scans_not_of_the_wrong_wheels(drive: dict):
     true = np.hypot(*np.diff(truth[:, 1:3], axis=0).T).sum()
     places = np.array([(pose.pose.x, pose.pose.y) for pose in poses])
     # Sampled once a second: the noise between ticks is no way.
-    told = np.hypot(*np.diff(places[::50], axis=0).T).sum()
+    reported = np.hypot(*np.diff(places[::50], axis=0).T).sum()
     assert true > 1.5
-    assert told == pytest.approx(true, rel=0.04), "the wheels alone would make it 7 % longer"
+    assert reported == pytest.approx(true, rel=0.04), "the wheels alone would make it 7 % longer"
 
 
 def test_the_motion_between_scans_goes_over_the_bus(drive: dict):

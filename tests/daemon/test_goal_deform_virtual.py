@@ -67,7 +67,7 @@ def test_where_the_hall_is_blocked_the_truck_takes_the_way_through_the_rooms():
     assert rig.truth.array()[:, 2].max() > 5.5
 
 
-def test_where_all_ways_are_blocked_the_ladder_is_climbed_to_its_end():
+def test_where_all_ways_are_blocked_the_recovery_behaviours_are_tried_to_the_last():
     async def story(trip: Trip) -> None:
         world, now = trip.rig.world, trip.clock.now
         world.add(now(), Box(5.5, 6.65, 0.1, 1.0))
@@ -80,11 +80,11 @@ def test_where_all_ways_are_blocked_the_ladder_is_climbed_to_its_end():
         assert state.text
         events = trip.events.drain()
         assert not [event for event in events if event.reason in (Reason.BUSY, Reason.DISARMED)]
-        told = [event for event in events if event.source == "goals"]
-        rungs = [event.text.rpartition(": ")[2] for event in told if event.reason is Reason.RECOVERING]
-        climbed = [rung for rung, _ in itertools.groupby(rungs) if "backs out" not in rung]
-        assert climbed == ["clear", "back out", "wait", "replan"]
-        assert told[-1].severity is Severity.WARNING
+        reported = [event for event in events if event.source == "goals"]
+        behaviours = [event.text.rpartition(": ")[2] for event in reported if event.reason is Reason.RECOVERING]
+        tried = [behaviour for behaviour, _ in itertools.groupby(behaviours) if "backs out" not in behaviour]
+        assert tried == ["clear", "back out", "wait", "replan"]
+        assert reported[-1].severity is Severity.WARNING
 
     assert not travel(story).truth.array()[:, 5].any(), "collided"
 

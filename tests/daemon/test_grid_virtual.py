@@ -68,7 +68,7 @@ def test_estimates_come_first_then_who_uses_them_then_the_gate_then_threads():
 def test_what_leaves_leaves_in_rows_behind_the_gate():
     wanted = (topics.ODOMETRY, topics.SCAN, topics.CMD_DRIVES[0], topics.HEALTH)
     found = seen(wanted, lambda _, now: now)
-    # Retained messages are told at once at the begin, what waits at the end.
+    # Retained messages are reported at once at the begin, what waits at the end.
     begin, end = min(map(min, found.values())), max(map(max, found.values()))
     for topic in wanted:
         late = [(now - BEHIND) % (40 * MILLISECOND) for now in found[topic] if begin < now < end]

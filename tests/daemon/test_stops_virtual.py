@@ -1,4 +1,4 @@
-"""Stops of the whole daemon, told with their causes and kept in black boxes, on the virtual clock."""
+"""Stops of the whole daemon, reported with their causes and kept in black boxes, on the virtual clock."""
 
 import asyncio
 import os
@@ -61,7 +61,7 @@ class Drive:
         return self.stops
 
 
-def test_a_lost_hub_is_told_behind_the_stop_and_the_box_holds_what_led_to_it(tmp_path: Path):
+def test_a_lost_hub_is_reported_behind_the_stop_and_the_box_holds_what_led_to_it(tmp_path: Path):
     config = with_overlay(base("full"), {"recorder": {"directory": str(tmp_path)}, "map": None})
 
     async def main(clock: VirtualClock) -> list[Stop]:

@@ -1,4 +1,4 @@
-"""What goes wrong with the estimation is told by the whole daemon: a corridor, slipping wheels, iron at the compass."""
+"""The whole daemon reports what goes wrong with the estimation: a corridor, slipping wheels, iron at the compass."""
 
 from pathlib import Path
 
@@ -99,7 +99,7 @@ def troubled() -> dict:
     return run_virtual(main, start=SECOND)
 
 
-def told(run: dict, reason: Reason) -> list[float]:
+def reported(run: dict, reason: Reason) -> list[float]:
     """Stamps of an event, s."""
     return [event.stamp / SECOND for event in run[topics.EVENT.name] if event.reason is reason]
 
@@ -114,17 +114,17 @@ def health(run: dict, second: float) -> OdometryHealth:
     return [one for one in run[topics.FUSION.name] if one.stamp <= second * SECOND][-1]
 
 
-def test_iron_near_the_compass_is_told_and_the_compass_no_source(troubled: dict):
+def test_iron_near_the_compass_is_reported_and_the_compass_no_source(troubled: dict):
     begin = troubled["iron"] / SECOND
-    assert any(begin < second < begin + 0.5 for second in told(troubled, Reason.HEADING_DISTURBED))
+    assert any(begin < second < begin + 0.5 for second in reported(troubled, Reason.HEADING_DISTURBED))
     assert "compass" in sources(troubled, begin)
     assert not health(troubled, begin).disturbed
     assert health(troubled, begin + 1.9).disturbed
     assert "compass" not in sources(troubled, begin + 1.9)
 
 
-def test_slip_and_its_end_are_told(troubled: dict):
+def test_slip_and_its_end_are_reported(troubled: dict):
     begin = troubled["slip"] / SECOND
-    assert any(begin < second < begin + 1.0 for second in told(troubled, Reason.WHEEL_SLIP))
-    assert any(begin + 1.0 < second < begin + 4.0 for second in told(troubled, Reason.WHEEL_GRIP))
+    assert any(begin < second < begin + 1.0 for second in reported(troubled, Reason.WHEEL_SLIP))
+    assert any(begin + 1.0 < second < begin + 4.0 for second in reported(troubled, Reason.WHEEL_GRIP))
     assert [health(troubled, begin + later).slipping for later in (0.0, 1.0, 4.0)] == [False, True, False]

@@ -186,8 +186,8 @@ def test_one_cable_pulled_is_no_lost_hub():
         assert robot.down() == {"lidar"}
         lidar.port.plug()
         assert await robot.ready() < 2.0
-        told = [event for event in robot.events() if event.reason in (Reason.HUB_LOST, Reason.DEVICE_LOST)]
-        assert [(event.reason, event.source) for event in told] == [(Reason.DEVICE_LOST, "lidar")]
+        reported = [event for event in robot.events() if event.reason in (Reason.HUB_LOST, Reason.DEVICE_LOST)]
+        assert [(event.reason, event.source) for event in reported] == [(Reason.DEVICE_LOST, "lidar")]
 
     play(scene)
 

@@ -36,7 +36,7 @@ def test_every_row_of_ours_loads(table, name):
     assert row.doc
 
 
-def test_groups_are_told_apart():
+def test_groups_are_kept_apart():
     assert len({table.group for table in TABLES}) == len(TABLES)
 
 

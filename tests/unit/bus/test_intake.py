@@ -204,7 +204,7 @@ def goal(seq: int) -> bytes:
 
 
 @pytest.mark.parametrize(("topic", "make", "burst"), [(REQ_GOAL, goal, 5), (REQ_PATH, lambda seq: path(2, seq), 5)])
-async def test_more_than_a_few_a_second_are_dropped_and_told_once(
+async def test_more_than_a_few_a_second_are_dropped_and_reported_once(
     topic: Topic[Message], make: Callable[[int], bytes], burst: int
 ):
     entrance = Entrance()

@@ -71,7 +71,7 @@ def test_a_long_row_leaves_in_several_turns_of_the_loop():
     assert [at for _, _, at in found] == list(range(2 * BATCH + 1))
 
 
-def test_nothing_waits_if_it_is_told_so():
+def test_nothing_waits_if_it_is_configured_so():
     async def scenario(send, _, clock):
         send(ODOMETRY)
         await clock.sleep(0.1)
@@ -255,7 +255,7 @@ def test_an_event_is_not_held_back():
     run_virtual(main)
 
 
-def test_who_is_told_may_have_all_that_waits_delivered():
+def test_who_is_informed_may_have_all_that_waits_delivered():
     found = []
 
     def deliver(row):

@@ -199,7 +199,7 @@ async def test_state_put_by_others_never_enters_the_bus():
     "key",
     ["req/ann/unknown", "req/ann", "req/**", "req/ann/**", "req/*/drive", "**", "req/ann/drive/x"],
 )
-async def test_a_put_to_a_wildcard_or_an_unknown_key_is_told_and_taken_by_nobody(key: str):
+async def test_a_put_to_a_wildcard_or_an_unknown_key_is_reported_and_taken_by_nobody(key: str):
     async with running_robot() as robot:
         box = robot.bus.subscribe(REQ_DRIVE, fifo(1))
         with raw_session(robot.endpoint) as station:

@@ -57,7 +57,7 @@ def test_measured_values_win_and_show_where_they_come_from(config: Path):
     assert not truck.devices.drive.driver.inverted
     assert truck.devices.steering is not None
     assert truck.devices.steering.driver.front.centre_us == 1450.0
-    assert truck.devices.steering.driver.front.channel == 1, "what stands beside stays"
+    assert truck.devices.steering.driver.front.channel == 1, "what stands next to it stays"
     assert truck.devices.steering.driver.rear.direction == 1
     assert truck.devices.compass is not None
     assert truck.devices.compass.driver.iron.hard_x == 7.5

@@ -32,7 +32,7 @@ REAL, TO_CALIBRATE = "truck.yaml", "yard.yaml"
 
 def test_shipped_configurations_with_emulated_servos_say_how_late_these_answer():
     """The chain's own share: the simulated servos of these files have neither dead time nor lag."""
-    told = {}
+    reported = {}
     for file in sorted((*CONFIGS.glob("*.yaml"), *(CONFIGS / "robots").glob("*.yaml"))):
         if file.name == REAL and file.parent == CONFIGS:
             continue
@@ -40,7 +40,7 @@ def test_shipped_configurations_with_emulated_servos_say_how_late_these_answer()
         servos, truck = config.devices.steering, config.sim.world.truck
         if servos is not None:
             assert truck.front_servo.dead_time == truck.front_servo.lag == 0.0, file.name
-            told[f"{file.parent.name}/{file.name}"] = servos.driver.dead_time, servos.driver.lag
-    assert told.pop(f"configs/{TO_CALIBRATE}") == (None, None)
-    assert len(told) > 10
-    assert set(told.values()) == {(0.012, 0.0)}, told
+            reported[f"{file.parent.name}/{file.name}"] = servos.driver.dead_time, servos.driver.lag
+    assert reported.pop(f"configs/{TO_CALIBRATE}") == (None, None)
+    assert len(reported) > 10
+    assert set(reported.values()) == {(0.012, 0.0)}, reported

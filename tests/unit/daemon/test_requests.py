@@ -42,8 +42,8 @@ def test_every_goal_is_answered(tmp_path: Path, count: int):
         events = daemon.bus.subscribe(EVENT, fifo(9))
         for _ in range(count):
             daemon.bus.inject(REQ_GOAL, GoalRequest(**HEADER, frame="map", goal=Pose2D(x=1.0, y=2.0, yaw=0.0)))
-        told = events.drain()
-        assert [event.reason for event in told] == [Reason.NOT_SUPPORTED] * count
-        assert "ann" in told[0].text
+        reported = events.drain()
+        assert [event.reason for event in reported] == [Reason.NOT_SUPPORTED] * count
+        assert "ann" in reported[0].text
 
     with_daemon(tmp_path, check)

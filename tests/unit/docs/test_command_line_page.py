@@ -15,7 +15,7 @@ def test_every_reason_is_in_the_table_with_its_code(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out in PAGE, "put in what `monstertruckd reasons --markdown` prints"
 
 
-def test_modes_and_speeds_of_the_keyboard_are_told():
+def test_modes_and_speeds_of_the_keyboard_are_reported():
     *first, last = (mode.value for mode in SteeringMode if mode is not SteeringMode.TWIST)
     assert f"{', '.join(first)} and {last} steering" in PAGE
     assert "drive by twist" in PAGE

@@ -65,7 +65,7 @@ class Events:
 
 @contextlib.asynccontextmanager
 async def background(coroutine: Coroutine[Any, Any, Any]) -> AsyncIterator[asyncio.Task[Any]]:
-    """Runs beside the test; a failure is raised at the end."""
+    """Runs while the test runs; a failure is raised at the end."""
     task = asyncio.create_task(coroutine)
     try:
         yield task

@@ -63,7 +63,7 @@ def test_it_goes_on_when_nobody_waits_any_more():
 
 
 def test_a_wait_may_be_too_long():
-    def patient():
+    def repeated():
         try:
             yield Need(1, 0.5)
         except TimeoutError:
@@ -71,7 +71,7 @@ def test_a_wait_may_be_too_long():
 
     async def scenario(link, _, clock):
         begin = clock.now()
-        assert await Talk(link, patient()).result() == "late"
+        assert await Talk(link, repeated()).result() == "late"
         assert (clock.now() - begin) / SECOND == pytest.approx(0.5, abs=0.01)
 
     on_link(scenario)

@@ -1,4 +1,4 @@
-"""Wheel data of a truck that drives exactly as it is told."""
+"""Wheel data of a truck that drives exactly as it is commanded."""
 
 import math
 

@@ -47,12 +47,12 @@ def test_every_family_has_a_covariance_that_grows_with_the_way_not_with_the_read
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_noise_of_the_shafts_gives_the_covariance_that_is_told(kind):
+def test_the_noise_of_the_shafts_gives_the_covariance_that_is_reported(kind):
     """Monte Carlo: 300 drives of 1 s with noisy shafts, against the sum of the ways' covariances."""
     chassis = BODIES[kind].implementation_class()(Dimensions(DRIVETRAIN))
     rng, speeds = np.random.default_rng(1), np.full(len(chassis.shafts), 0.2)
     made = rolls(chassis, speeds, 0.05, 20)
-    told = sum(way_covariance(chassis, roll, SHAFT, 0.0, (0.0, 0.0, 0.0)) for roll in made)
+    reported = sum(way_covariance(chassis, roll, SHAFT, 0.0, (0.0, 0.0, 0.0)) for roll in made)
     ends = []
     for _ in range(300):
         end = np.zeros(3)
@@ -62,8 +62,8 @@ def test_the_noise_of_the_shafts_gives_the_covariance_that_is_told(kind):
             end = end + np.array(twist) * roll.dt
         ends.append(end)
     seen = np.cov(np.array(ends).T)
-    sizes = np.sqrt(np.diag(told))
-    assert (np.abs(seen - told) <= 0.35 * np.outer(sizes, sizes) + 1e-9).all()
+    sizes = np.sqrt(np.diag(reported))
+    assert (np.abs(seen - reported) <= 0.35 * np.outer(sizes, sizes) + 1e-9).all()
 
 
 def test_the_covariance_of_a_truck_that_stands_is_none():

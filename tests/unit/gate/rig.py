@@ -213,7 +213,7 @@ class Rig:
         assert self.out.mode is GateMode.DRIVING
         return self
 
-    def told(self, reason):
+    def reported(self, reason):
         return [event for event in self.events if event.reason is reason]
 
 

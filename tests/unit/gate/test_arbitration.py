@@ -56,14 +56,14 @@ def test_a_lapsed_lease_stops_within_300_ms_and_stands_within_300_more():
     assert rig.out.mode is GateMode.STOPPING
     assert rig.out.reasons == (Reason.LEASE_EXPIRED,)
     assert rig.out.speed_limit == 0
-    assert rig.told(Reason.LEASE_EXPIRED)
+    assert rig.reported(Reason.LEASE_EXPIRED)
     ticks = 0
     while rig.out.mode is GateMode.STOPPING:
         rig.tick()
         ticks += 1
     assert seconds(ticks) <= 0.3
     assert rig.out.mode is GateMode.ARMED
-    assert rig.told(Reason.STOPPED)
+    assert rig.reported(Reason.STOPPED)
 
 
 def speed_of(rig):
@@ -87,9 +87,9 @@ def test_who_lets_go_of_a_truck_at_rest_does_not_stop_it():
     assert (rig.out.mode, rig.out.holder, rig.out.reasons) == (GateMode.ARMED, None, ())
     assert (rig.out.action, rig.out.speeds[0]) == (DriveAction.RUN, 0.0)
     assert rig.trips == []
-    (told,) = rig.told(Reason.STOPPED)
-    assert (told.severity, told.text) == (Severity.INFO, "ann released control")
-    assert not rig.told(Reason.LEASE_EXPIRED)
+    (reported,) = rig.reported(Reason.STOPPED)
+    assert (reported.severity, reported.text) == (Severity.INFO, "ann released control")
+    assert not rig.reported(Reason.LEASE_EXPIRED)
     rig.driver = {"speed": 0.2}
     rig.tick(5)
     assert rig.out.mode is GateMode.DRIVING, "the same source goes on"
@@ -116,7 +116,7 @@ def test_nobody_for_a_while_disarms():
     rig.tick(round(0.4 / 0.02))
     assert rig.out.mode is GateMode.DISARMED
     assert rig.out.action is DriveAction.DISABLE
-    assert "1.5 s" in rig.told(Reason.DISARMED)[0].text
+    assert "1.5 s" in rig.reported(Reason.DISARMED)[0].text
 
 
 def test_armed_but_never_driven_disarms():
@@ -180,7 +180,7 @@ def test_clipping_keeps_the_curvature():
     assert max(abs(rig.out.front), abs(rig.out.rear)) <= 0.436 + 1e-12
     assert rig.out.speeds[0] == pytest.approx(0.21)  # of the wheels
     assert Reason.CLIPPED in rig.out.reasons
-    assert len(rig.told(Reason.CLIPPED)) == 1
+    assert len(rig.reported(Reason.CLIPPED)) == 1
     rig.driver = {"speed": 0.1, "front": 9.0, "rear": -9.0}
     rig.tick(40)
     assert (rig.out.front, rig.out.rear) == pytest.approx((0.4095, -0.4095), abs=1e-4)  # servos at 45 degrees
@@ -219,7 +219,7 @@ def test_a_servo_at_the_end_of_its_pulses_is_reported_and_the_curvature_is_what_
         rig = Rig(chassis=chassis).driving(ticks=80, **asked(front, rear))
         assert Reason.SERVO_LIMIT in rig.out.reasons
         assert Reason.CLIPPED in rig.out.reasons
-        assert len(rig.told(Reason.SERVO_LIMIT)) == 1
+        assert len(rig.reported(Reason.SERVO_LIMIT)) == 1
         assert chassis.bicycle.curvature(rig.out.front, rig.out.rear) == pytest.approx(curvature, abs=2e-3)
         for servo in rig.out.servos:
             assert reach[0][0] - 1e-4 <= servo <= reach[0][1] + 1e-4
@@ -238,8 +238,8 @@ def test_estop_latches_whoever_asks():
     assert rig.out.mode is GateMode.ESTOPPED
     assert rig.out.action is DriveAction.QUICK_STOP
     assert rig.out.reasons[0] is Reason.ESTOPPED
-    assert rig.told(Reason.ESTOP_REQUESTED)[0].values == {"role": "tracker", "by": "cy"}
-    assert rig.told(Reason.ESTOP_REQUESTED)[0].severity is Severity.ERROR
+    assert rig.reported(Reason.ESTOP_REQUESTED)[0].values == {"role": "tracker", "by": "cy"}
+    assert rig.reported(Reason.ESTOP_REQUESTED)[0].severity is Severity.ERROR
     rig.tick(100)
     assert rig.out.mode is GateMode.ESTOPPED
     assert rig.out.action is DriveAction.QUICK_STOP
@@ -248,7 +248,7 @@ def test_estop_latches_whoever_asks():
     assert rig.order(Order.ARM) is Reason.ESTOPPED
     rig.order(Order.ESTOP)
     rig.tick()
-    assert len(rig.told(Reason.ESTOP_REQUESTED)) == 1
+    assert len(rig.reported(Reason.ESTOP_REQUESTED)) == 1
 
 
 def test_estop_is_cleared_by_reset_with_neutral_stick_then_arm():
@@ -267,7 +267,7 @@ def test_estop_is_cleared_by_reset_with_neutral_stick_then_arm():
     assert rig.order(Order.RESET) is Reason.OK
     rig.tick()
     assert rig.out.mode is GateMode.DISARMED
-    assert "reset by ann" in rig.told(Reason.DISARMED)[0].text
+    assert "reset by ann" in rig.reported(Reason.DISARMED)[0].text
     assert rig.order(Order.ARM) is Reason.OK
     assert rig.order(Order.RESET) is Reason.OK  # nothing to reset
     rig.tick()
@@ -291,7 +291,7 @@ def test_arming_is_refused_while_moving_pushed_or_blocked():
     rig.silent = set()
     rig.tick()
     assert rig.order(Order.ARM) is Reason.OK
-    assert [e.values["request"] for e in rig.told(Reason.NOT_ARMED_SPEED)] == ["arm", "arm"]
+    assert [e.values["request"] for e in rig.reported(Reason.NOT_ARMED_SPEED)] == ["arm", "arm"]
 
 
 def test_a_waiting_tracker_does_not_hinder_arming():
@@ -319,14 +319,14 @@ def test_disarm_stops_first():
     rig.order(Order.DISARM)
     rig.tick()
     assert rig.out.mode is GateMode.DISARMED
-    assert rig.told(Reason.DISARMED)
+    assert rig.reported(Reason.DISARMED)
 
 
 def test_arming_twice_is_no_harm():
     rig = Rig().armed()
     assert rig.order(Order.ARM) is Reason.OK
     rig.tick()
-    assert len(rig.told(Reason.ARMED)) == 1
+    assert len(rig.reported(Reason.ARMED)) == 1
 
 
 def test_arming_while_stopping_is_refused():
@@ -364,7 +364,7 @@ def test_a_stalled_tick_stops_quickly_and_recovers():
     rig.now += round(0.2 * SECOND)
     rig.tick()
     assert (rig.out.mode, rig.out.action) == (GateMode.STOPPING, DriveAction.QUICK_STOP)
-    assert rig.told(Reason.TICK_STALLED)
+    assert rig.reported(Reason.TICK_STALLED)
     rig.tick(24)
     assert rig.out.mode is GateMode.ARMED
     rig.tick(3)
@@ -392,7 +392,7 @@ def test_equal_events_are_counted_not_repeated():
     rig = Rig()
     rig.driver = {"speed": 0.1}
     rig.tick(120)
-    refusals = rig.told(Reason.DISARMED)
+    refusals = rig.reported(Reason.DISARMED)
     assert len(refusals) == 3
     assert refusals[1].values["repeated"] == 49
     assert refusals[0].values == {"role": "gamepad", "request": "drive", "by": "ann"}

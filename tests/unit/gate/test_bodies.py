@@ -61,7 +61,7 @@ def test_crab_and_counter_steer_are_refused_by_name_and_move_nothing(rear):
     assert rig.drive(speed=0.1, front=0.2, rear=rear) is Reason.IMPOSSIBLE_MOTION
     rig.tick(5)
     assert rig.out.mode is GateMode.ARMED
-    [event] = rig.told(Reason.IMPOSSIBLE_MOTION)
+    [event] = rig.reported(Reason.IMPOSSIBLE_MOTION)
     assert f"rear is {rear}: expected 0" in event.text
 
 
@@ -80,7 +80,7 @@ def test_one_fault_stops_and_disarms():
     rig.broken = {1}
     rig.tick()
     assert rig.out.action is DriveAction.QUICK_STOP
-    assert rig.told(Reason.DRIVE_FAULT)[0].values["drive_fault_code"] == 0x2310
+    assert rig.reported(Reason.DRIVE_FAULT)[0].values["drive_fault_code"] == 0x2310
     rig.tick(50)
     assert rig.out.mode is GateMode.DISARMED
 

@@ -86,7 +86,7 @@ def test_the_outage_of_any_service_of_a_sensor_counts():
         ("", f"lidar: {Reason.DEVICE_LOST.text}"),
     ],
 )
-def test_an_outage_is_told_with_the_name_of_its_service_once(detail, text):
+def test_an_outage_is_reported_with_the_name_of_its_service_once(detail, text):
     found = outages(("lidar", ServiceState.BACKOFF, NOW, {"reason": Reason.DEVICE_LOST, "detail": detail}))
     found_cause = found.explain((cause(),))[1]
     assert (found_cause.text, found_cause.since) == (text, NOW)
@@ -159,8 +159,8 @@ def test_stops_are_numbered_kept_until_they_are_read_and_read_once():
     assert log.drain(NOW) == ()
 
 
-@pytest.mark.parametrize(("later", "told"), [(EXPLAINED_WITHIN, True), (EXPLAINED_WITHIN + 1, False)])
-def test_what_becomes_known_soon_after_a_stop_is_added_to_it_once(later, told):
+@pytest.mark.parametrize(("later", "reported"), [(EXPLAINED_WITHIN, True), (EXPLAINED_WITHIN + 1, False)])
+def test_what_becomes_known_soon_after_a_stop_is_added_to_it_once(later, reported):
     found = outages()
     log = StopLog(found)
     add(log)
@@ -172,7 +172,7 @@ def test_what_becomes_known_soon_after_a_stop_is_added_to_it_once(later, told):
         )
     )
     again = log.drain(NOW + later)
-    assert [(trip.number, len(trip.causes)) for trip in again] == ([(1, 2)] if told else [])
+    assert [(trip.number, len(trip.causes)) for trip in again] == ([(1, 2)] if reported else [])
     assert log.drain(NOW + later) == ()
 
 

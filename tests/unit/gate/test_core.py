@@ -44,31 +44,31 @@ def test_a_refused_request_is_an_event_about_its_sender():
 
 
 @pytest.mark.parametrize(
-    ("request_", "reason", "told"),
+    ("request_", "reason", "reported"),
     [
         ({**GOALS, "speed": 0.0}, Reason.BUSY, False),
         ({**GOALS, "speed": 0.1}, Reason.BUSY, True),
     ],
 )
-def test_a_planner_that_holds_the_truck_at_rest_while_another_drives_is_no_event(request_, reason, told):
+def test_a_planner_that_holds_the_truck_at_rest_while_another_drives_is_no_event(request_, reason, reported):
     rig = Rig().driving(speed=0.1, **TRACK)
     assert rig.drive(**request_) is reason
     rig.tick()
-    assert bool(rig.told(Reason.BUSY)) is told
+    assert bool(rig.reported(Reason.BUSY)) is reported
 
 
 def test_an_operator_that_holds_the_truck_at_rest_while_another_drives_is_an_event():
     rig = Rig().driving(source="ann")
     assert rig.drive(source="bob", speed=0.0) is Reason.BUSY
     rig.tick()
-    assert rig.told(Reason.BUSY)
+    assert rig.reported(Reason.BUSY)
 
 
 def test_a_planner_that_holds_below_an_operator_is_an_event():
     rig = Rig().driving(source="ann")
     assert rig.drive(**TRACK, speed=0.0) is Reason.LOWER_PRIORITY
     rig.tick()
-    assert rig.told(Reason.LOWER_PRIORITY)
+    assert rig.reported(Reason.LOWER_PRIORITY)
 
 
 def test_what_is_not_finite_is_named_with_its_value():
@@ -99,12 +99,12 @@ def test_a_request_of_a_truck_that_is_not_armed_is_refused_for_its_mode():
 # Orders
 
 
-def test_an_emergency_stop_is_told_once_as_an_error_with_who_asked():
+def test_an_emergency_stop_is_reported_once_as_an_error_with_who_asked():
     rig = Rig().driving()
     rig.order(Order.ESTOP, source="bob", role=Role.STATION)
     rig.order(Order.ESTOP, source="eve")
     rig.tick()
-    (event,) = rig.told(Reason.ESTOP_REQUESTED)
+    (event,) = rig.reported(Reason.ESTOP_REQUESTED)
     assert (event.severity, event.values) == (ERROR, {"role": "station", "by": "bob"})
     assert len(rig.trips) == 1
     trip = rig.trips[0]
@@ -113,7 +113,7 @@ def test_an_emergency_stop_is_told_once_as_an_error_with_who_asked():
     assert trip.causes[0].since == trip.at
 
 
-def test_a_second_emergency_stop_soon_after_the_reset_is_told_again():
+def test_a_second_emergency_stop_soon_after_the_reset_is_reported_again():
     rig = Rig()
     for _ in range(2):
         rig.tick()
@@ -121,8 +121,8 @@ def test_a_second_emergency_stop_soon_after_the_reset_is_told_again():
         rig.tick()
         rig.order(Order.RESET)
         rig.tick()
-    assert len(rig.told(Reason.ESTOP_REQUESTED)) == 2
-    assert [event.text for event in rig.told(Reason.DISARMED)] == ["emergency stop reset by ann"] * 2
+    assert len(rig.reported(Reason.ESTOP_REQUESTED)) == 2
+    assert [event.text for event in rig.reported(Reason.DISARMED)] == ["emergency stop reset by ann"] * 2
 
 
 def test_a_reset_without_an_emergency_stop_changes_nothing():
@@ -130,7 +130,7 @@ def test_a_reset_without_an_emergency_stop_changes_nothing():
     assert rig.order(Order.RESET) is Reason.OK
     rig.tick()
     assert rig.out.mode is GateMode.ARMED
-    assert not rig.told(Reason.DISARMED)
+    assert not rig.reported(Reason.DISARMED)
 
 
 def test_a_stop_order_is_a_transition_with_who_gave_it():
@@ -181,7 +181,7 @@ def test_an_order_that_is_given_by_no_operator_is_refused():
 # The story of a drive
 
 
-def test_a_drive_is_told_from_arming_to_rest():
+def test_a_drive_is_distinguished_from_arming_to_rest():
     rig = Rig().armed()
     rig.drive(speed=0.1)
     rig.tick(20)
@@ -198,11 +198,11 @@ def test_a_drive_is_told_from_arming_to_rest():
     assert said(rig)[-1] == (Reason.DISARMED, INFO, "no driver for 1.5 s")
 
 
-def test_a_change_of_drivers_is_told():
+def test_a_change_of_drivers_is_reported():
     rig = Rig().driving(speed=0.1, **TRACK)
     rig.driver = {"source": "ann", "speed": 0.1}
     rig.tick(3)
-    assert [event.values["by"] for event in rig.told(Reason.DRIVING)] == ["track", "ann"]
+    assert [event.values["by"] for event in rig.reported(Reason.DRIVING)] == ["track", "ann"]
     assert rig.trips == []
 
 
@@ -253,13 +253,13 @@ def test_a_blocked_truck_is_stopped_for_what_blocks_it_and_not_released():
     both.tilt = 0.4
     both.tick()
     assert both.trips[-1].reason is Reason.TILT_STOP
-    assert not both.told(Reason.LEASE_EXPIRED)
+    assert not both.reported(Reason.LEASE_EXPIRED)
 
 
 # Blocks
 
 
-def test_a_block_is_told_every_time_while_driving_and_once_a_second_while_armed():
+def test_a_block_is_reported_every_time_while_driving_and_once_a_second_while_armed():
     driving = Rig(disarm_after=10.0).driving(speed=0.1)
     for _ in range(2):
         driving.tilt = 0.4
@@ -267,17 +267,17 @@ def test_a_block_is_told_every_time_while_driving_and_once_a_second_while_armed(
         driving.tilt = 0.0
         driving.tick(12)
         assert driving.out.mode is GateMode.DRIVING
-    assert len(driving.told(Reason.TILT_STOP)) == 2
+    assert len(driving.reported(Reason.TILT_STOP)) == 2
     armed = Rig(disarm_after=10.0).armed()
     for _ in range(2):
         armed.tilt = 0.4
         armed.tick(2)
         armed.tilt = 0.0
         armed.tick(2)
-    assert len(armed.told(Reason.TILT_STOP)) == 1
+    assert len(armed.reported(Reason.TILT_STOP)) == 1
 
 
-def test_a_limit_is_told_when_it_begins_with_its_measurements():
+def test_a_limit_is_reported_when_it_begins_with_its_measurements():
     rig = Rig().driving(speed=0.1)
     rig.tilt = 0.25
     rig.tick(10)
@@ -285,12 +285,12 @@ def test_a_limit_is_told_when_it_begins_with_its_measurements():
     rig.tick(5)
     rig.tilt = 0.25
     rig.tick(5)
-    (event,) = rig.told(Reason.TILT_SLOW)
+    (event,) = rig.reported(Reason.TILT_SLOW)
     assert event.severity is WARNING
     assert event.values["tilt"] == pytest.approx(0.25)
 
 
-def test_nothing_is_told_of_a_disarmed_truck():
+def test_nothing_is_reported_of_a_disarmed_truck():
     rig = Rig()
     rig.tilt = 0.4
     rig.tick(3)
@@ -302,10 +302,10 @@ def test_a_failed_service_is_named_in_its_event():
     rig = Rig().driving()
     rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "slam"))
     rig.tick()
-    assert rig.told(Reason.SERVICE_FAILED)[0].text == f"{Reason.SERVICE_FAILED.text}: slam"
+    assert rig.reported(Reason.SERVICE_FAILED)[0].text == f"{Reason.SERVICE_FAILED.text}: slam"
     rig.driver = None
     rig.tick(60)
-    assert rig.told(Reason.DISARMED)[-1].text == Reason.SERVICE_FAILED.text
+    assert rig.reported(Reason.DISARMED)[-1].text == Reason.SERVICE_FAILED.text
 
 
 @pytest.mark.parametrize(("apart", "disarms"), [(2.5, True), (10 / 3, True), (10 / 3 + 0.001, False)])
@@ -317,8 +317,8 @@ def test_so_many_short_faults_within_their_time_disarm(apart, disarms):
         rig.gate._count_short_fault(round(number * apart * SECOND))
     assert rig.gate._states.disarm_at_rest is disarms
     rig.tick()
-    told = [(reason, severity, text) for reason, severity, text in said(rig) if reason is Reason.FAULTS_REPEAT]
-    assert told == ([(Reason.FAULTS_REPEAT, WARNING, "4 stops for stale sensors within 10 s: disarmed")] * disarms)
+    reported = [(reason, severity, text) for reason, severity, text in said(rig) if reason is Reason.FAULTS_REPEAT]
+    assert reported == ([(Reason.FAULTS_REPEAT, WARNING, "4 stops for stale sensors within 10 s: disarmed")] * disarms)
 
 
 def test_short_faults_before_the_truck_was_disarmed_do_not_count():

@@ -174,6 +174,6 @@ def test_of_two_shafts_the_second_one_alone_stops_the_robot():
 
     robot._obey = held_second
     robot.tick(40)
-    assert robot.told(Reason.SHAFT_BLOCKED)
+    assert robot.reported(Reason.SHAFT_BLOCKED)
     assert robot.gate._shaft_check.blocked in (1, None)
     assert robot.trips[-1].reason is Reason.SHAFT_BLOCKED

@@ -65,7 +65,7 @@ def test_a_transition_is_never_suppressed_and_tells_how_often_it_was():
     assert log.drain()[0].values == {"repeated": 1}
 
 
-def test_so_many_names_are_told_within_one_interval_and_transitions_always():
+def test_so_many_names_are_reported_within_one_interval_and_transitions_always():
     log = EventLog(1.0)
     for number in range(MAX_KEYS + 5):
         emit(log, source=f"s{number}")
@@ -129,18 +129,18 @@ def test_the_modes_of_a_drive():
     assert (states.mode, states.holder, states.driven) == (GateMode.ARMED, None, NOW + 6)
     states.disarm(NOW + 8, "enough")
     assert (states.mode, states.active) == (GateMode.DISARMED, False)
-    told = [(event.reason, event.severity, event.text, event.values.get("by")) for event in log.drain()]
-    assert told == [
+    reported = [(event.reason, event.severity, event.text, event.values.get("by")) for event in log.drain()]
+    assert reported == [
         (Reason.ARMED, INFO, Reason.ARMED.text, "ann"),
         (Reason.DRIVING, INFO, Reason.DRIVING.text, "ann"),
         (Reason.DRIVING, INFO, Reason.DRIVING.text, "ann"),
         (Reason.STOPPED, INFO, Reason.STOPPED.text, None),
         (Reason.DRIVING, INFO, Reason.DRIVING.text, "ann"),
         (Reason.DISARMED, INFO, "enough", None),
-    ], "letting go right after a stop is not told again"
+    ], "letting go right after a stop is not reported again"
 
 
-def test_every_rest_and_disarming_is_told_however_soon():
+def test_every_rest_and_disarming_is_reported_however_soon():
     states, log = machine()
     for _ in range(3):
         states.arm(NOW, "ann")
@@ -152,7 +152,7 @@ def test_every_rest_and_disarming_is_told_however_soon():
     assert reasons == [Reason.ARMED, Reason.DRIVING, Reason.STOPPED, Reason.DISARMED] * 3
 
 
-def test_a_release_is_told_with_who_let_go():
+def test_a_release_is_reported_with_who_let_go():
     states, log = machine()
     states.arm(NOW, "ann")
     states.drive(NOW, source())

@@ -21,7 +21,7 @@ def test_non_finite_requests_are_refused_by_name(field, value):
     rig = Rig().driving()
     assert rig.drive(**{field: value}) is Reason.NOT_FINITE
     rig.tick()
-    event = rig.told(Reason.NOT_FINITE)[0]
+    event = rig.reported(Reason.NOT_FINITE)[0]
     assert f"{field} is {value}" in event.text
     assert rig.out.mode is GateMode.DRIVING
     assert rig.out.speeds[0] == pytest.approx(0.2)
@@ -148,11 +148,11 @@ def test_a_flood_of_names_does_not_become_one_of_events():
     for i in range(1000):
         rig.drive(source=f"junk{i}", role=Role.TRACKER)
     rig.tick()
-    assert 1 <= len(rig.told(Reason.BAD_ROLE)) <= 64
+    assert 1 <= len(rig.reported(Reason.BAD_ROLE)) <= 64
     rig.tick(60)
     rig.drive(source="later", role=Role.TRACKER)
     rig.tick()
-    assert rig.told(Reason.BAD_ROLE)[-1].values["by"] == "later"
+    assert rig.reported(Reason.BAD_ROLE)[-1].values["by"] == "later"
 
 
 def test_the_gate_caps_leases_but_keeps_shorter_ones():
@@ -212,7 +212,7 @@ def test_a_planner_that_keeps_the_truck_standing_neither_disturbs_nor_delays_ano
     rig = Rig().driving(**TRACK)
     assert rig.drive(speed=0.0, **GOALS) is Reason.BUSY
     rig.tick(60)
-    assert (rig.out.holder, rig.told(Reason.BUSY)) == ("track", [])
+    assert (rig.out.holder, rig.reported(Reason.BUSY)) == ("track", [])
     rig.driver = None
     for _ in range(14):
         rig.drive(speed=0.0, **GOALS)
@@ -235,7 +235,7 @@ def test_anybody_may_stop():
         assert rig.order(Order.STOP, source="cy", role=role, nonce="any") is Reason.OK
         rig.tick()
         assert (rig.out.mode, rig.out.speeds[0]) == (GateMode.STOPPING, 0.0)
-        assert "cy" in rig.told(Reason.STOPPED)[0].text
+        assert "cy" in rig.reported(Reason.STOPPED)[0].text
 
 
 def test_after_a_stop_the_stick_must_return_to_neutral():

@@ -166,7 +166,7 @@ def test_an_earlier_loss_does_not_replace_a_later_one():
     assert sensors.speed(3 * SECOND) is None
 
 
-def test_what_stops_the_truck_is_told_in_this_order():
+def test_what_stops_the_truck_is_reported_in_this_order():
     sensors = monitor(battery={"stale_after": 1.0, "critical": True})
     sensors.observe_health(health(0, ServiceState.FAILED, "slam"))
     assert sensors.assess(SECOND).blocks == (

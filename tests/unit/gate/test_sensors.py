@@ -31,7 +31,7 @@ def test_a_silent_sensor_stops_within_300_ms_of_its_last_sample(sensor):
     urgent = sensor == "drive"
     assert rig.out.action is (DriveAction.QUICK_STOP if urgent else DriveAction.RUN)
     assert rig.out.reasons == (STALE[sensor],)
-    assert len(rig.told(STALE[sensor])) == 1
+    assert len(rig.reported(STALE[sensor])) == 1
     rig.tick(15)
     assert rig.speed == 0.0
     assert rig.travelled < 0.3
@@ -133,7 +133,7 @@ def test_tilt_slows_then_stops_with_hysteresis():
     assert rig.out.reasons == (Reason.TILT_SLOW,)
     assert rig.out.speeds[0] == pytest.approx(0.08)
     assert rig.out.speed_limit == pytest.approx(0.08)
-    assert rig.told(Reason.TILT_SLOW)[0].values["tilt"] == pytest.approx(0.22)
+    assert rig.reported(Reason.TILT_SLOW)[0].values["tilt"] == pytest.approx(0.22)
     rig.tilt = 0.19
     rig.tick(20)
     assert rig.out.speeds[0] == pytest.approx(0.08)
@@ -235,7 +235,7 @@ def test_a_drive_fault_stops_quickly_and_disarms():
     rig.tick()
     assert (rig.out.mode, rig.out.action) == (GateMode.STOPPING, DriveAction.QUICK_STOP)
     assert rig.out.reasons == (Reason.DRIVE_FAULT,)
-    assert rig.told(Reason.DRIVE_FAULT)[0].values["drive_fault_code"] is None
+    assert rig.reported(Reason.DRIVE_FAULT)[0].values["drive_fault_code"] is None
     rig.fault = False
     rig.tick(20)
     assert rig.out.mode is GateMode.DISARMED
@@ -246,7 +246,7 @@ def test_a_fault_while_armed_disarms():
     rig.fault = True
     rig.tick()
     assert rig.out.mode is GateMode.DISARMED
-    assert rig.told(Reason.DRIVE_FAULT)
+    assert rig.reported(Reason.DRIVE_FAULT)
 
 
 def test_a_failed_service_stops_unless_it_is_tolerated():
@@ -260,10 +260,10 @@ def test_a_failed_service_stops_unless_it_is_tolerated():
     rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "odometry"))
     rig.tick()
     assert (rig.out.mode, rig.out.action) == (GateMode.STOPPING, DriveAction.QUICK_STOP)
-    assert "odometry" in rig.told(Reason.SERVICE_FAILED)[0].text
+    assert "odometry" in rig.reported(Reason.SERVICE_FAILED)[0].text
 
 
-def test_several_reasons_are_told_worst_first():
+def test_several_reasons_are_reported_worst_first():
     rig = Rig().driving()
     rig.silent = {"scan", "drive"}
     rig.level = BatteryLevel.LOW
@@ -296,7 +296,7 @@ def test_the_truck_slows_down_and_stops_before_a_wall():
     assert rig.out.mode is GateMode.DRIVING
     left = gap - (rig.travelled - start)
     assert 0.04 < left < 0.12
-    assert len(rig.told(Reason.OBSTACLE_STOP)) == 1
+    assert len(rig.reported(Reason.OBSTACLE_STOP)) == 1
 
 
 def test_a_sudden_obstacle_is_a_quick_stop_in_the_same_tick():

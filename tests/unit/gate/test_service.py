@@ -234,7 +234,7 @@ from tests.unit.gate.bench import Bench, Outbox
 def fsync(file, wait=threading.Event().wait):
     wait()  # a disk that never comes to an end
 
-class Told(Outbox):
+class Reported(Outbox):
     def put(self, message):
         super().put(message)
         if sys.argv[2] in (message.mode, "start"):
@@ -246,7 +246,7 @@ async def main():
     latch = EstopLatch(folder / "state" / "estop", folder / "run")
     latch.prepare()
     os.fsync = fsync
-    bench = Bench(WallClock(), latch, Told())
+    bench = Bench(WallClock(), latch, Reported())
     async with bench.running():
         bench.order(Order.ESTOP)
         await asyncio.sleep(60)
@@ -256,14 +256,14 @@ asyncio.run(main())
 
 
 @pytest.mark.parametrize(
-    ("when", "told", "engaged"), [("estopped", "estopped False", True), ("start", "disarmed False", False)]
+    ("when", "reported", "engaged"), [("estopped", "estopped False", True), ("start", "disarmed False", False)]
 )
-def test_killed_before_the_disk_has_the_latch_it_starts_as_it_was_told(tmp_path, when, told, engaged):
+def test_killed_before_the_disk_has_the_latch_it_starts_as_it_was_reported(tmp_path, when, reported, engaged):
     (tmp_path / "run").mkdir()
     run = subprocess.run(
         [sys.executable, "-c", KILLED, str(tmp_path), when], capture_output=True, text=True, timeout=30, check=False
     )
-    assert (run.returncode, run.stdout.strip()) == (-signal.SIGKILL, told), run.stderr
+    assert (run.returncode, run.stdout.strip()) == (-signal.SIGKILL, reported), run.stderr
     latch = file_latch(tmp_path)
     assert not latch.stored()
     assert latch.engaged() is engaged
@@ -386,7 +386,7 @@ class BrokenLatch(MemoryLatch):
         raise OSError(28, "no space left")
 
 
-def test_a_latch_that_cannot_be_stored_is_told_and_tried_again():
+def test_a_latch_that_cannot_be_stored_is_reported_and_tried_again():
     async def scenario(bench):
         bench.order(Order.ESTOP)
         await asyncio.sleep(0.05)

@@ -114,7 +114,7 @@ def test_every_shaft_gets_its_own_command():
     run_virtual(main)
 
 
-def test_settings_that_weaken_are_told_at_the_start_and_in_every_state():
+def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state():
     async def main(clock):
         bench = Bench(clock)
         weak = ("gate.speed 1, default 0.21", "gate.turning null")
@@ -136,7 +136,7 @@ def _inputs(bench):
 
 
 class Disk(MemoryLatch):
-    """A latch that notes what is asked of it, and fails as often as told."""
+    """A latch that notes what is asked of it, and fails as often as reported."""
 
     def __init__(self, failures=0, engaged=False):
         super().__init__(engaged)

@@ -20,7 +20,7 @@ RATE = 0.33
 
 
 def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, rate=RATE, start=0):
-    """Heading (clockwise) of a truck that turns by a share of what it is told; seconds until found dead."""
+    """Heading (clockwise) of a truck that turns by a share of what is commanded; seconds until found dead."""
     for step in range(round(seconds * SECOND / PERIOD) + 1):
         at = step * PERIOD / SECOND
         measured = (heading - turning * RATE * at) % (2 * math.pi)
@@ -36,7 +36,7 @@ def check():
 
 
 @pytest.mark.parametrize("turning", [0.8, 1.0, 1.2])
-def test_a_truck_that_turns_about_as_told_is_sound(check, turning):
+def test_a_truck_that_turns_about_as_commanded_is_sound(check, turning):
     assert drive(check, 20.0, turning=turning) is None
 
 
@@ -48,7 +48,7 @@ def test_one_that_does_not_is_found_within_a_second_and_a_half(check, turning):
     assert check.dead
 
 
-def test_turning_without_being_told_to_is_found(check):
+def test_turning_without_being_commanded_to_is_found(check):
     assert drive(check, 5.0, rate=0.0) is not None
 
 
@@ -172,7 +172,7 @@ def test_the_gate_stops_for_dead_steering_and_has_to_be_armed_again():
     rig = Straight().armed()
     rig.driver = {"speed": 0.2, "front": 0.3, "rear": -0.3}
     rig.tick(150)
-    assert rig.told(Reason.STEERING_DEAD)
+    assert rig.reported(Reason.STEERING_DEAD)
     assert rig.out.mode is GateMode.DISARMED
     assert rig.speed == 0
     assert rig.travelled < 0.5
@@ -182,7 +182,7 @@ def test_the_gate_stops_for_dead_steering_and_has_to_be_armed_again():
     assert rig.order(Order.ARM) == "ok"
 
 
-def test_it_can_be_told_not_to_look():
+def test_it_can_be_configured_not_to_look():
     rig = Straight(turning=None).armed()
     rig.driver = {"speed": 0.2, "front": 0.3, "rear": -0.3}
     rig.tick(150)
@@ -203,7 +203,7 @@ def test_every_body_that_servos_steer_is_checked(kind):
     robot.turns = False
     robot.driver = {"vx": 0.15, "wz": 0.2}
     robot.tick(200)
-    assert robot.told(Reason.STEERING_DEAD)
+    assert robot.reported(Reason.STEERING_DEAD)
 
 
 def test_a_body_that_nothing_steers_is_not():
@@ -211,4 +211,4 @@ def test_a_body_that_nothing_steers_is_not():
     robot.turns = False
     robot.driver = {"wz": 0.4}
     robot.tick(200)
-    assert not robot.told(Reason.STEERING_DEAD)
+    assert not robot.reported(Reason.STEERING_DEAD)

@@ -113,8 +113,10 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
     assert trip.causes[0].since == lost
     rig.tick(5)
     assert len(rig.trips) == 1, "no news"
-    told = rig.now
-    rig.gate.observe_event(event(told, Reason.HUB_LOST, "usb", "hub 1-2 vanished: lidar, camera", roles="lidar,camera"))
+    reported = rig.now
+    rig.gate.observe_event(
+        event(reported, Reason.HUB_LOST, "usb", "hub 1-2 vanished: lidar, camera", roles="lidar,camera")
+    )
     rig.tick()
     better = rig.trips[-1]
     assert (better.number, better.at) == (trip.number, trip.at)
@@ -147,7 +149,7 @@ def test_one_hub_behind_two_sensors_comes_once():
         ("usb", None),
         ("steering", 3),
     ]
-    assert causes_text(trip.causes, trip.at).count("hub 1-1") == 2, "each chain is told to its end"
+    assert causes_text(trip.causes, trip.at).count("hub 1-1") == 2, "each chain is reported to its end"
 
 
 def test_an_outage_that_is_over_is_not_behind_a_later_silence():

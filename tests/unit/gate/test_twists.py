@@ -51,7 +51,7 @@ def test_what_a_body_cannot_do_is_refused_with_the_reason_and_moves_nothing(kind
     assert robot.twist(**asked) is Reason.IMPOSSIBLE_MOTION
     robot.tick(5)
     assert robot.out.mode is GateMode.ARMED
-    [event] = robot.told(Reason.IMPOSSIBLE_MOTION)
+    [event] = robot.reported(Reason.IMPOSSIBLE_MOTION)
     assert why in event.text
 
 
@@ -60,7 +60,7 @@ def test_a_form_that_a_body_does_not_take_is_refused(monkeypatch):
     monkeypatch.setattr(type(robot.chassis), "forms", frozenset({"axles"}))
     assert robot.twist(vx=0.1) is Reason.IMPOSSIBLE_MOTION
     robot.tick()
-    assert "a request by twist: this body takes axles" in robot.told(Reason.IMPOSSIBLE_MOTION)[0].text
+    assert "a request by twist: this body takes axles" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
     assert robot.drive(speed=0.1) is Reason.OK
 
 
@@ -87,7 +87,7 @@ def test_numbers_that_are_not_finite_are_refused_by_name(number):
     robot = Robot("mecanum").armed()
     assert robot.twist(vx=0.1, wz=number) is Reason.NOT_FINITE
     robot.tick()
-    assert f"wz is {number}: expected finite numbers" in robot.told(Reason.NOT_FINITE)[0].text
+    assert f"wz is {number}: expected finite numbers" in robot.reported(Reason.NOT_FINITE)[0].text
 
 
 @pytest.mark.parametrize(("kind", "fastest"), [("mecanum", 0.15), ("wheels", 0.21)])

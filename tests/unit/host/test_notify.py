@@ -111,7 +111,7 @@ def test_a_gate_that_limps_at_less_than_half_its_pace_is_no_sign_of_life(pause: 
     assert late == ([float(at) for at in range(4, 43)] if alive else [])
 
 
-def test_without_a_watchdog_only_changes_of_the_status_are_told():
+def test_without_a_watchdog_only_changes_of_the_status_are_reported():
     async def scene(bench: Bench) -> None:
         bench.service.up()
         await bench.clock.sleep(2.5)
@@ -127,7 +127,7 @@ def test_without_a_watchdog_only_changes_of_the_status_are_told():
     ]
 
 
-def test_what_systemd_did_not_take_is_told_again():
+def test_what_systemd_did_not_take_is_reported_again():
     async def scene(bench: Bench) -> None:
         bench.systemd.deaf = True
         bench.service.up()
@@ -154,13 +154,13 @@ def test_both_kinds_of_sockets(abstract: bool, tmp_path: Path):
     assert not notify_socket(address)("WATCHDOG=1")
 
 
-def test_a_full_socket_neither_blocks_nor_counts_as_told(tmp_path: Path):
+def test_a_full_socket_neither_blocks_nor_counts_as_reported(tmp_path: Path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         send = notify_socket(str(tmp_path / "notify"))
-        told = [send("WATCHDOG=1") for _ in range(10_000)]
-    assert told[0]
-    assert not told[-1]
+        reported = [send("WATCHDOG=1") for _ in range(10_000)]
+    assert reported[0]
+    assert not reported[-1]
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def an_extension_that_keeps_the_lock(seconds):
 
 
 async def watched(folder, scenario, **settings):
-    """Run ``scenario`` beside a control tick of 50 Hz."""
+    """Run ``scenario`` during a control tick of 50 Hz."""
     ticks = 0
 
     async def tick():

@@ -264,7 +264,7 @@ def test_a_turned_grid_turns_its_obstacles():
     assert field.free(Footprint(), np.add(beside, (0.02, 0, 0))).tolist() == [False]
 
 
-def test_unknown_cells_block_unless_told_otherwise():
+def test_unknown_cells_block_unless_configured_otherwise():
     cells = np.zeros((40, 40), dtype=np.int8)
     cells[20, 20] = -1
     grid = Grid(

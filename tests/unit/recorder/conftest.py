@@ -47,7 +47,7 @@ async def drive(recorder: Recorder, clock: VirtualClock, seconds: float) -> None
 
 
 class Failures(list):
-    """Collects what ``on_failure`` was told."""
+    """Collects what ``on_failure`` was called with."""
 
     def __call__(self, reason, text):
         self.append((reason, text))

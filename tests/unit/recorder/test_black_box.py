@@ -41,7 +41,7 @@ def trip(now, reason=Reason.SCAN_STALE, number=1):
     )
 
 
-class Told(list):
+class Reported(list):
     """Collects events."""
 
     def __call__(self, reason, severity, source, text="", **values):
@@ -58,12 +58,12 @@ class Bench:
     def __init__(self, clock, folder, offload=inline, **config):
         self.clock = clock
         self.folder = folder
-        self.told = Told()
+        self.reported = Reported()
         self.box = BlackBox(
             BlackBoxConfig(**config),
             folder,
             clock,
-            self.told,
+            self.reported,
             attachments={"config": {"robot": "truck"}, "versions": {"python": "3"}},
             metadata={"robot": "truck"},
             offload=offload,
@@ -115,14 +115,14 @@ def test_a_trip_saves_the_minute_before_and_five_seconds_after(tmp_path: Path):
         bench.event("long ago")
         await bench.drive(100)
         assert bench.trip() == "blackbox-000001-scan_stale.mcap"
-        assert bench.told == [], "it is not there yet"
+        assert bench.reported == [], "it is not there yet"
         await bench.drive(4.9)
         assert bench.files == []
         await bench.drive(0.2)
         assert bench.files == ["blackbox-000001-scan_stale.mcap"]
 
     bench = on_bench(tmp_path, scenario)
-    ((reason, text, values),) = bench.told
+    ((reason, text, values),) = bench.reported
     assert reason is Reason.BLACK_BOX_SAVED
     assert text == "the minute before stop 1 is in blackbox-000001-scan_stale.mcap"
     assert (values["file"], values["stop"]) == ("blackbox-000001-scan_stale.mcap", 1)
@@ -150,8 +150,8 @@ def test_two_virtual_runs_write_the_same_bytes(tmp_path: Path):
         bench.trip()
         await bench.drive(6)
 
-    told = [on_bench(tmp_path / name, scenario).told for name in ("a", "b")]
-    assert told[0] == told[1]
+    reported = [on_bench(tmp_path / name, scenario).reported for name in ("a", "b")]
+    assert reported[0] == reported[1]
     first, second = (next((tmp_path / name).iterdir()).read_bytes() for name in ("a", "b"))
     assert first == second
 
@@ -193,7 +193,7 @@ def test_boxes_of_one_reason_are_rate_limited_but_every_trip_lies_in_one(tmp_pat
         assert bench.trip(Reason.STOPPED) is None, "an order is no accident"
 
     bench = on_bench(tmp_path, scenario)
-    assert [text for _, text, _ in bench.told][-1] == "stops 1, 2, 4 are in blackbox-000002-scan_stale.mcap"
+    assert [text for _, text, _ in bench.reported][-1] == "stops 1, 2, 4 are in blackbox-000002-scan_stale.mcap"
 
 
 def test_no_trip_waits_until_the_minute_before_it_is_forgotten(tmp_path: Path):
@@ -217,7 +217,7 @@ def test_what_is_due_at_the_end_is_written_before_it(tmp_path: Path):
         assert bench.files == [], "it has its content, and waits for the end"
 
     bench = on_bench(tmp_path, scenario)
-    assert bench.told.reasons == [Reason.BLACK_BOX_SAVED]
+    assert bench.reported.reasons == [Reason.BLACK_BOX_SAVED]
     assert len(list(open_log(tmp_path / bench.files[0]))) == 50
 
 
@@ -240,7 +240,7 @@ def test_a_box_is_complete_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     assert seen == [["blackbox-000001-scan_stale.mcap.part"]]
 
 
-def test_a_full_disk_costs_the_box_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_costs_the_box_and_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     class Full(LogFile):
         def finish(self):
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -251,7 +251,7 @@ def test_a_full_disk_costs_the_box_and_is_told(tmp_path: Path, monkeypatch: pyte
             patch.setattr(module, "LogFile", Full)
             bench.trip()
             await bench.drive(6)
-        assert bench.told == [
+        assert bench.reported == [
             (Reason.DISK_FULL, "blackbox-000001-scan_stale.mcap is lost: No space left on device", {})
         ]
         assert list(tmp_path.iterdir()) == [], "no half of it is left"
@@ -262,25 +262,25 @@ def test_a_full_disk_costs_the_box_and_is_told(tmp_path: Path, monkeypatch: pyte
     assert bench.files == ["blackbox-000002-tilt_stop.mcap"], "it goes on"
 
 
-def test_a_folder_that_cannot_be_made_is_told_and_tried_again(tmp_path: Path):
+def test_a_folder_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Path):
     blocked = tmp_path / "file"
     blocked.touch()
 
     async def scenario(bench):
-        assert bench.told.reasons == [Reason.RECORDING_FAILED]
+        assert bench.reported.reasons == [Reason.RECORDING_FAILED]
         blocked.unlink()
         bench.trip()
 
     assert on_bench(blocked, scenario).files == ["blackbox-000001-scan_stale.mcap"]
 
 
-def test_a_bug_while_writing_is_told_and_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+def test_a_bug_while_writing_is_reported_and_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):
     async def scenario(bench):
         monkeypatch.setattr(module, "LogFile", lambda *_: 1 / 0)
         bench.trip()
         await bench.drive(6)
 
-    assert on_bench(tmp_path, scenario).told.reasons == [Reason.INTERNAL]
+    assert on_bench(tmp_path, scenario).reported.reasons == [Reason.INTERNAL]
     assert "ZeroDivisionError" in caplog.text
 
 
@@ -301,7 +301,7 @@ def test_the_oldest_boxes_go_but_the_newest_of_each_reason_stays(tmp_path: Path)
     assert another.files[-1][9:15] == "000009", "numbers go on over runs"
 
 
-def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(tmp_path: Path):
+def test_it_is_written_in_a_thread_with_pauses_and_without_them_at_the_end(tmp_path: Path):
     async def main():
         bench = Bench(WallClock(), tmp_path, offload=module.in_daemon_thread, after=0.05)
         writing = []
@@ -317,7 +317,7 @@ def test_it_is_written_beside_the_loop_with_pauses_and_without_them_at_the_end(t
             for seq in range(640):
                 bench.put(t.CMD_STEERING, steering(bench.clock.now(), seq))
             bench.trip()
-            while not bench.told:
+            while not bench.reported:
                 await asyncio.sleep(0.01)
         assert writing
         assert threading.main_thread() not in writing
@@ -387,7 +387,7 @@ def test_boxes_do_not_pile_up_before_a_slow_disk(tmp_path: Path):
             for reason in (Reason.SCAN_STALE, Reason.TILT_STOP, Reason.DRIVE_STALE, Reason.BATTERY_CRITICAL):
                 bench.trip(reason)
                 await bench.drive(6)
-            assert bench.told == [
+            assert bench.reported == [
                 (Reason.RECORDING_FAILED, "blackbox-000004-battery_critical.mcap is lost: the disk is too slow", {})
             ]
             disk.released.set()
@@ -413,7 +413,7 @@ def test_a_box_that_is_given_up_leaves_nothing_behind(tmp_path: Path):
         bench.box._given_up.set()
         bench.trip()
         await bench.drive(6)
-        assert bench.told.reasons == [Reason.RECORDING_FAILED]
+        assert bench.reported.reasons == [Reason.RECORDING_FAILED]
         assert list(tmp_path.iterdir()) == []
 
     on_bench(tmp_path, scenario)

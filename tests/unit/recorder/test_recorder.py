@@ -307,14 +307,14 @@ def test_write_error_stops_the_recording_loudly_and_nothing_else(
             return before, recorder.health(1)
 
     before, after = run_virtual(main)
-    ((told, text),) = failures
-    assert told is reason
+    ((reported, text),) = failures
+    assert reported is reason
     assert os.strerror(code) in text
     assert (before.recording, before.reason) == (False, reason)
     assert after.drops == before.drops + 1
 
 
-def test_error_while_finishing_is_told_and_does_not_hang(config, failures, monkeypatch):
+def test_error_while_finishing_is_reported_and_does_not_hang(config, failures, monkeypatch):
     def fail(self):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -323,14 +323,14 @@ def test_error_while_finishing_is_told_and_does_not_hang(config, failures, monke
     assert [reason for reason, _ in failures] == [Reason.DISK_FULL]
 
 
-def test_folder_that_cannot_be_made_is_told(config, failures, tmp_path):
+def test_folder_that_cannot_be_made_is_reported(config, failures, tmp_path):
     (tmp_path / "logs").write_text("a file is here")
     recorder = record(config, 0.2, failures)
     assert [reason for reason, _ in failures] == [Reason.RECORDING_FAILED]
     assert recorder.path is None
 
 
-def test_bug_in_the_thread_is_told(config, failures):
+def test_bug_in_the_thread_is_reported(config, failures):
     record(config, 0.2, failures, attachments={"config": object()})
     ((reason, text),) = failures
     assert reason is Reason.INTERNAL
@@ -421,7 +421,7 @@ def test_kill_9_loses_less_than_a_second_and_the_file_opens_after_repair(config)
     assert open_log(path).attachments().keys() == {"config.json"}
 
 
-def test_a_disk_can_be_told_to_refuse(config, failures):
+def test_a_disk_can_be_made_to_refuse(config, failures):
     async def main(clock):
         async with Recorder(config, clock, failures, deterministic=True) as recorder:
             recorder.refuse(OSError(errno.ENOSPC, "No space left on device"))

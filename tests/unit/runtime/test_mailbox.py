@@ -145,8 +145,8 @@ async def test_a_mailbox_has_one_reader():
 
 
 async def test_close_ends_iteration_and_tells_once():
-    told: list[Mailbox[Message]] = []
-    box: Mailbox[Message] = Mailbox(fifo(4), told.append)
+    reported: list[Mailbox[Message]] = []
+    box: Mailbox[Message] = Mailbox(fifo(4), reported.append)
     box.put(message(0))
 
     async def read() -> list[int]:
@@ -160,7 +160,7 @@ async def test_close_ends_iteration_and_tells_once():
     box.close()
     box.put(message(1))
     assert await reading == [0]
-    assert told == [box]
+    assert reported == [box]
     assert [m async for m in box] == []
     with pytest.raises(RuntimeError, match="closed"):
         await box.next()

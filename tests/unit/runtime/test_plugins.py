@@ -1,4 +1,4 @@
-"""Catalogs: our rows, and those of distributions that are installed beside us."""
+"""Catalogs: our rows, and those of distributions that are installed with us."""
 
 import json
 from dataclasses import dataclass
@@ -94,8 +94,8 @@ def test_what_is_broken_is_named_and_left_out(install):
     catalog = toys()
     assert list(catalog) == ["ball", "cube", "top"]
     assert catalog.origin("top") == "spinning-top 1.0"
-    told = {(b.origin, b.name): b.error for b in catalog.broken}
-    assert told == {
+    reported = {(b.origin, b.name): b.error for b in catalog.broken}
+    assert reported == {
         ("a-broken-one 1.0", "kite"): "SystemExit: no",
         ("spinning-top 1.0", "ball"): "the name is taken by monstertruckd",
         ("spinning-top 1.0", "missing"): "AttributeError: module 'spinning' has no attribute 'MISSING'",

@@ -97,7 +97,7 @@ def test_another_distribution_adds_a_topic(install):
     }
 
 
-def test_keys_beside_topics():
+def test_keys_that_are_no_topics():
     assert rpc_key("truck", "topics") == "mt/truck/rpc/topics"
     assert rpc_key("truck", "topics", "ann") == "mt/truck/rpc/topics/ann"
     assert alive_key("truck") == "mt/truck/alive"

@@ -160,14 +160,16 @@ def test_a_controller_is_braked_and_switched_off_once_it_had_the_time_to_brake(n
         ("silent", "no answer"),
     ],
 )
-def test_whatever_goes_wrong_is_told_and_tried_again_once_the_controller_has_forgotten_it(neutral, fault, says, capsys):
+def test_whatever_goes_wrong_is_reported_and_tried_again_once_the_controller_has_forgotten_it(
+    neutral, fault, says, capsys
+):
     code, frames, slept = run(neutral, fault, 0, 0)
     assert code == 0
     assert frames[-2:] == [BRAKE, SWITCH_OFF]
     assert slept == [0.55, 0.4]
-    told = capsys.readouterr()
-    assert says in told.err
-    assert told.err.startswith("neutral: /dev/pts/")
+    reported = capsys.readouterr()
+    assert says in reported.err
+    assert reported.err.startswith("neutral: /dev/pts/")
 
 
 def test_a_controller_that_refuses_to_switch_off_is_braked_again(neutral):
@@ -197,7 +199,7 @@ def test_without_an_answer_it_waits_a_quarter_of_a_second(neutral, monkeypatch):
     assert waits == [0.25]
 
 
-def test_a_port_that_is_not_there_is_told_and_a_failure(neutral, tmp_path, capsys):
+def test_a_port_that_is_not_there_is_reported_and_a_failure(neutral, tmp_path, capsys):
     assert neutral.main([str(tmp_path / "none")]) == 1
     assert "No such file" in capsys.readouterr().err
 

@@ -33,7 +33,7 @@ class Rig(DriverRig):
         self.driver = Ax12Driver(config, self.port, clock, self.commands, self.out, self.events)
         self._seq = 0
 
-    def wish(self, pitch: float, roll: float, age: float = 0.0) -> None:
+    def request(self, pitch: float, roll: float, age: float = 0.0) -> None:
         now = self.clock.now() - round(age * 1e9)
         self.commands.put(StabiliserCommand(stamp=now, received=now, seq=self._seq, pitch=pitch, roll=roll))
         self._seq += 1

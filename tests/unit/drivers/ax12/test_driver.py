@@ -26,7 +26,7 @@ def test_goals_become_motion_and_feedback_follows(echo: bool, chunk: int | None)
         rig.port.device.faults.chunk = chunk
         async with rig.driving():
             await rig.settle(0.3)
-            rig.wish(0.2, -0.3)
+            rig.request(0.2, -0.3)
             await rig.settle(0.03)
             feedback = rig.out.kept[-1]
             assert 0 < feedback.pitch < 0.2
@@ -57,7 +57,7 @@ def test_goals_go_out_at_once_in_one_packet_with_no_answer():
         async with rig.driving():
             await rig.settle(0.305)
             rig.bus.received.clear()
-            rig.wish(0.1, 0.1)
+            rig.request(0.1, 0.1)
             await rig.settle(0.001)
             (packet,) = requests(rig)
             assert packet.encode() == p.sync_write(
@@ -77,7 +77,7 @@ def test_signs_and_limits(direction: int):
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.settle(0.3)
-            rig.wish(2.0, -0.2)
+            rig.request(2.0, -0.2)
             await rig.settle(1.5)
             shaft = rig.bus.angle(1, rig.clock.now()) / STEP
             assert shaft == pytest.approx(613 if direction > 0 else 409, abs=1.1), "held at the limit"
@@ -113,7 +113,7 @@ def test_a_slow_adapter_slows_the_rate_and_nothing_else():
             await rig.settle(1)
             before = len(rig.out.kept)
             for i in range(100):
-                rig.wish(0.001 * i, 0.0)
+                rig.request(0.001 * i, 0.0)
                 await rig.settle(0.02)
             assert 25 <= (len(rig.out.kept) - before) / 2 <= 32
             assert rig.joint("pitch") == pytest.approx(0.099, abs=0.02)
@@ -134,10 +134,10 @@ def test_the_units_hold_before_the_first_goal_and_after_the_last():
             await rig.settle(1)
             assert rig.joint("pitch") == pytest.approx(0.1, abs=STEP)
             assert rig.unit(1).get(p.TORQUE_ENABLE) == 1
-            rig.wish(0.3, 0.0, age=0.6)
+            rig.request(0.3, 0.0, age=0.6)
             await rig.settle(1)
             assert rig.joint("pitch") == pytest.approx(0.1, abs=STEP), "stale goals are not obeyed"
-            rig.wish(0.2, 0.0, age=0.4)
+            rig.request(0.2, 0.0, age=0.4)
             await rig.settle(1)
             held = rig.joint("pitch")
             assert held == pytest.approx(0.2, abs=2 * STEP)
@@ -229,7 +229,7 @@ def test_limits_that_contradict_the_configuration_are_refused(low: int, high: in
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_a_unit_that_answers_too_little_is_told_to_answer_all(level: int):
+def test_a_unit_that_answers_too_little_is_set_to_answer_all(level: int):
     async def test(rig: Rig) -> None:
         rig.unit(1).put(p.STATUS_LEVEL, level)
         async with rig.driving():

@@ -35,7 +35,7 @@ def test_one_absent_unit_leaves_the_other_working_and_is_asked_once_a_second(ech
             feedback = rig.out.kept[-1]
             assert (feedback.roll, feedback.roll_joint.torque) == (None, TorqueState.ABSENT)
             assert feedback.roll_joint.voltage is None
-            rig.wish(0.2, 0.2)
+            rig.request(0.2, 0.2)
             await rig.settle(1)
             assert rig.joint("pitch") == pytest.approx(0.2, abs=2 * STEP)
             rig.bus.received.clear()
@@ -47,7 +47,7 @@ def test_one_absent_unit_leaves_the_other_working_and_is_asked_once_a_second(ech
             rig.bus.inject("return", "2")
             await rig.settle(1.2)
             assert rig.out.kept[-1].roll_joint.torque is TorqueState.HOLDING
-            rig.wish(0.0, 0.2)
+            rig.request(0.0, 0.2)
             await rig.settle(1)
             assert rig.joint("roll") == pytest.approx(0.2, abs=2 * STEP)
         assert rig.events.reasons() == [Reason.DEVICE_TIMEOUT, Reason.DEVICE_READY]
@@ -105,7 +105,7 @@ def test_unplugging_ends_the_session_and_the_next_one_works():
         rig.port.plug()
         async with rig.driving():
             await rig.settle(0.5)
-            rig.wish(0.1, 0.0)
+            rig.request(0.1, 0.0)
             await rig.settle(0.5)
             assert rig.joint("pitch") == pytest.approx(0.1, abs=2 * STEP)
 
@@ -119,7 +119,7 @@ def test_single_damaged_answers_cost_nothing_but_themselves(damage: str, echo: b
         fault, *values = damage.split()
         async with rig.driving():
             await rig.settle(1)
-            rig.wish(0.15, -0.15)
+            rig.request(0.15, -0.15)
             for _ in range(20):
                 rig.bus.inject(fault, *values)
                 await rig.settle(0.093)
@@ -162,7 +162,7 @@ def test_an_overloaded_joint_rests_and_holds_again_without_a_jump():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.settle(0.5)
-            rig.wish(0.3, 0.3)
+            rig.request(0.3, 0.3)
             await rig.settle(1)
             rig.bus.inject("trip", "1")
             tripped = rig.clock.now()
@@ -173,7 +173,7 @@ def test_an_overloaded_joint_rests_and_holds_again_without_a_jump():
             assert feedback.roll_joint.torque is TorqueState.HOLDING
             rig.unit(1).position = 511.0  # sagged while limp
             goal = rig.unit(1).get(p.GOAL_POSITION)
-            rig.wish(-0.3, 0.1)
+            rig.request(-0.3, 0.1)
             await rig.settle(0.7)
             assert rig.joint("pitch") == 0.0
             assert rig.unit(1).get(p.GOAL_POSITION) == goal, "a limp joint is given no goals"
@@ -187,7 +187,7 @@ def test_an_overloaded_joint_rests_and_holds_again_without_a_jump():
             await rig.settle(0.5)
             assert rig.joint("pitch") == pytest.approx(0, abs=STEP), "it waits for a goal where it is"
             assert set(speeds) == {0.0}
-            rig.wish(-0.3, 0.1)
+            rig.request(-0.3, 0.1)
             await rig.settle(1)
             assert rig.joint("pitch") == pytest.approx(-0.3, abs=2 * STEP)
         reports, limp, again = rig.events.kept
@@ -222,7 +222,7 @@ def test_a_joint_that_stays_blocked_rests_longer_each_time():
             limp: list[float] = []
             was = TorqueState.HOLDING
             for _ in range(1500):
-                rig.wish(0.4, 0.0)
+                rig.request(0.4, 0.0)
                 await rig.settle(0.02)
                 now = rig.out.kept[-1].pitch_joint.torque
                 if now is not was and now is TorqueState.LIMP:
@@ -300,7 +300,7 @@ def test_a_brown_out_of_one_unit_is_noticed_and_repaired():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.settle(0.5)
-            rig.wish(0.2, 0.0)
+            rig.request(0.2, 0.0)
             await rig.settle(1)
             rig.unit(1).power(False, rig.clock.now())
             rig.unit(1).power(True, rig.clock.now())

@@ -1,4 +1,4 @@
-"""The maker's own library against the emulated bus, and our driver beside it, over a pty on the wall clock."""
+"""The maker's own library against the emulated bus, and our driver next to it, over a pty on the wall clock."""
 
 import asyncio
 import contextlib
@@ -53,7 +53,7 @@ class Library:
     def close(self) -> None:
         self.port.closePort()
 
-    def patient(self, call: Callable[[], tuple[T, int, int]]) -> tuple[T, int]:
+    def repeated(self, call: Callable[[], tuple[T, int, int]]) -> tuple[T, int]:
         for _ in range(PATIENCE):
             value, result, error = call()
             if result == sdk.COMM_SUCCESS:
@@ -61,15 +61,15 @@ class Library:
         raise AssertionError(self.packet.getTxRxResult(result))
 
     def ping(self, unit: int) -> tuple[int, int]:
-        return self.patient(lambda: self.packet.ping(self.port, unit))
+        return self.repeated(lambda: self.packet.ping(self.port, unit))
 
     def read(self, unit: int, register: p.Register) -> tuple[int, int]:
         call = self.packet.read1ByteTxRx if register.size == 1 else self.packet.read2ByteTxRx
-        return self.patient(lambda: call(self.port, unit, register.address))
+        return self.repeated(lambda: call(self.port, unit, register.address))
 
     def write(self, unit: int, register: p.Register, value: int) -> int:
         call = self.packet.write1ByteTxRx if register.size == 1 else self.packet.write2ByteTxRx
-        return self.patient(lambda: (None, *call(self.port, unit, register.address, value)))[1]
+        return self.repeated(lambda: (None, *call(self.port, unit, register.address, value)))[1]
 
     def sync_write(self, register: p.Register, values: dict[int, int]) -> None:
         group = sdk.GroupSyncWrite(self.port, self.packet, register.address, register.size)
@@ -107,7 +107,7 @@ async def test_the_library_pings_reads_writes_and_sync_writes(tmp_path: Path):
             pass
         assert abs(library.read(1, p.PRESENT_POSITION)[0] - 531) <= 1
         assert abs(library.read(2, p.PRESENT_POSITION)[0] - 184) <= 1
-        data, error = library.patient(lambda: library.packet.readTxRx(library.port, 1, p.PRESENT_POSITION.address, 8))
+        data, error = library.repeated(lambda: library.packet.readTxRx(library.port, 1, p.PRESENT_POSITION.address, 8))
         assert error == 0
         assert p.Present.decode(bytes(data)).temperature == 25
 

@@ -181,7 +181,7 @@ def test_unknown_faults_are_refused_with_a_list(tmp_path: Path):
     on_bench(tmp_path, test)
 
 
-async def test_files_are_read_beside_the_loop_by_default(tmp_path: Path):
+async def test_files_are_read_in_a_thread_by_default(tmp_path: Path):
     """On the wall clock, in a thread."""
     clock = WallClock()
     IioEmulator(tmp_path, clock, lambda _: 2.4)

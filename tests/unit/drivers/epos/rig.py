@@ -34,7 +34,7 @@ BAUD = 38_400
 
 
 class Gate:
-    """Sends drive commands at 50 Hz while ``talking``, and at once when told."""
+    """Sends drive commands at 50 Hz while ``talking``, and at once when asked."""
 
     def __init__(self, clock: Clock, commands: Mailbox[DriveCommand]) -> None:
         self.action = DriveAction.DISABLE

@@ -339,7 +339,7 @@ def test_the_deadman_line_is_obeyed_and_driving_goes_on_when_it_is_released():
             assert rig.newest.mode is not DriveMode.ENABLED
             assert [event for event in rig.events.reasons() if event is not Reason.DEVICE_READY] == [
                 Reason.DEVICE_TIMEOUT
-            ], "told once"
+            ], "reported once"
             rig.emulator.set_quick_stop_input(False)
             await rig.drive(6_000)
 

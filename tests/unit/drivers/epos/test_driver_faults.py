@@ -29,7 +29,7 @@ from tests.unit.drivers.kit import background
 # Faults
 
 
-def test_a_passing_fault_is_told_reset_and_driving_goes_on_from_0():
+def test_a_passing_fault_is_reported_reset_and_driving_goes_on_from_0():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(6_000)
@@ -75,7 +75,7 @@ def test_a_permanent_fault_ends_after_three_resets_and_waits_for_its_cause():
             assert controls(rig).count(Control.FAULT_RESET) == 3
             assert rig.health[-1].state is not ServiceState.READY
             assert any(row.reason is Reason.DEVICE_FAULT for row in rig.health)
-            assert rig.events.reasons().count(Reason.DRIVE_FAULT) == 1, "told once"
+            assert rig.events.reasons().count(Reason.DRIVE_FAULT) == 1, "reported once"
             assert rig.newest.mode is DriveMode.FAULT
             assert rig.newest.fault_code == od.POSITION_SENSOR
             rig.emulator.inject("clear")

@@ -143,7 +143,7 @@ def test_current_is_noisy_and_seeded():
     assert series(1) == series(1) != series(2)
 
 
-def test_the_plant_is_told_ramp_coast_and_brake():
+def test_the_plant_gets_ramp_coast_and_brake():
     motor = StillMotor()
     firmware = Firmware(lambda: SECOND, motor, np.random.default_rng(0))
     assert motor.commands[-1] == (None, 0.0)

@@ -1,4 +1,4 @@
-"""One session of the drive's driver at its limits: pauses, periods, what is sent and what is told."""
+"""One session of the drive's driver at its limits: pauses, periods, what is sent and what is reported."""
 
 from itertools import pairwise
 
@@ -98,8 +98,8 @@ def test_resets_of_a_fault_keep_their_pause_and_are_limited_within_their_window(
         resets = [at for at, value in rig.writes(od.CONTROLWORD) if value == Control.FAULT_RESET]
         assert len(resets) == 3
         assert all(0.3 <= pause < 0.5 for pause in seconds_between(resets))
-        first_told = next(at for at, value in rig.writes(od.CONTROLWORD) if value == Control.QUICK_STOP)
-        assert resets[0] - first_told >= 300 * MS, "the first one has its pause as well"
+        first_reported = next(at for at, value in rig.writes(od.CONTROLWORD) if value == Control.QUICK_STOP)
+        assert resets[0] - first_reported >= 300 * MS, "the first one has its pause as well"
         assert [at for at in rig.driver.resets if at > 0] == rig.driver.resets
         assert len(rig.driver.resets) == 3
         with pytest.raises(DeviceFaultError):
@@ -132,7 +132,7 @@ def test_no_reset_at_all_if_so_configured():
     on_bench(test, EposConfig(fault_resets=0))
 
 
-def test_a_controller_that_does_not_follow_is_told_once_after_two_seconds():
+def test_a_controller_that_does_not_follow_is_reported_once_after_two_seconds():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(3_000)
@@ -141,11 +141,11 @@ def test_a_controller_that_does_not_follow_is_told_once_after_two_seconds():
             await rig.until(lambda: Reason.DEVICE_TIMEOUT in rig.events.reasons(), 4.0)
             assert 1.9 < (rig.clock.now() - began) / SECOND < 2.6
             await rig.settle(4.0)
-            told = [event for event in rig.events.kept if event[0] is Reason.DEVICE_TIMEOUT]
-            assert len(told) == 1
-            assert told[0][1] is Severity.WARNING
-            assert told[0][2].startswith("controller stays in ")
-            assert told[0][2].endswith(", wanted ENABLED")
+            reported = [event for event in rig.events.kept if event[0] is Reason.DEVICE_TIMEOUT]
+            assert len(reported) == 1
+            assert reported[0][1] is Severity.WARNING
+            assert reported[0][2].startswith("controller stays in ")
+            assert reported[0][2].endswith(", wanted ENABLED")
 
     on_bench(test)
 
@@ -236,8 +236,8 @@ def test_a_link_is_slow_by_its_median_with_hysteresis():
         assert judged(session, *[100.0] * RECENT)
         assert not judged(session, *[quick - 0.1] * RECENT)
         assert not judged(session, *[slow] * RECENT)
-        told = [(event[0], event[1]) for event in rig.events.kept]
-        assert told == [(Reason.SLOW_LINK, Severity.WARNING), (Reason.SLOW_LINK, Severity.INFO)]
+        reported = [(event[0], event[1]) for event in rig.events.kept]
+        assert reported == [(Reason.SLOW_LINK, Severity.WARNING), (Reason.SLOW_LINK, Severity.INFO)]
         assert rig.events.kept[0][2].startswith("answers take 100 ms")
         assert rig.events.kept[0][3] == {"seconds": pytest.approx(0.1)}
 

@@ -154,7 +154,7 @@ def test_chunks_of_any_size(chunk: int | None):
 
 
 def test_everything_in_one_read():
-    """A stall that ends: three scans arrive in one piece and are told apart."""
+    """A stall that ends: three scans arrive in one piece and are kept apart."""
 
     async def main(clock: VirtualClock) -> Rig:
         async with bench(clock) as rig, rig.driving():

@@ -29,7 +29,7 @@ MD = "MD0044072501000"
 
 
 def ask(*lines: str, wait: float = 0.05, **kwargs: Any) -> bytes:
-    """Everything a sensor that starts in SCIP 2.0 (unless told otherwise) says to ``lines``."""
+    """Everything a sensor that starts in SCIP 2.0 (unless stated otherwise) says to ``lines``."""
 
     async def main(clock: VirtualClock) -> bytes:
         async with bench(clock, **{"state": "scip2", **kwargs}) as rig:

@@ -1,4 +1,4 @@
-"""VV, PP and II of the captured sensor, and what else is told in those fields."""
+"""VV, PP and II of the captured sensor, and what else those fields state."""
 
 import math
 

@@ -23,15 +23,15 @@ def test_probe(state: str):
             return found, list(rig.emulator.received)
 
     found, received = run_virtual(main)
-    told = json.loads(json.dumps(found))
-    assert told["device"] == "hokuyo_urg"
-    assert told["dialect"] == "SCIP 2.0"
-    assert told["identity"]["serial"] == "H0706400"
-    assert told["parameters"]["last_step"] == 725
-    assert told["state"]["status"] == "Sensor works well."
-    assert told["scan"]["beams"] == 682
-    assert told["scan"]["valid"] == 662
-    assert told["scan"]["error_codes"] == {str(code): 1 for code in range(20)}
+    reported = json.loads(json.dumps(found))
+    assert reported["device"] == "hokuyo_urg"
+    assert reported["dialect"] == "SCIP 2.0"
+    assert reported["identity"]["serial"] == "H0706400"
+    assert reported["parameters"]["last_step"] == 725
+    assert reported["state"]["status"] == "Sensor works well."
+    assert reported["scan"]["beams"] == 682
+    assert reported["scan"]["valid"] == 662
+    assert reported["scan"]["error_codes"] == {str(code): 1 for code in range(20)}
     assert received[-1] == "QT"
 
 
@@ -41,10 +41,10 @@ def test_probe_of_an_old_unit():
             return await probe(rig.port, clock), list(rig.emulator.received)
 
     found, received = run_virtual(main)
-    told = json.loads(json.dumps(found))
-    assert told["dialect"] == "SCIP 1.1"
-    assert told["state"] is None
-    assert told["scan"]["counter_ms"] is None
+    reported = json.loads(json.dumps(found))
+    assert reported["dialect"] == "SCIP 1.1"
+    assert reported["state"] is None
+    assert reported["scan"]["counter_ms"] is None
     assert received[-1] == "L0"
 
 

@@ -57,7 +57,7 @@ def test_quality_and_traffic_are_published_once_a_second(tmp_path: Path):
     on_bench(tmp_path, test)
 
 
-def test_driving_away_and_back_is_told_once_each_way(tmp_path: Path):
+def test_driving_away_and_back_is_reported_once_each_way(tmp_path: Path):
     async def test(rig: Rig) -> None:
         start = rig.clock.now()
         rig.emulator._signal = lambda now: -50 - 2.0 * (30 - abs((now - start) / SECOND - 30))

@@ -135,7 +135,7 @@ class Bench:
 def play(
     folder: Path, scene: Callable[[Bench], Awaitable[None]], config: UsbConfig | None = None, *, watched: bool = True
 ) -> Bench:
-    """Run ``scene`` on a virtual clock, with the service running unless told otherwise."""
+    """Run ``scene`` on a virtual clock, with the service running unless stated otherwise."""
 
     async def main(clock: VirtualClock) -> Bench:
         bench = Bench(folder, clock, config)

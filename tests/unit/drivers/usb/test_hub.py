@@ -25,7 +25,7 @@ FIRST = ("lidar", "steering", "drive", "stabiliser")
 """Roles behind hub 1-1."""
 
 
-def test_at_rest_nobody_waits_and_nothing_is_told(tmp_path: Path):
+def test_at_rest_nobody_waits_and_nothing_is_reported(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         async with bench.drivers() as starts:
             await bench.clock.sleep(20)
@@ -400,16 +400,16 @@ def test_autosuspend_is_forbidden_or_reported_after_every_replug(tmp_path: Path,
         await bench.clock.sleep(1)
 
     bench = play(tmp_path, scene)
-    told = bench.events.of(Reason.AUTOSUSPEND)
-    assert len(told) == 2
-    severity, source, text, _ = told[0]
+    reported = bench.events.of(Reason.AUTOSUSPEND)
+    assert len(reported) == 2
+    severity, source, text, _ = reported[0]
     assert source == "lidar"
     assert severity is (Severity.INFO if permitted else Severity.WARNING)
     assert ("udev rule" in text) is not permitted
     assert bench.usb.sysfs.text(f"{DEVICES}/1-1.1/power/control") == ("on" if permitted else "auto")
 
 
-def test_a_cable_in_another_port_is_told(tmp_path: Path):
+def test_a_cable_in_another_port_is_reported(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         bench.usb.unplug("1-1.2")
         await bench.clock.sleep(1)
@@ -445,7 +445,7 @@ def test_twins_that_return_to_their_own_ports_have_not_moved(tmp_path: Path):
     assert play(tmp_path, scene).events.kept == []
 
 
-def test_a_hub_in_another_port_is_told(tmp_path: Path):
+def test_a_hub_in_another_port_is_reported(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         bench.usb.unplug("1-1")
         await bench.clock.sleep(1)

@@ -77,7 +77,7 @@ def test_it_never_falls_back_to_another_port(tmp_path: Path):
         (await twin.open()).close()  # nobody had it open
 
     bench = play(tmp_path, scene)
-    assert bench.events.of(Reason.PORT_MOVED), "told, not used"
+    assert bench.events.of(Reason.PORT_MOVED), "reported, not used"
 
 
 def test_another_kind_of_device_is_refused_before_the_first_byte(tmp_path: Path):
@@ -139,7 +139,7 @@ def test_an_adapters_latency_is_lowered_at_every_open(tmp_path: Path):
     assert play(tmp_path, scene).events.kept == []
 
 
-def test_a_latency_that_cannot_be_lowered_is_told_once(tmp_path: Path):
+def test_a_latency_that_cannot_be_lowered_is_reported_once(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         bench.usb.refused.add("latency_timer")
         for _ in range(3):

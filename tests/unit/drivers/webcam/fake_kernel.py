@@ -17,7 +17,7 @@ BUFFER_LENGTH = 65536
 
 @dataclass
 class Node:
-    """One /dev/video*: what it can, what it was told, what it has to give."""
+    """One /dev/video*: what it can, what it was given, what it has to give."""
 
     flags: int = v4l2.CAP_CAPTURE | v4l2.CAP_STREAMING
     formats: tuple[int, ...] = (YUYV, v4l2.MJPG)

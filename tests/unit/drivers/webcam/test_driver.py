@@ -125,7 +125,7 @@ def test_two_runs_are_identical():
     assert runs[0] == runs[1]
 
 
-def test_another_mode_is_used_and_told_once():
+def test_another_mode_is_used_and_reported_once():
     async def test(rig: Rig) -> None:
         driver = rig.driver()
         for _ in range(2):

@@ -69,7 +69,7 @@ def test_slip_and_a_disturbed_compass_are_events():
     assert odometry[-1].frame == "odom"
 
 
-def test_health_is_told_once_a_second_and_at_once_when_it_changes():
+def test_health_is_reported_once_a_second_and_at_once_when_it_changes():
     rig = Rig().drive(0.3, 0.0, 0.0, 2.0)
     health = Outbox()
     served(rig, seconds=2.5, health=health)

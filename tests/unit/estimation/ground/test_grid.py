@@ -62,7 +62,7 @@ def test_places_far_off_are_left_out():
     assert grid.message(0, 0, "map").width < 100
 
 
-def test_it_is_saved_beside_the_map_and_read_again(tmp_path):
+def test_it_is_saved_with_the_map_and_read_again(tmp_path):
     assert GroundGrid.load(tmp_path).empty
     grid = GroundGrid()
     grid.observe(np.random.default_rng(1).uniform(-2, 2, (50, 2)), 0.1, 0.01)

@@ -81,6 +81,6 @@ def drive(mapper: Mapper, walls, truth, odom, *, noise=0.01, seed=1) -> list[Ste
 
 
 def errors(poses, truth):
-    """Distances, m, between poses told from the first one."""
+    """Distances, m, between poses reported from the first one."""
     off = between(truth[0], np.asarray(truth)) - between(poses[0], np.asarray(poses))
     return np.hypot(off[:, 0], off[:, 1])

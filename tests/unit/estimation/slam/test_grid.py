@@ -123,7 +123,7 @@ def test_tiles_put_together_are_the_grid():
     assert sum((cells != -1).sum() for cells in tiles.values()) == (whole.cells != -1).sum()
 
 
-def test_after_a_closure_the_map_is_drawn_anew_and_old_places_are_told_unknown():
+def test_after_a_closure_the_map_is_drawn_anew_and_old_places_are_reported_unknown():
     builder = GridBuilder(GridConfig())
     scan = scan_of((1.0, 0.0), (1.0, 0.2))
     poses = np.array([(float(i), 0.0, 0.0) for i in range(5)])
@@ -136,8 +136,8 @@ def test_after_a_closure_the_map_is_drawn_anew_and_old_places_are_told_unknown()
     assert builder.update_poses(stamps, moved)
     assert value(builder.grid, 5.0, 20.0) == 70
     assert value(builder.grid, 5.0, 0.0) == -1
-    told = {patch.origin: patch.cells for patch in builder.grid.changes()}
-    assert (told[(0.0, 0.0)] == -1).all()
+    reported = {patch.origin: patch.cells for patch in builder.grid.changes()}
+    assert (reported[(0.0, 0.0)] == -1).all()
 
 
 def test_scans_join_by_way_turn_or_time():

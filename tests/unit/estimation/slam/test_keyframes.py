@@ -23,7 +23,7 @@ def straight(count: int = 9, every: int = 4) -> tuple[Trajectory, np.ndarray]:
     return trail, keys
 
 
-def test_an_unmoved_graph_gives_back_what_was_told():
+def test_an_unmoved_graph_gives_back_what_was_reported():
     trail, keys = straight()
     stamps, poses = trail.poses(keys)
     assert stamps.tolist() == list(range(9))

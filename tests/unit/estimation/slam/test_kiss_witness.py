@@ -28,31 +28,31 @@ GOOD = SlamEstimate(
 )
 
 
-def told(off, **changed) -> list[float]:
+def reports_of(off, **changed) -> list[float]:
     """What the witness reports of estimates that are ``off(k)`` m beside the truth in x."""
     witness, rng = KissWitness(), np.random.default_rng(2)
-    told = []
+    reports = []
     for k, pose in enumerate(TRUTH):
         x, y, yaw = pose.tolist()
         estimate = replace(GOOD, stamp=SECOND + k * SECOND // 10, pose=(x + off(k), y, yaw), **changed)
         distance = witness.compare(scan(ROOM, pose, noise=0.01, rng=rng), estimate)
-        told += [] if distance is None else [distance]
-    return told
+        reports += [] if distance is None else [distance]
+    return reports
 
 
 def test_a_true_estimate_is_not_doubted():
-    assert told(lambda _: 0.0) == []
+    assert reports_of(lambda _: 0.0) == []
 
 
 def test_an_estimate_that_slides_away_is_reported_again_and_again():
-    reported = told(lambda k: 0.01 * k)
+    reported = reports_of(lambda k: 0.01 * k)
     assert len(reported) >= 3
     assert reported == pytest.approx([0.2] * len(reported), abs=0.08)
 
 
 def test_a_loop_closure_and_a_doubtful_estimate_are_not_compared():
-    assert told(lambda k: 0.01 * k, events=("closed",)) == []
-    assert told(lambda k: 0.01 * k, status=LocalisationStatus.DEGENERATE) == []
+    assert reports_of(lambda k: 0.01 * k, events=("closed",)) == []
+    assert reports_of(lambda k: 0.01 * k, status=LocalisationStatus.DEGENERATE) == []
 
 
 def test_the_worker_asks_the_witness_only_where_configured():

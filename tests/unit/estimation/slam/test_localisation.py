@@ -74,7 +74,7 @@ def test_a_room_that_only_fits_is_outside_the_map(odom: bool):
     assert estimates[-1].status is LocalisationStatus.OUTSIDE
 
 
-def test_a_robot_that_stands_still_outside_the_map_is_told():
+def test_a_robot_that_stands_still_outside_the_map_is_reported():
     walls = box(-9.0, -1.0, -6.0, 4.0)
     estimates = followed(SavedMap(drawn(), None), walls, np.tile((-8.0, 1.0, 0.3), (120, 1)))
     assert estimates[-1].status is LocalisationStatus.OUTSIDE

@@ -181,11 +181,11 @@ def test_bad_scans_in_between_neither_crash_nor_jump(kind):
     truth = rounds(80, 0.5)
     odom = drifting(truth)
     mapper = Mapper()
-    told = []
+    reported = []
     for k, pose in enumerate(truth):
         bad = k % 7 == 3 or k == 0
-        told.append(mapper.step(BAD[kind](pose) if bad else scan(ROOM, pose), int(k * 1e8), odom[k]).pose)
-    off = errors(told[1:], truth[1:])
+        reported.append(mapper.step(BAD[kind](pose) if bad else scan(ROOM, pose), int(k * 1e8), odom[k]).pose)
+    off = errors(reported[1:], truth[1:])
     assert off.max() < 0.15
     assert np.median(off) < 0.03
 

@@ -31,7 +31,7 @@ def take(increments, stamp, pose, *, alone=False, **more):
     return increments.take(stamp, made, made.pose, alone=alone)
 
 
-def test_the_motion_is_told_in_base_with_the_covariance_of_the_later_place():
+def test_the_motion_is_reported_in_base_with_the_covariance_of_the_later_place():
     increments = ScanOdometry()
     assert take(increments, 1, (1.0, 0.0, math.pi / 2)) is None
     moved = take(increments, 2, (1.0, 0.5, math.pi / 2))
@@ -52,7 +52,7 @@ def test_without_odometry_rejected_matches_are_stepped_over():
     assert take(increments, 4, (0.3, 0.0, 0.0), alone=True, overlap=0.4).motion == pytest.approx((0.1, 0.0, 0.0))
 
 
-def test_beside_odometry_no_motion_is_told_by_or_across_a_misfit():
+def test_with_odometry_no_motion_is_reported_by_or_across_a_misfit():
     increments = ScanOdometry()
     take(increments, 1, (0.0, 0.0, 0.0))
     assert take(increments, 2, (1.0, 1.0, 0.5), overlap=0.4) is None

@@ -84,7 +84,7 @@ def test_a_slip_beyond_the_covariance_is_found_by_looking_further():
     assert match.pose == pytest.approx(PLACE, abs=0.01)
 
 
-def test_a_corridor_is_told_and_leaves_the_way_along_it_to_the_wheels():
+def test_a_corridor_is_reported_and_leaves_the_way_along_it_to_the_wheels():
     submap = seen_from(CORRIDOR, (0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
     guess = np.array((0.9, 0.0, 0.03))
     match = PlanarMatcher().match(

@@ -82,7 +82,7 @@ def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def _scans(start: tuple[float, float, float], count: int, *, odom: bool) -> list[tuple[ScanInput, np.ndarray]]:
     """Scans of a truck that is pushed on in a slight bow, 3 cm and at most 0.03 rad at a time, and its true poses."""
-    told, pose = [], np.array(start)
+    reported, pose = [], np.array(start)
     for k in range(count):
         x, y, yaw = pose.tolist()
         world = World(WorldConfig(map="rooms", start=Pose2D(x=x, y=y, yaw=yaw)), 7 + k)
@@ -98,9 +98,9 @@ def _scans(start: tuple[float, float, float], count: int, *, odom: bool) -> list
             mount=(0.14, 0.0, 0.0),
             odom=(x + 3.0, y - 1.0, yaw) if odom else None,
         )
-        told.append((scan, pose.copy()))
+        reported.append((scan, pose.copy()))
         pose += np.array((0.03 * math.cos(yaw), 0.03 * math.sin(yaw), 0.03 * math.sin(k / 3)))
-    return told
+    return reported
 
 
 PLACES = [(1.5, 3.95, 0.0), (6.85, 4.6, 1.6), (4.5, 6.4, 0.0)]

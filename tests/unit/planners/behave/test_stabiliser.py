@@ -137,7 +137,7 @@ class Kept:
 
 
 def serving(test: Any) -> None:
-    """Run ``test(clock, compass, out)`` beside the service."""
+    """Run ``test(clock, compass, out)`` with the service running."""
 
     async def main(clock: VirtualClock) -> None:
         compass: Mailbox[Attitude] = Mailbox(latest())

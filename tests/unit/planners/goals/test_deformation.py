@@ -1,4 +1,4 @@
-"""What the goal service keeps of a deformation: what is sent, when it counts as blocked, what is told."""
+"""What the goal service keeps of a deformation: what is sent, when it counts as blocked, what is reported."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -27,7 +27,7 @@ FREE, BLOCKED = DeformAnswer(1, "free", complete=True), DeformAnswer(1, "blocked
 
 
 class Elsewhere:
-    """An actor that answers as it is told, or fails."""
+    """An actor that answers as it is given, or fails."""
 
     def __init__(self) -> None:
         self.tasks: list[DeformTask] = []
@@ -57,7 +57,7 @@ class Stage:
         self.clock, self.actor = clock, Elsewhere()
         self.scans: Mailbox[LaserScan] = Mailbox(latest())
         self.poses: Mailbox[Odometry] = Mailbox(latest())
-        self.told: list[tuple[Finding, Finding]] = []
+        self.reported: list[tuple[Finding, Finding]] = []
         self.events: list[Reason] = []
         self.deformation = RouteDeformation(
             Setup(PlannerConfig(local_planner=RsbandConfig()), FourWheelSteering(), Footprint()),
@@ -87,7 +87,9 @@ class Stage:
 def play(story: Callable[[Stage], Coroutine[Any, Any, None]]) -> Stage:
     async def main(clock: VirtualClock) -> Stage:
         stage = Stage(clock)
-        task = asyncio.create_task(stage.deformation.run(lambda was, answer: stage.told.append((was, answer.finding))))
+        task = asyncio.create_task(
+            stage.deformation.run(lambda was, answer: stage.reported.append((was, answer.finding)))
+        )
         await clock.sleep(0.01)
         await story(stage)
         task.cancel()
@@ -110,7 +112,7 @@ def test_setup_and_route_are_sent_once_and_again_after_a_failure():
         assert sent == [(True, False), (False, True), (False, False), (False, False), (True, True)]
         assert len(stage.events) == 1
 
-    assert play(story).told == [("idle", "free"), ("free", "free"), ("free", "free")]
+    assert play(story).reported == [("idle", "free"), ("free", "free"), ("free", "free")]
 
 
 def test_tilted_scans_say_nothing():
@@ -171,6 +173,6 @@ def test_a_detour_without_end_is_blocked_too():
         ("idle", FREE, None),
     ],
 )
-def test_changes_are_told_once(was: Finding, answer: DeformAnswer, reason: Reason | None):
-    told = event_of(was, answer)
-    assert (None if told is None else told[0]) is reason
+def test_changes_are_reported_once(was: Finding, answer: DeformAnswer, reason: Reason | None):
+    reported = event_of(was, answer)
+    assert (None if reported is None else reported[0]) is reason

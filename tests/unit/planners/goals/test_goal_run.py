@@ -32,7 +32,7 @@ WAY = PlanAnswer(Reason.OK, poses=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), 
 
 
 class Story:
-    """A run that is told facts; time passes by 0.1 s a fact."""
+    """A run that is given facts; time passes by 0.1 s a fact."""
 
     def __init__(self, config: PlannerConfig = CONFIG) -> None:
         self.config = config
@@ -59,7 +59,7 @@ class Story:
         return self.run.phase
 
 
-def told(actions: Iterable[Action]) -> list[Reason]:
+def reported(actions: Iterable[Action]) -> list[Reason]:
     return [action.reason for action in actions if isinstance(action, Report)]
 
 
@@ -68,12 +68,12 @@ def test_a_goal_is_planned_followed_and_reached():
     assert story.done == [Report(Reason.GOAL_ACCEPTED, goal_run.Severity.INFO, story.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
     assert story.tell() == ()
     actions = story.tell(answer=WAY)
-    assert (story.phase, actions[0], told(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
+    assert (story.phase, actions[0], reported(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
     assert story.tell(10, along=1.0, at_rest=False) == ()
     assert story.tell(outcome=Reason.GOAL_REACHED, at_rest=False, pose=GOAL) == (), "still rolling"
     actions = story.tell(outcome=Reason.GOAL_REACHED, pose=(1.95, 0.02, 0.05 + math.tau))
     assert (story.run.outcome, story.run.active) == (Reason.GOAL_REACHED, False)
-    assert (Halt() in actions, told(actions)) == (True, [Reason.GOAL_REACHED])
+    assert (Halt() in actions, reported(actions)) == (True, [Reason.GOAL_REACHED])
     assert story.tell(answer=WAY) == ()
 
 
@@ -88,7 +88,7 @@ def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
     story = Story()
     for _ in range(goal_run.MISSES):
         story.tell(answer=WAY)
-        assert told(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
+        assert reported(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
         assert story.phase is GoalPhase.PLANNING
     story.tell(answer=WAY)
     story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.3))
@@ -108,7 +108,7 @@ def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     story.tell(answer=WAY)
     assert story.tell(CONFIG.blocked_scans - 1, blocked=True, along=0.2) == ()
     actions = story.tell(blocked=True, along=0.3)
-    assert (told(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
+    assert (reported(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
 
 def test_the_recovery_behaviours_are_tried_in_order_and_then_the_goal_is_given_up():
@@ -158,7 +158,7 @@ def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
     assert (story.run.outcome, story.run.recoveries) == (Reason.STUCK, 4)
 
 
-def test_a_failed_escape_is_the_next_rung():
+def test_a_failed_escape_is_the_next_recovery_behaviour():
     story = Story(PlannerConfig(recovery=("back_out", "wait")))
     story.tell(answer=PlanAnswer(Reason.START_BLOCKED))
     story.tell(answer=PlanAnswer(Reason.STUCK, "both ends"))
@@ -422,7 +422,7 @@ def test_waypoints_are_passed_one_by_one_and_asked_for_until_then():
     story.run, _ = goal_run.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
     story.tell(answer=WAY)
     assert story.tell(pose=(0.5, 0.0, 0.0)) == ()
-    assert told(story.tell(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
+    assert reported(story.tell(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
     assert story.run.via == ((1.5, 0.0, 0.0),)
     assert story.tell(pose=(1.0, 0.1, 0.0), along=1.0) == ()
 
@@ -506,7 +506,7 @@ def test_a_missed_cusp_is_planned_anew_from_there():
     story.tell(answer=WAY)
     actions = story.tell(outcome=Reason.CUSP_MISSED, pose=(1.0, 0.1, 0.0))
     assert Plan() in actions
-    assert told(actions) == [Reason.CUSP_MISSED]
+    assert reported(actions) == [Reason.CUSP_MISSED]
 
 
 def test_an_end_off_the_path_is_judged_by_the_goal():

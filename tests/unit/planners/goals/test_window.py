@@ -53,7 +53,7 @@ def test_what_is_seen_stays_in_place_while_the_window_moves():
     assert not window.cells.any()
 
 
-def test_obstacles_of_the_map_count_beside_those_seen():
+def test_obstacles_of_the_map_count_with_those_seen():
     window = Window()
     scan(window, 1.0)
     known = np.zeros((100, 100), bool)

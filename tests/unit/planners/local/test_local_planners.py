@@ -53,7 +53,7 @@ def test_the_same_question_has_the_same_answer(config):
 
 
 @pytest.mark.parametrize("config", OURS, ids=name)
-def test_no_way_round_leads_up_to_it_and_is_told_with_the_reason(config):
+def test_no_way_round_leads_up_to_it_and_is_reported_with_the_reason(config):
     cycles, route, wall = Cycles(make_local_planner(CARS["2ws"], config)), line(), window((2.2, 0, 2.4, 4))
     result, pose = cycles.step(route, wall, START), np.array(START)
     assert result.reason is Reason.PATH_PARTIAL
@@ -80,7 +80,7 @@ def test_what_is_free_of_a_blocked_path_is_given(config):
 
 
 @pytest.mark.parametrize("config", OURS, ids=name)
-def test_a_truck_in_an_obstacle_is_told(config):
+def test_a_truck_in_an_obstacle_is_reported(config):
     result = make_local_planner(CARS["4ws"], config).plan(
         line(), window((0.7, 1.9, 0.9, 2.1)), START, LocalPlannerState()
     )
@@ -220,7 +220,7 @@ def test_a_pose_that_is_none_is_refused(config):
         make_local_planner(CARS["2ws"], config).plan(line(), window(), (math.nan, 0, 0), LocalPlannerState())
 
 
-def test_route_off_the_window_is_told():
+def test_route_off_the_window_is_reported():
     far = replace(line(), poses=line().poses + np.array([10.0, 0, 0]))
     for config in (*OURS, PublishedConfig()):
         result = make_local_planner(CARS["4ws"], config).plan(

@@ -24,7 +24,7 @@ ROUTE = path(straight(1.0))
 
 
 class Bench:
-    """A path service and a gate that says what it is told."""
+    """A path service and a gate that says what it is given."""
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock

@@ -20,7 +20,7 @@ def test_an_open_path_goes_on_straight_behind_its_end():
     assert segment.at(99.0).tangent == 0.0
 
 
-def test_projection_looks_only_where_it_is_told():
+def test_projection_looks_only_where_it_is_reported():
     segment = segmented(path(straight(2.0))).segments[0]
     assert segment.project(0.73, 0.2, 0.0, 2.0).s == pytest.approx(0.73)
     assert segment.project(0.73, 0.2, 1.0, 2.0).s == pytest.approx(1.0)

@@ -46,7 +46,7 @@ def test_a_request_due_at_the_very_step_counts():
     assert axles.angles == pytest.approx((0.2, 0.0))
 
 
-def test_the_pose_is_foretold_over_the_dead_time():
+def test_the_pose_is_predicted_over_the_dead_time():
     axles = AxleModel(0.2, 0.0, 100.0)
     axles.advance(0.0)
     axles.request(0.0, (0.3, -0.3))

@@ -39,7 +39,7 @@ class Bench:
         self.clock = clock
         self.pose_in, self.path_in, self.gate_in, self.scan_in = Inbox(), Inbox(), Inbox(), Inbox()
         self.path_in.latest = route
-        self.asked, self.told, self.events = Outbox(), Outbox(), []
+        self.asked, self.reported, self.events = Outbox(), Outbox(), []
         self.pose, self.speed = (0.0, 0.0, 0.0), 0.0
         self.silent = False
         self.heard = 0
@@ -49,7 +49,7 @@ class Bench:
             inputs=self._inputs(with_scan),
             actor=actor,
             drive=self.asked,
-            tracker=self.told,
+            tracker=self.reported,
             events=lambda reason, severity, source, text="", **values: self.events.append((reason, text)),
         )
         self.gate(GateMode.DISARMED)
@@ -117,7 +117,7 @@ def on_bench(scenario, route, **more):
 
 async def until_ended(bench, seconds=60.0):
     for _ in range(round(seconds / 0.1)):
-        if bench.told[-1].outcome is not Reason.DRIVING:
+        if bench.reported[-1].outcome is not Reason.DRIVING:
             return
         await bench.clock.sleep(0.1)
 
@@ -162,7 +162,7 @@ def test_a_worker_gives_what_the_loop_gives_and_is_sent_what_is_new():
     actor, route = Elsewhere(), path(straight(0.5))
     here, there = (on_bench(scenario, route, actor=where) for where in (None, actor))
     assert here.asked == there.asked
-    assert here.told == there.told
+    assert here.reported == there.reported
     assert here.events == there.events
     assert [inputs.setup is not None for inputs in actor.sent] == [True] + [False] * (len(actor.sent) - 1)
     assert sum("path" in inputs.news for inputs in actor.sent) == 1
@@ -180,23 +180,23 @@ def test_a_lap_from_arming_to_the_goal():
     assert (request.source, request.role, request.nonce, request.lease) == ("tracker", Role.TRACKER, "n1", 0.25)
     assert [w.seq for w in bench.asked] == list(range(len(bench.asked)))
     assert np.diff([w.stamp for w in bench.asked]) == pytest.approx(SECOND // 20, abs=1000)
-    last = bench.told[-1]
+    last = bench.reported[-1]
     assert last.outcome is Reason.GOAL_REACHED
     assert last.along == pytest.approx(last.length, abs=0.03)
     assert last.path == "test"
-    assert max(abs(t.cross_track) for t in bench.told) < 0.06
+    assert max(abs(t.cross_track) for t in bench.reported) < 0.06
     assert math.hypot(*bench.pose[:2]) < 0.06
     assert [reason for reason, _ in bench.events] == [Reason.GOAL_REACHED]
     assert bench.asked[-1].speed == 0.0
-    assert bench.told[-1].stamp - bench.asked[-1].stamp > SECOND // 2  # silent once at rest
+    assert bench.reported[-1].stamp - bench.asked[-1].stamp > SECOND // 2  # silent once at rest
 
 
 def test_it_asks_for_nothing_while_disarmed_and_goes_on_after_a_stop():
     async def scenario(bench):
-        assert bench.told[-1].along == 0.0
+        assert bench.reported[-1].along == 0.0
         bench.gate(GateMode.DRIVING)
         await bench.clock.sleep(3.0)
-        driven = bench.told[-1].along
+        driven = bench.reported[-1].along
         assert driven > 0.3
         bench.gate(GateMode.ESTOPPED)
         await bench.clock.sleep(1.0)
@@ -206,7 +206,7 @@ def test_it_asks_for_nothing_while_disarmed_and_goes_on_after_a_stop():
         bench.gate(GateMode.ARMED)
         await bench.clock.sleep(1.0)
         assert len(bench.asked) > asked
-        assert bench.told[-1].along > driven
+        assert bench.reported[-1].along > driven
 
     on_bench(scenario, path(straight(4.0)))
 
@@ -219,8 +219,8 @@ def test_arming_after_the_end_starts_the_lap_over():
         await bench.clock.sleep(0.5)
         bench.gate(GateMode.ARMED)
         await bench.clock.sleep(2.0)
-        assert bench.told[-1].outcome is Reason.DRIVING
-        assert 0.1 < bench.told[-1].along < 1.0
+        assert bench.reported[-1].outcome is Reason.DRIVING
+        assert 0.1 < bench.reported[-1].along < 1.0
 
     on_bench(scenario, path(circle(0.6), closed=True))
 
@@ -256,8 +256,8 @@ def test_a_truck_put_elsewhere_before_arming_starts_there():
         await bench.clock.sleep(0.2)
         bench.gate(GateMode.ARMED)
         await bench.clock.sleep(0.5)
-        assert abs(bench.told[-1].cross_track) < 0.05
-        assert bench.told[-1].along < 0.2
+        assert abs(bench.reported[-1].cross_track) < 0.05
+        assert bench.reported[-1].along < 0.2
 
     on_bench(scenario, path(circle(1.0), closed=True))
 
@@ -275,14 +275,14 @@ def test_a_stale_pose_silences_it():
     on_bench(scenario, path(straight(4.0)))
 
 
-def test_a_lost_path_is_told_and_the_truck_left_standing():
+def test_a_lost_path_is_reported_and_the_truck_left_standing():
     async def scenario(bench):
         bench.gate(GateMode.DRIVING)
         await bench.clock.sleep(2.0)
         bench.pose = (bench.pose[0], 2.0, 0.0)
         await bench.clock.sleep(1.0)
-        assert bench.told[-1].outcome is Reason.PATH_LOST
-        assert bench.told[-1].stamp - bench.asked[-1].stamp > SECOND // 2
+        assert bench.reported[-1].outcome is Reason.PATH_LOST
+        assert bench.reported[-1].stamp - bench.asked[-1].stamp > SECOND // 2
 
     bench = on_bench(scenario, path(straight(4.0)))
     assert [reason for reason, _ in bench.events] == [Reason.PATH_LOST]
@@ -294,13 +294,13 @@ def test_a_new_path_replaces_the_old_one():
         await bench.clock.sleep(2.0)
         bench.path_in.latest = path(straight(1.0) + bench.pose[:2])
         await bench.clock.sleep(0.2)
-        assert bench.told[-1].length == pytest.approx(1.0)
-        assert bench.told[-1].along < 0.2
+        assert bench.reported[-1].length == pytest.approx(1.0)
+        assert bench.reported[-1].along < 0.2
 
     on_bench(scenario, path(straight(4.0)))
 
 
-def test_impossible_paths_are_told_once_and_ignored():
+def test_impossible_paths_are_reported_once_and_ignored():
     async def scenario(bench):
         bench.gate(GateMode.DRIVING)
         await bench.clock.sleep(1.0)
@@ -319,7 +319,7 @@ def test_impossible_paths_are_told_once_and_ignored():
     assert "frame 'map': expected 'odom'" in bench.events[0][1]
 
 
-def test_a_path_of_huge_poses_is_told_and_ignored():
+def test_a_path_of_huge_poses_is_reported_and_ignored():
     async def scenario(bench):
         bench.gate(GateMode.DRIVING)
         await bench.clock.sleep(1.0)
@@ -332,7 +332,7 @@ def test_a_path_of_huge_poses_is_told_and_ignored():
     assert [reason for reason, _ in bench.events] == [Reason.BAD_INPUT]
 
 
-def test_a_path_that_the_kinematics_refuse_is_told_once_and_ignored(monkeypatch):
+def test_a_path_that_the_kinematics_refuse_is_reported_once_and_ignored(monkeypatch):
     def refuse(*_):
         raise KinematicsError("no such motion")
 
@@ -365,12 +365,12 @@ def test_the_gates_stamp_is_echoed():
 def test_nothing_happens_without_gate_or_path():
     async def scenario(bench):
         gate, bench.gate_in.latest = bench.gate_in.latest, None
-        told = len(bench.told)
+        reported = len(bench.reported)
         await bench.clock.sleep(0.3)
-        assert len(bench.told) == told
+        assert len(bench.reported) == reported
         bench.gate_in.latest = gate
         await bench.clock.sleep(0.1)
-        assert len(bench.told) > told
+        assert len(bench.reported) > reported
 
     on_bench(scenario, path(straight(1.0)))
 

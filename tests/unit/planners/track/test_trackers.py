@@ -299,7 +299,7 @@ class Delayed:
         return float(np.abs(errors[20:]).max())
 
 
-def test_kinds_are_told_apart_and_unknown_keys_refused():
+def test_kinds_are_kept_apart_and_unknown_keys_refused():
     assert TRACKER.validate_python({"kind": "mpc"}).kind == "mpc"
     for bad, hint in (({"kind": "magic"}, "kind"), ({"kind": "lqr", "lookahead": 0.4}, "lookahead"), ({}, "kind")):
         with pytest.raises(ValidationError, match=hint):

@@ -286,7 +286,7 @@ def test_a_start_that_hangs_or_fails_on_the_virtual_clock():
 @pytest.mark.parametrize(
     ("target", "error"), [("slow_to_build", WorkerTimeoutError), ("broken", WorkerError), ("Counter", None)]
 )
-def test_on_the_virtual_clock_a_worker_starts_beside_the_run(target: str, error: type[Exception] | None):
+def test_on_the_virtual_clock_a_worker_starts_while_the_run_goes_on(target: str, error: type[Exception] | None):
     async def main(clock: VirtualClock) -> None:
         async with counter(clock, target, start_timeout=0.3 if target == "slow_to_build" else 30.0) as worker:
             await worker.start()

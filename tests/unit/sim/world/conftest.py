@@ -1,4 +1,4 @@
-"""An open field, a truck that is told pulses and speeds directly, and no noise unless asked for."""
+"""An open field, a truck that is given pulses and speeds directly, and no noise unless asked for."""
 
 from math import degrees
 

@@ -47,7 +47,7 @@ def run(starts: float, stops: float, lag: float, direction: int = 1) -> MoveReco
     return found
 
 
-def test_setting_off_and_stopping_are_told_apart():
+def test_setting_off_and_stopping_are_kept_apart():
     runs = [run(0.06, 0.02, 0.03, sign) for sign in (1, -1)]
     for part, dead_time in (("start", 0.06), ("stop", 0.02)):
         found = drive_response(runs, part, CYCLE)

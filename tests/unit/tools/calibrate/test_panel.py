@@ -80,7 +80,7 @@ def test_an_answer_has_a_name():
         TerminalPanel(["2.0"])
 
 
-def test_an_answer_nobody_asked_for_is_told(capsys):
+def test_an_answer_nobody_asked_for_is_reported(capsys):
     with TerminalPanel(["distnace=1.98"]):
         pass
     assert "--answer distnace=1.98: was not asked for" in capsys.readouterr().err

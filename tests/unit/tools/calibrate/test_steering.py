@@ -30,7 +30,7 @@ def leg(
     string: bool = False,
     stop: float = math.pi / 4,
 ) -> SteeringRun:
-    """What a truck with the maps ``true`` does when it is told axle angles by the believed ones."""
+    """What a truck with the maps ``true`` does when it is commanded axle angles by the believed ones."""
     count = 16
     motor = np.full(count, CHASSIS.drivetrain.motor_angle(metres) / count)
     servos = CHASSIS.servos(front, rear)

@@ -24,7 +24,7 @@ class Unplanned:
         return {"planner": None}
 
 
-def test_a_robot_without_a_planner_is_told(monkeypatch: pytest.MonkeyPatch):
+def test_a_robot_without_a_planner_is_reported(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Unplanned)
     done = CliRunner().invoke(app, ["goto", "1", "0", "0"])
     assert done.exit_code == Reason.NOT_FOUND.exit_code

@@ -122,10 +122,10 @@ def called(*arguments: str, **streams: Any) -> "subprocess.CompletedProcess[str]
 
 
 def test_help_and_usage_errors_are_bare_lines_in_pipes():
-    told = called("log", "--help", capture_output=True).stdout
-    assert told.isascii()
+    reported = called("log", "--help", capture_output=True).stdout
+    assert reported.isascii()
     report = "Write one HTML page about a log: path, states, events, signals, health, losses."
-    assert f"  report   {report}\n" in told
+    assert f"  report   {report}\n" in reported
     refused = called("probe", capture_output=True)
     assert refused.returncode == 2
     assert refused.stderr.endswith("\nError: Missing argument 'device'.\n")

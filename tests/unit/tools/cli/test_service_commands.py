@@ -44,7 +44,7 @@ def test_a_port_that_no_rule_makes_is_pointed_out(tmp_path: Path):
     assert "note: devices.lidar.port: /dev/truck/lidar is made by no rule" in said.stderr
 
 
-def test_who_may_not_install_is_told_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_who_may_not_install_gets_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from monstertruckd.tools.install import apply
 
     def refuse(path: Path, _: str, **_options: object) -> None:

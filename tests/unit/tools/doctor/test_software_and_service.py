@@ -26,7 +26,7 @@ def without(*absent: str):
     return change
 
 
-def test_a_processor_without_wheels_is_told(tmp_path: Path):
+def test_a_processor_without_wheels_is_reported(tmp_path: Path):
     assert bad(see(tmp_path / "a", lambda context: python(context, "x86_64"))) == {}
     found = see(tmp_path / "b", lambda context: python(context, "armv7l"))["python"]
     assert (found.level, found.reason) == (Level.WARN, Reason.NOT_SUPPORTED)

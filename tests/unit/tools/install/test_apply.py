@@ -1,4 +1,4 @@
-"""Installing and taking out: twice is once, nothing of the operator's is lost, the system is told once."""
+"""Installing and taking out: twice is once, nothing of the operator's is lost, the system is informed once."""
 
 import os
 import shutil
@@ -72,7 +72,7 @@ def test_the_second_time_the_configuration_may_have_any_name(tmp_path: Path):
         truck_plan(root, None)
 
 
-def test_an_edited_configuration_is_kept_beside_and_its_change_reaches_the_rules(tmp_path: Path):
+def test_an_edited_configuration_is_kept_as_well_and_its_change_reaches_the_rules(tmp_path: Path):
     install(truck_plan(tmp_path), tmp_path)
     installed = tmp_path / "etc/monstertruckd/truck.yaml"
     edited = installed.read_text().replace('hub: "1-2", port: 1', 'hub: "1-2", port: 4')
@@ -125,7 +125,7 @@ class Here:
         return install(truck_plan(Path("/")), Path("/"), run=self)
 
 
-def test_the_running_system_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_running_system_is_informed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     here = Here(tmp_path, monkeypatch)
     assert here.install().commands == list(AFTER_INSTALL)
     assert here.ran == list(AFTER_INSTALL)
@@ -152,11 +152,11 @@ def test_an_installation_that_broke_off_goes_on(tmp_path: Path, monkeypatch: pyt
     here.fails = None
     here.ran.clear()
     assert here.install().changed
-    assert here.ran == list(AFTER_INSTALL), "the files are all there, but nobody was told of them"
+    assert here.ran == list(AFTER_INSTALL), "the files are all there, but they were not reported"
     assert not here.install().changed
 
 
-def test_nothing_is_told_by_a_shell_or_over_the_network():
+def test_nothing_is_run_by_a_shell_or_over_the_network():
     programs = {command[0] for command in (*AFTER_INSTALL, *BEFORE_REMOVAL, *AFTER_REMOVAL)}
     assert programs == {"systemctl", "systemd-sysusers", "systemd-tmpfiles", "udevadm"}
 
@@ -168,7 +168,7 @@ def test_what_a_program_says_becomes_the_error():
         run_command(["no-such-program"])
 
 
-def test_who_may_not_write_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_who_may_not_write_gets_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def refuse(path: Path, _: str, **_options: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 

@@ -21,7 +21,7 @@ class Computer:
 
     Args:
         folder: its root.
-        status: what systemd was last told by the daemon, one line for each time it is asked; the last one stays.
+        status: what systemd last got from the daemon, one line for each time it is asked; the last one stays.
         fails: programs of which a restart fails, by a part of the unit.
     """
 

@@ -1,4 +1,4 @@
-"""No flipped bit loses or makes a message untold."""
+"""No flipped bit loses or makes a message unreported."""
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -29,7 +29,7 @@ def test_a_length_beyond_the_file_ends_the_reading_there(log, length):
     assert "damaged after byte" in reader.damage
 
 
-def test_a_damaged_index_is_told_and_mended(log, master):
+def test_a_damaged_index_is_reported_and_mended(log, master):
     data = bytearray(log.read_bytes())
     data[data.rindex(b"jsonschema")] ^= 1
     log.write_bytes(data)
@@ -42,7 +42,7 @@ def test_a_damaged_index_is_told_and_mended(log, master):
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_no_flipped_bit_changes_messages_untold(tmp_path, compression):
+def test_no_flipped_bit_changes_messages_unreported(tmp_path, compression):
     source, damaged = tmp_path / "source.mcap", tmp_path / "damaged.mcap"
     write(source, 2, compression)
     whole, messages = source.read_bytes(), list(open_log(source))
@@ -120,7 +120,7 @@ def test_records_of_others_are_no_damage(log, master):
     assert reader.config() == {"a": 1}
 
 
-def test_a_damaged_attachment_is_told_kept_and_not_used(log, master):
+def test_a_damaged_attachment_is_reported_kept_and_not_used(log, master):
     assert open_log(log).config() == {"a": 1}
     log.write_bytes(log.read_bytes().replace(b'"a": 1', b'"a": 2', 1))
     reader = open_log(log)

@@ -42,7 +42,7 @@ def test_every_log_says_when_how_long_and_how_much(folder: Path):
     assert foreign.state is LogState.UNREADABLE
 
 
-def test_a_log_being_written_is_told_from_one_broken_off(folder: Path):
+def test_a_log_being_written_is_distinguished_from_one_broken_off(folder: Path):
     with (folder / "run-3.mcap").open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert list_logs(folder)[2].state is LogState.WRITING

@@ -109,7 +109,7 @@ def test_tables_get_their_names_together(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_export_is_told(tmp_path):
+def test_an_empty_export_is_reported(tmp_path):
     done = run("export", GOLDEN, tmp_path / "out", "--start", 5000)
     assert done.exit_code == 0
     assert "no message of these topics and times" in done.output

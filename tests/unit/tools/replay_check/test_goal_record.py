@@ -44,7 +44,7 @@ def test_ticks_that_left_nothing_lie_on_the_grid_of_those_that_did():
     assert unseen == pytest.approx([3.2, 3.4, 3.6, 3.7, 3.8, 3.9])  # none before there was a goal
 
 
-def test_a_tick_that_told_nothing_came_before_a_report_was_due():
+def test_a_tick_that_reported_nothing_came_before_a_report_was_due():
     log = record((3.0, 1, GoalPhase.DRIVING), (3.603, 1, GoalPhase.DRIVING))
     assert [tick / SECOND for tick in log.unseen_ticks(PERIOD)] == pytest.approx([3.103, 3.203, 3.303, 3.403, 3.5])
     assert max(log.unseen_ticks(PERIOD)) < 3.5 * SECOND

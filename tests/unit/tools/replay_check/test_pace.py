@@ -51,12 +51,12 @@ def test_others_keep_the_time_of_the_loop_to_the_nanosecond():
 
 def test_results_of_workers_count_when_they_are_called_in_their_order():
     async def main(clock):
-        turns, told = RecordedTurns(), []
+        turns, reported = RecordedTurns(), []
         use_delivery(clock, turns)
 
         async def step(name):
             await delivery_of(clock).wait(clock, 2 * SECOND)
-            told.append((name, clock.now()))
+            reported.append((name, clock.now()))
 
         turns.next()  # nobody waits
         tasks = [asyncio.create_task(step(name)) for name in "abc"]
@@ -67,6 +67,6 @@ def test_results_of_workers_count_when_they_are_called_in_their_order():
         turns.open()
         await asyncio.gather(*tasks)
         await step("d")
-        return told
+        return reported
 
     assert run(main) == [("a", 5 * SECOND), ("b", 6 * SECOND), ("c", 6 * SECOND), ("d", 6 * SECOND)]

@@ -133,7 +133,7 @@ def with_drive(log, target, change):
 
 
 @pytest.mark.parametrize(("by", "rounded"), [(1e-9, True), (1e-5, False)])
-def test_last_digits_alone_are_told_as_such(tmp_path, by, rounded):
+def test_last_digits_alone_are_reported_as_such(tmp_path, by, rounded):
     log = with_drive(
         LEVEL, tmp_path / "nudged.mcap", lambda drive: drive.model_copy(update={"front": drive.front + by})
     )
@@ -191,11 +191,11 @@ def test_missing_and_extra_outputs_are_counted(tmp_path):
     rows = {row.topic: row for row in check.topics}
     assert rows[topics.SLAM].missing > 20
     assert not check.agrees
-    told = computed_again(
-        changed(SLAM, tmp_path / "told.mcap", lambda one: None if one.topic == "health/slam" else one)
+    reported = computed_again(
+        changed(SLAM, tmp_path / "reported.mcap", lambda one: None if one.topic == "health/slam" else one)
     )
-    assert {row.topic: row for row in told.topics}[topics.SLAM].surplus(told.end) > 60
-    assert not told.agrees
+    assert {row.topic: row for row in reported.topics}[topics.SLAM].surplus(reported.end) > 60
+    assert not reported.agrees
 
 
 def test_another_configuration_shows_what_it_would_have_changed(tmp_path):

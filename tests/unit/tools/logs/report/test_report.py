@@ -165,7 +165,7 @@ def test_page_tells_events_states_losses_and_config(log):
     assert "<b>Battery</b>" not in text
 
 
-def test_stops_are_told_with_their_chain(tmp_path):
+def test_stops_are_reported_with_their_chain(tmp_path):
     file = tmp_path / "run.mcap"
     writer = Writer(file)
     writer.put(t.GATE, gate(SECOND, 0))
