@@ -275,6 +275,7 @@ def test_a_truck_at_rest_before_a_wall_does_not_set_off():
         rig.tick()
         assert rig.out.speeds == (0.0,)
     assert Reason.OBSTACLE_STOP in rig.out.reasons
+    assert rig.trips == [], "nothing was stopped"
 
 
 def test_what_appears_before_a_truck_that_brakes_is_a_quick_stop():

@@ -149,3 +149,42 @@ def test_the_mode_stays_driving_and_goes_on_when_the_lidar_sees_again():
     rig.unknown = ()
     rig.tick(40)
     assert rig.speed == pytest.approx(0.2)
+
+
+EDGE = np.linspace(-1.0, 1.0, 9)
+LENGTH, WIDTH = Footprint().half_length, Footprint().half_width
+ENDS = [
+    ((1.0, 0.0, 0.0), [(LENGTH + 0.2, y * WIDTH) for y in EDGE]),
+    ((-1.0, 0.0, 0.0), [(-LENGTH - 0.2, y * WIDTH) for y in EDGE]),
+    ((0.0, 1.0, 0.0), [(x * LENGTH, WIDTH + 0.2) for x in EDGE]),
+    ((0.0, -1.0, 0.0), [(x * LENGTH, -WIDTH - 0.2) for x in EDGE]),
+]
+
+
+@pytest.mark.parametrize(("way", "ground"), ENDS)
+@pytest.mark.parametrize("offset", [0.0, 0.1])
+def test_every_part_of_the_outline_travels_over_its_ground(way, ground, offset):
+    visibility = Visibility(Footprint(offset=offset), MOUNT, 0.5)
+    travelled = visibility.travelled(swept_poses(way, np.linspace(0.0, 0.2, 20)))
+    points = np.array(ground) + np.array((offset, 0.0))
+    assert set(visibility.sectors_of(points)) <= set(travelled)
+    middle = points.mean(axis=0)
+    opposite = visibility.sectors_of(np.array([(2 * offset - middle[0], -middle[1])]))
+    assert set(opposite).isdisjoint(travelled)
+
+
+def test_a_turn_on_the_spot_travels_over_the_ground_of_all_corners():
+    visibility = Visibility(Footprint(), MOUNT, 0.5)
+    travelled = visibility.travelled(swept_poses((0.0, 0.0, 5.0), np.linspace(0.0, 0.1, 20)))
+    turned = np.array([math.atan2(y, x) + 0.4 for x in (LENGTH, -LENGTH) for y in (WIDTH, -WIDTH)])
+    corners = math.hypot(LENGTH, WIDTH) * np.column_stack((np.cos(turned), np.sin(turned)))
+    assert set(visibility.sectors_of(corners)) <= set(travelled)
+
+
+def test_a_lidar_that_is_mounted_aside_and_turned_looks_from_there():
+    visibility = Visibility(Footprint(), (0.1, 0.05, math.pi / 2), 0.5)
+    middle = SECTORS // 2
+    (left,) = visibility.sectors_of(np.array([(0.1 - 0.001, 1.05)]))
+    (ahead,) = visibility.sectors_of(np.array([(1.1, 0.05 + 0.001)]))
+    assert left in (middle - 1, middle)
+    assert ahead == middle - SECTORS // 4

@@ -197,6 +197,36 @@ def test_the_end_of_a_session_brakes_and_switches_off_within_its_time():
     on_bench(test)
 
 
+def test_running_again_after_a_quick_stop_needs_no_way_through_power_off():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(6_000)
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.until(lambda: abs(rig.shaft_rpm) < 1)
+            await rig.settle(1.0)
+            before = len(controls(rig))
+            await rig.drive(6_000)
+            assert controls(rig)[before:] == [Control.ENABLE]
+
+    on_bench(test)
+
+
+def test_a_latched_quick_stop_is_left_through_power_off_once_it_has_not_helped_for_a_while():
+    async def test(rig: Rig) -> None:
+        rig.emulator.inject("latch", "on")
+        async with rig.driving():
+            await rig.drive(6_000)
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(1.0)
+            asked = rig.clock.now()
+            await rig.drive(6_000)
+            off = [at for at, word in rig.writes(od.CONTROLWORD) if word == Control.DISABLE_VOLTAGE and at > asked]
+            assert len(off) == 1
+            assert 0.3 < (off[0] - asked) / SECOND < 0.6
+
+    on_bench(test)
+
+
 def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
     async def test(rig: Rig) -> None:
         async with rig.driving():
