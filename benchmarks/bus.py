@@ -106,8 +106,8 @@ def _processes(ping: list[str], echo: list[str], **options: Any) -> Iterator[Pai
 
 @contextmanager
 def zenoh_pair(kind: str) -> Iterator[Pair]:
-    """Ends of ``bus_peers``, each at an address of its own, so that no other's connection happens to have its port."""
-    one, other = (f"tcp/127.1.{next(_ends)}.1:{PORT}" for _ in range(2))
+    """Ends of ``bus_peers``, each at an address and port that no connection or socket of another has."""
+    one, other = (f"tcp/127.1.{end}.1:{PORT + end}" for end in (next(_ends), next(_ends)))
     program = [sys.executable, str(HERE / "bus_peers.py"), kind.removeprefix("quick_")]
     arranged = QUICK if kind.startswith("quick_") else {}
     with _processes([*program, "ping", one, other], [*program, "echo", other, one], env=os.environ | arranged) as pair:

@@ -83,6 +83,17 @@ def test_so_many_names_are_reported_within_one_interval_and_transitions_always()
     assert log.drain()[0].values == {"by": "s0"}, "forgotten with its count"
 
 
+def test_what_is_known_is_counted_however_many_names_there_are():
+    log = EventLog(1.0)
+    for number in range(MAX_KEYS):
+        emit(log, source=f"s{number}")
+    emit(log, 0.5, source="s0")
+    emit(log, 0.6, source="s0")
+    log.drain()
+    emit(log, 1.0, source="s0")
+    assert log.drain()[0].values == {"by": "s0", "repeated": 2}
+
+
 def source(name="ann", inside=False):
     request = DriveRequest(
         **header(NOW), nonce=NONCE, source=name, role=Role.GAMEPAD, lease=1.0, speed=0.1, front=0.0, gate_stamp=NOW

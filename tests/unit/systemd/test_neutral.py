@@ -80,7 +80,7 @@ class Controller:
             os.write(self.master, bytes([byte]))
 
     def close(self):
-        self.thread.join(2.0)
+        self.thread.join(10.0)
         assert not self.thread.is_alive()
         if select.select([self.master], [], [], 0)[0]:
             self.confirmed += os.read(self.master, 100) == b"O"
@@ -221,7 +221,8 @@ def test_every_drive_is_stopped_and_counts(neutral, second):
     assert neutral.main([f"{one.path}=3", f"{other.path}=3"]) == (0 if second == 0 else 1)
     assert one.frames == [BRAKE, SWITCH_OFF]
     one.close()
-    os.close(other.slave)
+    os.close(other.slave)  # ends what the other still waits for
+    other.thread.join(2.0)
     os.close(other.master)
 
 
