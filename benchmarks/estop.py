@@ -53,7 +53,7 @@ RATE = 10_000
 MISSED = 1.0
 DRIVEN = 0.3
 """Seconds of driving before each emergency stop, and a random share of a tick more."""
-PATIENCE = 40.0
+ORDER_TIMEOUT = 40.0
 GOAL_MS = 35.0
 
 
@@ -120,7 +120,7 @@ def flood(kind: str, endpoint: str, nonce: str) -> None:
                     session.get(call, lambda _: None, timeout=0.5)
                 case "forged":
                     state = GateState(
-                        stamp=now, received=now, seq=count, mode=GateMode.DISARMED, nonce="forged", speed_limit=0.0
+                        stamp=now, received=now, seq=count, mode=GateMode.DISARMED, nonce=nonce, speed_limit=0.0
                     )
                     session.put(topics.GATE.key("truck"), state.model_dump_json())
                     session.put(topics.SCAN.key("truck"), rng.bytes(2000))
@@ -180,7 +180,7 @@ async def order(client: TruckClient, what: Order) -> None:
     Raises:
         TruckError, TimeoutError: why it was not carried out in the end.
     """
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + ORDER_TIMEOUT
     while True:
         try:
             await client.order(what, hold=what is Order.ARM)
@@ -195,13 +195,13 @@ async def order(client: TruckClient, what: Order) -> None:
 async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -> float | None:
     """Drive, then one emergency stop; seconds to its quick stop, None if it is missed. Leaves the truck disarmed."""
     await order(client, Order.ARM)
-    with client.subscribe(topics.GATE, latest()) as gate:
-        async with asyncio.timeout(PATIENCE):
+    with client.subscribe(topics.ODOMETRY, latest()) as odometry:
+        async with asyncio.timeout(ORDER_TIMEOUT):
             driven: int | None = None
             while driven is None or time.monotonic_ns() < driven + (DRIVEN + more) * SECOND:
                 await client.drive(0.1 if forward else -0.1, 0.0)
-                state = gate.latest
-                if driven is None and state is not None and state.holder == client.source:
+                moves = odometry.latest is not None and abs(odometry.latest.twist.vx) > 0.02
+                if driven is None and moves:
                     driven = time.monotonic_ns()
                 await asyncio.sleep(0.03)
     await asyncio.sleep(more)
