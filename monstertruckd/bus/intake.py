@@ -30,9 +30,9 @@ MAX_MARKS: Final = 512
 """Commas, and brackets, braces and quotes, of one request: many small objects would take tens of milliseconds."""
 
 MAX_SOURCES: Final = 64
-"""Sources of one topic whose rates are known; the one heard least recently is dropped for a new one."""
+"""Sources whose rates are known; the one heard least recently is dropped for a new one."""
 TOGETHER: Final = 5.0
-"""All sources of a topic together may send so many times what one may: names can be invented."""
+"""All sources together may send so many times what one may: names can be invented."""
 
 _RANKS: Final = {Order.ESTOP: 2, Order.STOP: 1}
 """Where orders have to be dropped, these are the last to go."""
@@ -55,6 +55,50 @@ LIMITS: Final = {
 }
 """All others: ``Limit()``. No order is turned away for its rate, for it may be an emergency stop; a path of 2000 poses
 fits."""
+
+
+@dataclass(slots=True)
+class _Budget:
+    """Requests that may come at once; as many as come in a second at the greatest rate."""
+
+    left: float
+    at: int
+    """When it was true, ns."""
+
+    def spend(self, now: int, rate: float) -> bool:
+        """Take one; False if there is none."""
+        self.left = min(self.left + (now - self.at) / SECOND * rate, rate)
+        self.at = now
+        if self.left < 1.0:
+            return False
+        self.left -= 1.0
+        return True
+
+
+class SourceRates:
+    """Limits what each source may send a second, and all together; callable from any thread.
+
+    Args:
+        rate: requests a second of one source, in bursts of as many.
+        clock: time.
+    """
+
+    def __init__(self, rate: float, clock: Clock) -> None:
+        self._rate = rate
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._budgets: dict[str, _Budget] = {}
+        self._together = _Budget(rate * TOGETHER, clock.now())
+
+    def spend(self, source: str) -> bool:
+        """Count one request of ``source``; False if it has sent too many."""
+        with self._lock:
+            now = self._clock.now()
+            budget = self._budgets.pop(source, None) or _Budget(self._rate, now)
+            if len(self._budgets) >= MAX_SOURCES:
+                del self._budgets[next(iter(self._budgets))]
+            self._budgets[source] = budget
+            return budget.spend(now, self._rate) and self._together.spend(now, self._rate * TOGETHER)
 
 
 class Refusals:
@@ -112,10 +156,7 @@ class Intake:
     ) -> None:
         self.topic = topic
         self._limit = LIMITS.get(topic.name, Limit())
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._budgets: dict[str, _Budget] = {}
-        self._together = _Budget((self._limit.rate or 0.0) * TOGETHER, clock.now())
+        self._rates = None if self._limit.rate is None else SourceRates(self._limit.rate, clock)
         self._refusals = Refusals(bus, clock, reporter)
         self._requests: ThreadHop[Message] = ThreadHop(
             lambda request: guard(lambda: bus.inject(topic, request)), DEPTH, bus.add_drops, _rank
@@ -155,39 +196,12 @@ class Intake:
 
     def charge(self, source: str) -> bool:
         """Count one request of ``source``; False if it has sent too many. Callable from any thread."""
-        rate = self._limit.rate
-        if rate is None:
-            return True
-        with self._lock:
-            now = self._clock.now()
-            budget = self._budgets.pop(source, None) or _Budget(rate, now)
-            if len(self._budgets) >= MAX_SOURCES:
-                del self._budgets[next(iter(self._budgets))]
-            self._budgets[source] = budget
-            return budget.spend(now, rate) and self._together.spend(now, rate * TOGETHER)
+        return self._rates is None or self._rates.spend(source)
 
     def close(self) -> None:
         """Discard what waits and everything to come."""
         self._requests.close()
         self._refusals.close()
-
-
-@dataclass(slots=True)
-class _Budget:
-    """Requests that may come at once; as many as come in a second at the greatest rate."""
-
-    left: float
-    at: int
-    """When it was true, ns."""
-
-    def spend(self, now: int, rate: float) -> bool:
-        """Take one; False if there is none."""
-        self.left = min(self.left + (now - self.at) / SECOND * rate, rate)
-        self.at = now
-        if self.left < 1.0:
-            return False
-        self.left -= 1.0
-        return True
 
 
 def _rank(request: Message) -> int:

@@ -39,7 +39,7 @@ from monstertruck_schemas.topics import (
     sender_in,
 )
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
-from monstertruckd.bus.intake import Intake, Refusals
+from monstertruckd.bus.intake import Intake, Refusals, SourceRates
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import Door, ZenohConfig, doors, session_config
@@ -53,6 +53,8 @@ ORDERS = frozenset(order.value for order in Order)
 MAX_CALLS = 16
 """Remote calls served at once."""
 MAX_WAITING_CALLS = 64
+CALL_RATE = 100.0
+"""Calls a second of one source that are not orders."""
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
@@ -209,6 +211,7 @@ class ZenohBridge:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
         tokens = []
+        rates = SourceRates(CALL_RATE, self._clock)
         for door, session in self._sessions:
             for group in in_groups():
                 # One for all requests, so that a put to many keys comes once.
@@ -222,7 +225,7 @@ class ZenohBridge:
                 if topic.retained:
                     session.declare_queryable(key, partial(self._on_get, topic, key), allowed_origin=remote)
             session.declare_queryable(
-                rpc_key(self._robot, "**"), partial(_on_call, door, queries), allowed_origin=remote
+                rpc_key(self._robot, "**"), partial(self._on_call, door, queries, rates), allowed_origin=remote
             )
             tokens.append(session.liveliness().declare_token(alive_key(self._robot)))
         return tokens
@@ -264,9 +267,23 @@ class ZenohBridge:
             if (newest := self._bus.newest(topic)) is not None:
                 query.reply(key, wire.encode(topic, newest), encoding=wire.encoding(topic))
 
-    def _serve(self, query: zenoh.Query, door: Door, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
+    def _called(self, query: zenoh.Query) -> tuple[str, str | None]:
+        """Name and source of a call."""
         key = str(query.key_expr)
-        name, source = sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
+        return sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
+
+    def _on_call(self, door: Door, queries: ThreadHop[Call], rates: SourceRates, query: zenoh.Query) -> None:
+        size = 0 if query.payload is None else len(query.payload)
+        name, source = self._called(query)
+        if size > MAX_CALL:
+            _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
+        elif name not in ORDERS and not rates.spend(source or ANONYMOUS):
+            _refuse(query, Reason.BUSY, f"more than {CALL_RATE:g} calls a second")
+        else:
+            queries.put((query, door))
+
+    def _serve(self, query: zenoh.Query, door: Door, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
+        name, source = self._called(query)
         if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
             _refuse(query, Reason.BUSY, "too many calls at once")
             return
@@ -308,14 +325,6 @@ def _sender(door: Door, source: str | None) -> Sender:
 
 def _last(name: str) -> str:
     return name.rpartition("/")[2]
-
-
-def _on_call(door: Door, queries: ThreadHop[Call], query: zenoh.Query) -> None:
-    size = 0 if query.payload is None else len(query.payload)
-    if size > MAX_CALL:
-        _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
-    else:
-        queries.put((query, door))
 
 
 def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:

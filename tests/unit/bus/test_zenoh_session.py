@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, TO
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, doors, session_config
-from monstertruckd.bus.zenoh_session import MAX_CALL, ZenohBridge
+from monstertruckd.bus.zenoh_session import CALL_RATE, MAX_CALL, ZenohBridge
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
 
@@ -259,6 +260,24 @@ async def test_a_slow_call_does_not_hold_up_others_and_too_many_are_refused():
             assert await asyncio.to_thread(lambda: [bool(next(iter(w)).ok) for w in waiting]) == [True] * 16
             accepted = await asyncio.to_thread(ask, "topics")
     assert (refused, accepted) == ("busy", "ok")
+
+
+async def test_a_flood_of_calls_is_refused_by_its_rate_and_keeps_off_neither_others_nor_orders():
+    async with running_robot() as robot:
+        robot.rpc.register("estop", AsyncMock(return_value={}))
+        with raw_session(robot.endpoint) as station:
+
+            def texts(key: str, count: int = 1) -> list[str]:
+                asked = [station.get(f"mt/truck/rpc/{key}", payload=b"{}", timeout=2.0) for _ in range(count)]
+                replies = [reply for answer in asked for reply in answer]
+                return ["ok" if reply.ok else json.loads(reply.err.payload.to_bytes())["text"] for reply in replies]
+
+            flood = asyncio.create_task(asyncio.to_thread(texts, "topics/eve", round(4 * CALL_RATE)))
+            order = await asyncio.to_thread(texts, "estop/eve")
+            answers = await flood
+            other = await asyncio.to_thread(texts, "topics/ann")
+    assert order == other == ["ok"]
+    assert answers.count("more than 100 calls a second") > 2 * CALL_RATE
 
 
 async def test_calls_with_huge_payloads_are_refused_before_anybody_parses_them():
