@@ -241,29 +241,37 @@ def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":
 
 
 def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list["SlamEstimate"]]:
-    """Run every scan through the worker; returns facts to print, and the estimates."""
+    """Run every scan through the worker; returns facts to print, and the estimates.
+
+    Raises:
+        InputError: no scan could be used.
+    """
     from monstertruck_estimation.slam.worker_io import Start, WorkerInput
+    from monstertruck_runtime.errors import InputError
 
     first = log.scans[0].odom or (0.0, 0.0, 0.0)
     worker.step(WorkerInput(start=Start(config, first)))
     estimates: list[SlamEstimate] = []
-    refused = 0
+    refused: list[str] = []
     counts: dict[str, int] = {}
     with progress("scans", len(log.scans)) as advance:
         for number, scan in enumerate(log.scans, start=1):
             outputs: WorkerOutput = worker.step(WorkerInput(scan=scan))
-            refused += outputs.refused is not None
+            if outputs.refused is not None:
+                refused.append(outputs.refused)
             counts = outputs.counts
             if outputs.estimate is not None:
                 estimates.append(outputs.estimate)
             advance(number)
+    if len(refused) == len(log.scans):
+        raise InputError(f"{log.make} log: none of its {len(refused)} scans can be used; the last one: {refused[-1]}")
     statuses = Counter(estimate.status.value for estimate in estimates)
     offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
     facts: dict[str, Any] = {
         "log": log.make,
         "seconds": (log.scans[-1].stamp - log.scans[0].stamp) / 1e9,
         **counts,
-        "left_out": refused,
+        "left_out": len(refused),
         "standing": dict(statuses),
         "odometry_ahead_s": offsets[-1] if offsets else None,
     }

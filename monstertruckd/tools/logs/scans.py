@@ -26,6 +26,8 @@ BEGIN: Final = SECOND
 LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
 SHORTEST_RANGE: Final = 0.02
+LONGEST_LOG: Final = 1e9
+"""A longer npz log has other units than seconds, s."""
 NO_RETURN_SHARE: Final = 0.001
 """The greatest range of an npz log means no return if at least this share of its beams has it."""
 URG_STEP: Final = math.tau / 1024
@@ -148,8 +150,11 @@ def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
         raise InputError(f"{path}: t: expected finite seconds, got {times[bad[0]]} in row {bad[0]}")
-    if not np.isfinite(ranges).any():
-        raise InputError(f"{path}: ranges: expected metres, got no finite value")
+    span = float(np.ptp(times))
+    if span > LONGEST_LOG:
+        raise InputError(f"{path}: t: expected seconds, got a log of {span:g} s")
+    if not (np.isfinite(ranges) & (ranges > 0)).any():
+        raise InputError(f"{path}: ranges: expected metres, got no finite value above 0")
     shapes: dict[str, tuple[int, ...]] = {item.name: () for item in fields(LogGeometry)} | {"mount": (3,)}
     own = {name: _array(path, arrays, name, shape) for name, shape in shapes.items() if name in arrays}
     known = {name: _vector(value) if name == "mount" else float(value) for name, value in own.items()} | given

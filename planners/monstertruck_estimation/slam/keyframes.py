@@ -233,7 +233,7 @@ class KeyframeMap:
     def joined(self) -> NDArray[np.bool_]:
         """Which keyframes are related to the first one, shape (n,)."""
         labels = parts(self.edges.edges(), len(self))
-        return np.asarray(labels == labels[0])
+        return np.asarray(labels == labels[:1])
 
     def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
         """Add the edge from the last keyframe but one to the last."""

@@ -90,6 +90,15 @@ def test_the_worker_gives_memory_back_when_the_map_is_thinned(monkeypatch: pytes
     assert pruned > 2
 
 
+def test_a_map_without_a_scan_ends_with_a_sentence(tmp_path: Path):
+    worker = SlamWorker()
+    worker.step(WorkerInput(start=Start(SlamConfig())))
+    done = worker.step(WorkerInput(finish=True, whole=True, save=tmp_path / "map", trajectory=True))
+    assert done.saved is None
+    assert done.error == f"{tmp_path / 'map'}: nothing is mapped yet"
+    assert not (tmp_path / "map").exists()
+
+
 def test_a_saved_map_reads_back(saved: Path):
     loaded = storage.load(saved)
     assert loaded.graph is not None

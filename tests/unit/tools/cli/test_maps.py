@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_runtime.map_files import WorldMap, save_map
 from monstertruckd.tools.cli.main import app
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges, rounds
 
@@ -41,10 +42,33 @@ def test_a_trajectory_with_the_geometry_that_was_given(log: Path, tmp_path: Path
     assert json.loads(found.stdout)["localised"] > 10
 
 
-def test_bad_arrays_are_one_sentence(log: Path, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("times", "ranges", "said"),
+    [
+        (np.arange(3.0), np.nan, "ranges: expected metres, got no finite value"),
+        (np.arange(3.0), -1.0, "ranges: expected metres, got no finite value above 0"),
+        (1e11 * np.arange(3.0), 1.0, "t: expected seconds, got a log of 2e+11 s"),
+    ],
+)
+def test_bad_arrays_are_one_sentence(tmp_path: Path, times: np.ndarray, ranges: float, said: str):
     file = tmp_path / "bad.npz"
-    np.savez(file, t=np.arange(3.0), ranges=np.full((3, BEAMS), np.nan))
+    np.savez(file, t=times, ranges=np.full((3, BEAMS), ranges))
     result = CliRunner().invoke(app, ["map", "build", str(file), "-o", str(tmp_path / "map")])
     assert result.exit_code != 0
-    assert "bad.npz: ranges: expected metres" in result.output
+    assert f"bad.npz: {said}" in result.output
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("command", ["build", "localise"])
+def test_a_log_without_a_usable_scan_is_one_sentence(log: Path, tmp_path: Path, command: str):
+    file, grid = tmp_path / "short.npz", tmp_path / "map.yaml"
+    rows = np.full((3, BEAMS), np.inf)
+    rows[:, 0] = 2.0
+    np.savez(file, t=np.arange(3.0), ranges=rows)
+    save_map(WorldMap(np.pad(np.zeros((40, 40), np.int8), 2, constant_values=100), 0.05, (0.0, 0.0)), grid)
+    place = ["-o", str(tmp_path / "map")] if command == "build" else [str(grid)]
+    result = CliRunner().invoke(app, ["map", command, str(file), *place])
+    assert result.exit_code != 0
+    assert f"none of its 3 scans can be used; the last one: only 0 of {BEAMS} beams" in result.output.replace("\n", " ")
+    assert "Traceback" not in result.output
+    assert not (tmp_path / "map").exists()
