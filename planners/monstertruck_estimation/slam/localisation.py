@@ -41,8 +41,8 @@ MAX_CONTRADICTION: Final = 0.3
 """Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
 CHECKED_WAY: Final = (3.0, 9.0)
 """Way after which the search that confirms a place found ends, and after which it ends without having done so, m."""
-CHECK_TOLERANCE: Final = (0.5, 0.2)
-"""The search and the tracked pose are the same place if they differ by less, m and rad."""
+SAME_PLACE: Final = (0.5, 0.2)
+"""Two poses are of the same place if they differ by less, m and rad."""
 
 
 def submap_of(saved: SavedMap) -> Submap:
@@ -168,6 +168,8 @@ class LocalisationEstimator:
         if fits:
             evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
             fits = evidence.contradiction <= MAX_CONTRADICTION
+        if match.accepted and not fits and _apart(match.pose, guess):
+            match = rejected(guess, covariance, MatchStatus.FAR)
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
         self._misfits = 0 if fits else self._misfits + 1
         self.counts["rejected"] += not match.accepted
@@ -196,17 +198,19 @@ class LocalisationEstimator:
         """Whether the check says that the robot is not at ``pose``; it ends when it has confirmed the place."""
         assert self._global is not None
         self._checked += math.hypot(delta[0], delta[1])
-        elsewhere = False
-        if found is not None:
-            off = between(pose, found)
-            elsewhere = math.hypot(off[0], off[1]) > CHECK_TOLERANCE[0] or abs(float(off[2])) > CHECK_TOLERANCE[1]
-        if not (elsewhere or self._global.outside):
+        if (found is None or not _apart(pose, found)) and not self._global.outside:
             if self._checked >= CHECKED_WAY[0 if found is not None else 1]:
                 self._global = None
             return False
         self._global, self._tracking = self._search_anew(), False
         self.counts["searches"] += 1
         return True
+
+
+def _apart(one: Array, other: Array) -> bool:
+    """Whether two poses are not of the same place."""
+    off = between(one, other)
+    return math.hypot(off[0], off[1]) > SAME_PLACE[0] or abs(float(off[2])) > SAME_PLACE[1]
 
 
 def patch_of(saved: SavedMap) -> GridPatch:

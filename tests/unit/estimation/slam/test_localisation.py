@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam import localisation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
+from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import SavedMap
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
@@ -94,3 +96,21 @@ def test_a_wrong_place_is_refuted_within_metres():
     beyond = [k for k, pose in enumerate(truth) if pose[0] > 4.0]
     assert estimates[-1].status not in {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE}
     assert any(estimates[k].status not in PLACED for k in beyond)
+
+
+@pytest.mark.parametrize(
+    ("away", "overlap", "taken"), [((0.0, 0.0), 0.95, True), ((2.0, 0.3), 0.95, False), ((2.0, 0.3), 0.5, False)]
+)
+def test_a_match_elsewhere_counts_only_if_all_of_it_fits(monkeypatch, away, overlap, taken):
+    """A robot that leaves the map must not be moved back into it, to where half a scan fits."""
+    truth = rounds(80, laps=0.6)[0]
+    said, believed = truth + np.array((*away, 0.0)), truth + np.array((1.0, 0.0, 0.0))
+
+    class Matcher:
+        def match(self, _scan, _delta, guess, covariance, _submap):
+            return ScanMatch(said, covariance, overlap, 0.01, 1.0, 0.0, MatchStatus.ACCEPTED, np.eye(3))
+
+    monkeypatch.setattr(localisation, "PlanarMatcher", Matcher)
+    estimate = followed(SavedMap(drawn(), None), ROOM, [truth], start=tuple(believed.tolist()))[-1]
+    assert np.array(estimate.pose) == pytest.approx(said if taken else believed)
+    assert ("rejected" in estimate.events) is not taken
