@@ -4,11 +4,12 @@
                                   [--minutes M] [--again] [--list]
 
 Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``), or a seeded sample of them, meets
-the unit tests that reach its line, those that found others of its function first, then the quick ones; which tests
-reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet all tests of their
-part, those that reach a line with the same names first. A mutant that outlasts its time (three times its tests', and
-10 s) is counted apart. Mutants are judged in the order drawn, so those of a run that ended early (``--minutes``) are a
-sample as well. Results are kept, so an interrupted run goes on; ``--again`` judges survivors anew.
+the unit tests that reach its function: those that found others there first, then those that reach its line, then the
+quick ones; which tests reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet
+all tests of their part, those that reach a line with the same names first. A mutant with which one test, or all of
+them, take more than three times their time and 10 s is counted apart. Mutants are judged in the order drawn, so those
+of a run that ended early (``--minutes``) are a sample as well. Results are kept, so an interrupted run goes on;
+``--again`` judges survivors anew.
 ``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
 The score is killed of killed and survived, with its 95 % interval (Wilson).
 """
@@ -61,7 +62,7 @@ TARGETS = {
 
 GOAL = 0.97
 MARGIN = 10.0
-"""Seconds of processor time a mutant may take beyond three times its tests'."""
+"""Seconds of processor time that tests of a mutant may take beyond three times their own."""
 FIRST = 20
 """Tests whose files are imported first for a mutant that runs on import."""
 COMMON = frozenset(("self", "Final", "None", "True", "False", "float", "Annotated", "Field", "Positive", "Reason"))
@@ -84,10 +85,10 @@ class Baseline:
     """Of every test."""
 
     def tests(self, mutant: Mutant, sources: dict[str, bytes]) -> tuple[list[str], bool]:
-        """Tests that reach a mutant, likely and quick ones first, and whether its line runs on import."""
+        """Tests that reach a mutant's function, likely and quick ones first, and whether its line runs on import."""
         lines = self.lines[mutant.file]
         found = set(lines.get(mutant.line) or lines.get(mutant.statement) or ())
-        likely: set[str] = set()
+        likely = set(found)
         if on_import := "" in found:
             found = {test for test in self.seconds if test.startswith(TARGETS[mutant.file])}
             text = sources[mutant.file].decode().splitlines()
@@ -96,6 +97,8 @@ class Baseline:
                 for number, line in enumerate(source.decode().splitlines(), 1):
                     if names & set(re.findall(r"\w{4,}", line)):
                         likely.update(self.lines[file].get(number, ()))
+        else:  # a tracer misses lines of a coroutine that an exception was thrown into
+            found.update(test for line in mutant.scope for test in lines.get(line, ()) if test)
         return sorted(found, key=lambda test: (test not in likely, self.seconds[test], test)), on_import
 
     def first(self, tests: list[str], most: float) -> list[str]:
@@ -209,14 +212,15 @@ def judged(
         before = killers[mutant.file, mutant.where]
         reached = baseline.first(sorted(reached, key=lambda test: -before[test]), options.most)
         sound, faulty = sources[mutant.file].decode(), mutant.applied(sources[mutant.file]).decode()
+        limits = {test: 3 * baseline.seconds[test] + MARGIN for test in reached}
         seconds = 3 * sum(baseline.seconds[test] for test in reached) + MARGIN
         pair = idle.get()
         try:
             verdict, test = COLD, ""
             if not on_import:
-                verdict, test = pair["warm"].judge(mutant.file, sound, faulty, reached, seconds)
+                verdict, test = pair["warm"].judge(mutant.file, sound, faulty, limits, seconds)
             if verdict == COLD:
-                for chosen in (reached[:FIRST], reached):
+                for chosen in (dict(islice(limits.items(), FIRST)), limits):
                     verdict, test = pair["cold"].judge(mutant.file, sound, faulty, chosen, seconds)
                     if verdict != SURVIVED:
                         break
@@ -251,7 +255,7 @@ def _check(pair: dict[str, Server], baseline: Baseline, sources: dict[str, bytes
     file, source = next(iter(sources.items()))
     test = next(test for test in baseline.seconds if test.startswith(TARGETS[file]))
     for kind, server in pair.items():
-        if (verdict := server.judge(file, source.decode(), source.decode(), [test], 120.0)[0]) != SURVIVED:
+        if (verdict := server.judge(file, source.decode(), source.decode(), {test: 120.0}, 120.0)[0]) != SURVIVED:
             sys.exit(f"{test} of the sound project, {kind}: {verdict}")
 
 

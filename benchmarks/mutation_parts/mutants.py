@@ -70,6 +70,8 @@ class Mutant:
     after: str
     span: tuple[int, int]
     """Bytes of the source that ``after`` replaces."""
+    scope: range
+    """Lines of ``where``."""
 
     @property
     def key(self) -> str:
@@ -97,6 +99,7 @@ class _Finder(ast.NodeVisitor):
         lines = source.splitlines(keepends=True)
         self._starts = [sum(map(len, lines[:i])) for i in range(len(lines) + 1)]
         self._path: list[str] = []
+        self._scope = range(1, len(lines) + 1)
         self._statement = 0
 
     def visit(self, node: ast.AST) -> None:
@@ -123,13 +126,14 @@ class _Finder(ast.NodeVisitor):
             return
         after = after if isinstance(node, ast.stmt) or after.isidentifier() else f"({after})"
         where = ".".join(self._path) or "module"
-        self.found.append(
-            Mutant(self._file, node.lineno, self._statement, operator, where, before, after, self._span(node))
-        )
+        place = self._file, node.lineno, self._statement
+        self.found.append(Mutant(*place, operator, where, before, after, self._span(node), self._scope))
 
     # Statements
 
     def _named(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> None:
+        assert node.end_lineno is not None
+        outer, self._scope = self._scope, range(node.lineno, node.end_lineno + 1)
         self._path.append(node.name)
         for statement in node.body:
             self.visit(statement)
@@ -137,6 +141,7 @@ class _Finder(ast.NodeVisitor):
             for default in (*node.args.defaults, *(d for d in node.args.kw_defaults if d is not None)):
                 self.visit(default)
         self._path.pop()
+        self._scope = outer
 
     visit_FunctionDef = visit_AsyncFunctionDef = visit_ClassDef = _named  # noqa: N815
 

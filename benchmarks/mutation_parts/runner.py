@@ -69,8 +69,16 @@ class Server:
             cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    def judge(self, file: str, sound: str, faulty: str, tests: list[str], seconds: float) -> tuple[str, str]:
-        """What becomes of a faulty ``file`` within the time given, and the test that found it; COLD: it cannot say."""
+    def judge(self, file: str, sound: str, faulty: str, tests: dict[str, float], seconds: float) -> tuple[str, str]:
+        """What becomes of a faulty ``file``, and the test that found it; COLD: it cannot say.
+
+        Args:
+            file: relative to the project.
+            sound: its source.
+            faulty: the mutant's.
+            tests: in their order, each with the processor time it may take, s.
+            seconds: of processor time for all of them.
+        """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         order = {"file": file, "sound": sound, "faulty": faulty, "tests": tests, "seconds": seconds}
@@ -124,6 +132,7 @@ class _Served:
             found = _FirstFailure([])
             session.config.pluginmanager.register(found)
             for item, following in pairwise([*(items[test] for test in order["tests"]), None]):
+                _limit(order["tests"][item.nodeid])
                 session.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if found.test:
                     return 1, found.test
@@ -131,6 +140,13 @@ class _Served:
 
         _serve(self._orders, self._answers, run)
         return True
+
+
+def _limit(seconds: float) -> None:
+    """End this process after so much more processor time, or ``SHARE`` times as much by the clock."""
+    used, hard = time.process_time(), resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (min(math.ceil(used + seconds), hard), hard))
+    signal.setitimer(signal.ITIMER_REAL, SHARE * seconds)
 
 
 def _exchange(functions: Collection[FunctionType], sound: str, faulty: str, path: str) -> None:
@@ -172,7 +188,7 @@ def _cold(order: dict[str, Any]) -> tuple[int, str]:
         return compile(source, path, "exec", dont_inherit=True) if faulty else sound(loader, fullname)
 
     SourceFileLoader.get_code = get_code  # type: ignore[method-assign, assignment]
-    found = _FirstFailure(order["tests"])
+    found = _FirstFailure(list(order["tests"]))
     files = sorted({test.split("::")[0] for test in order["tests"]})
     return int(pytest.main(["-x", *OPTIONS, *files], plugins=[found])), found.test
 

@@ -135,7 +135,7 @@ class Gate:
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
-        self._steering_check = SteeringCheck(config.turning) if config.turning is not None and chassis.steered else None
+        self._steering_check = SteeringCheck(config.turning) if config.turning is not None else None
         self._shaft_check = ShaftCheck(config.blocked) if config.blocked is not None else None
         self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check, self._shaft_check)
         self._events = EventLog(config.event_interval)
@@ -180,7 +180,7 @@ class Gate:
     def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
         """Take the newest feedback of a driven shaft."""
         self._sensors.observe_drive(feedback, shaft)
-        if self._shaft_check is not None and self._states.active:
+        if self._shaft_check is not None:
             measured = self._chassis.drivetrain.speed(feedback.velocity)
             self._shaft_check.observe(feedback, shaft, self._motion.shaft_speeds[shaft], measured)
 

@@ -73,7 +73,6 @@ class MaestroDriver:
         if battery is not None and config.battery is not None:
             self._battery = BatteryInput(config.battery, BatteryMonitor(config.battery, battery, events, name, drive))
         self._angles = [0.0] * len(config.servos)
-        self._start_session()
 
     def _start_session(self) -> None:
         self._command: SteeringCommand | None = None

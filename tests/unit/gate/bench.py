@@ -5,6 +5,7 @@ from collections import deque
 from contextlib import asynccontextmanager
 
 from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Role
 from monstertruckd.gate.latch import MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
@@ -45,7 +46,7 @@ class Outbox:
 class Bench:
     """A gate service with every sensor alive."""
 
-    def __init__(self, clock, latch=None, state=None):
+    def __init__(self, clock, latch=None, state=None, offload=in_thread):
         self.clock = clock
         self.latch = latch or MemoryLatch()
         self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
@@ -63,7 +64,9 @@ class Bench:
         )
         gate = make_gate(self.latch.engaged())
         self.boxes = []
-        self.service = GateService(gate, 50, clock, inputs, self.out, self.note, self.latch, black_box=self.keep)
+        self.service = GateService(
+            gate, 50, clock, inputs, self.out, self.note, self.latch, black_box=self.keep, offload=offload
+        )
 
     def note(self, reason, severity, source, text="", **values):
         self.events.append((reason, source, text, values))
@@ -125,9 +128,9 @@ class Bench:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def on_bench(scenario, latch=None):
+def on_bench(scenario, latch=None, offload=in_thread):
     async def main(clock):
-        bench = Bench(clock, latch)
+        bench = Bench(clock, latch, offload=offload)
         async with bench.running():
             await scenario(bench)
         return bench

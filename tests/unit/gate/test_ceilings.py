@@ -19,6 +19,11 @@ from monstertruckd.gate.config import (
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 BODY = BodyLimits(length=0.47, mass=7.25, pull=25.0, motor_speed=0.2196, sight=3.9)
 STRONG = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=3.9)
+ACCELERATIONS = ("acceleration", "deceleration", "quick_deceleration")
+TIMES = (
+    *(f"{sensor}.stale_after" for sensor in ("scan", "drive", "steering", "attitude")),
+    *("max_latency", "reaction", "tick_stall", "max_request_age"),
+)
 NOT_LIMITS = {
     "leases", "remote_trackers", "scan", "drive", "steering", "attitude", "battery", "tolerated_failures", "tilt",
     "turning", "blocked", "obstacle", "event_interval", "steering_rate",
@@ -55,6 +60,37 @@ def test_the_defaults_are_within_all_ceilings_and_weaken_nothing():
 )
 def test_what_a_body_cannot_do_is_refused_by_name(config, expected):
     assert refusals(**config)[0].startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("speed", BODY.motor_speed), *((name, BODY.acceleration) for name in ACCELERATIONS)]
+)
+def test_a_ceiling_is_still_within_it_up_to_rounding(name, limit):
+    unchecked = GateConfig().model_copy
+    for excess, found in ((0.0, []), (0.5e-9, []), (1.5e-9, [f"gate.{name}"])):
+        refused = beyond(unchecked(update={name: limit + excess}), BODY)
+        assert [text.split()[0] for text in refused] == found
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_a_time_is_at_most_that_of_its_own_length(name):
+    body = BodyLimits(length=0.5, mass=7.25, pull=25.0, motor_speed=None, sight=1e3)
+    for seconds, found in ((2.0, []), (2.0001, [f"gate.{name}"])):
+        config = GateConfig(speed=0.25)
+        if name.endswith(".stale_after"):
+            section = name.split(".")[0]
+            update = {section: getattr(config, section).model_copy(update={"stale_after": seconds})}
+        else:
+            update = {name: seconds}
+        assert [text.split()[0] for text in beyond(config.model_copy(update=update), body)] == found
+
+
+def test_the_distance_to_standstill_and_the_speed_in_reverse_may_be_as_much_as_their_limits():
+    config = GateConfig(reverse_speed=0.21)
+    needed = stopping_distance(config)
+    assert list(beyond(config, BodyLimits(0.47, 7.25, 25.0, None, needed))) == []
+    assert len(list(beyond(config, BodyLimits(0.47, 7.25, 25.0, None, needed - 1e-9)))) == 1
+    assert list(beyond(config, BodyLimits(needed, 7.25, 25.0, None, None))) == []
 
 
 def test_a_fast_truck_must_stop_within_what_its_lidar_sees():
@@ -98,6 +134,13 @@ def changed(name, factor):
     return weakened(section if len(path) == 1 else config.model_copy(update={path[0]: section}))
 
 
+@pytest.mark.parametrize("sensor", ["scan", "drive", "steering", "attitude"])
+def test_every_sensor_that_may_be_silent_is_named(sensor):
+    section = getattr(GateConfig(), sensor).model_copy(update={"critical": False})
+    (text,) = weakened(GateConfig().model_copy(update={sensor: section}))
+    assert text.startswith(f"gate.{sensor}.critical false")
+
+
 def test_no_setting_is_forgotten():
     judged = {name for name in (*WEAKER_ABOVE, *WEAKER_BELOW) if "." not in name}
     assert judged | NOT_LIMITS == set(GateConfig.model_fields)
@@ -107,12 +150,16 @@ def test_sensors_checks_and_services_that_are_switched_off_are_named():
     config = GateConfig(
         scan={"stale_after": 0.25, "critical": False},
         turning=None,
+        blocked=None,
+        obstacle={"open_ground": True},
         tolerated_failures=("camera", "slam"),
         remote_trackers=("desk",),
     )
     assert weakened(config) == (
         "gate.scan.critical false: a silent sensor does not stop the truck",
         "gate.turning null: servos without supply are not noticed",
+        "gate.blocked null: a blocked shaft is not noticed",
+        "gate.obstacle.open_ground true: a scan without any range counts as free ground",
         "gate.tolerated_failures: slam may fail while the truck drives",
         "gate.remote_trackers: desk may drive from outside",
     )

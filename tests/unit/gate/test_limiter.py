@@ -13,7 +13,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import MAX_SPEED, POSES, TWIST_STEP, Motion, ObstacleGuard
+from monstertruckd.gate.limiter import MAX_SPEED, POSES, TWIST_STEP, Motion, ObstacleGuard, _same
 from tests.unit.gate.rig import BODIES, CHASSIS, NONCE, TICK, Rig, Robot, header, scan
 
 MS = SECOND // 1000
@@ -67,7 +67,7 @@ def test_no_corner_moves_further_between_two_poses_than_the_base_does_straight_o
     assert moved.max() <= REACH / (POSES - 1) * 1.05
 
 
-@pytest.mark.parametrize(("later", "kept"), [(100 * MS, True), (250 * MS, True), (250 * MS + 1, False)])
+@pytest.mark.parametrize(("later", "kept"), [(1, True), (250 * MS, True), (250 * MS + 1, False)])
 def test_an_obstacle_is_kept_while_its_sector_is_not_seen_and_the_view_before_is_not_too_old(later, kept):
     checked = guard()
     free = looked(checked, (FRONT + 0.2, 0.0))
@@ -163,6 +163,29 @@ def test_any_angle_of_a_request_is_taken_as_a_bounded_one(sign):
     assert found.twist[2] * sign > 0
     found = motion().target(asked(front=0.0, rear=sign * 100.0))
     assert found.twist[2] * sign < 0
+
+
+def test_angles_within_all_limits_are_those_asked_for():
+    front, rear = 0.1234, -0.0567
+    assert motion().target(asked(front=front, rear=rear)).angles == (front, rear)
+
+
+@pytest.mark.parametrize("lacking", [(0.9e-4, 0.0), (1.1e-4, 0.0), (0.0, -1.1e-4), (-1.1e-4, 0.0), (0.0, 0.0)])
+def test_a_servo_that_lacks_part_of_its_angle_is_at_its_limit_whichever_it_is(lacking, monkeypatch):
+    def reached(_chassis, angles):
+        return tuple(angle - less for angle, less in zip(angles, lacking, strict=True))
+
+    monkeypatch.setattr(type(CHASSIS), "reached", reached)
+    found = motion().target(asked(front=0.1, rear=-0.05))
+    assert found.saturated == found.clipped == (max(map(abs, lacking)) > 1e-4)
+
+
+@pytest.mark.parametrize(("excess", "clipped"), [(0.5e-6, False), (1.5e-6, True)])
+def test_what_is_beyond_a_limit_by_rounding_is_not_clipped(excess, clipped):
+    rig = Rig().driving(speed=0.21 * (1 + excess))
+    assert (Reason.CLIPPED in rig.out.reasons) is clipped
+    assert _same((1.0, 1.0 + excess, 0.0), (1.0, 1.0, 0.0)) is not clipped
+    assert _same((1.0, 1.0, excess), (1.0, 1.0, 0.0)) is not clipped
 
 
 def test_a_twist_the_body_can_do_is_not_clipped():

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +14,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.requests import parse_request
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import GATE, REQ_CONTROL, Writer
 from monstertruckd.bus.local import Bus
@@ -101,6 +103,12 @@ def test_a_gate_that_does_not_tick_gives_no_answer():
             await bench.call("disarm")
 
     run_virtual(main)
+
+
+def test_an_observer_may_order_an_emergency_stop_and_nothing_else():
+    roles = {}
+    gate_rpc.register(SimpleNamespace(register=lambda name, _, role: roles.update({name: role})), None, None)
+    assert roles == {order.value: AccessRole.OBSERVER if order is Order.ESTOP else AccessRole.PILOT for order in Order}
 
 
 def test_stop_is_answered_at_rest_and_leaves_the_truck_armed():

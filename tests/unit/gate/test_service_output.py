@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_runtime.threads import inline
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
@@ -178,7 +179,7 @@ def test_the_latch_is_tried_again_every_second_and_marked_until_it_is_stored():
         errors = [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
         assert errors == ["the emergency stop's latch could not be stored: disk"] * 2
 
-    on_bench(scenario, disk)
+    on_bench(scenario, disk, inline)
     assert disk.closed == 1
 
 

@@ -59,8 +59,15 @@ def test_standing_still_proves_nothing(check):
 def test_a_reset_forgets(check):
     drive(check, 5.0, turning=0.0)
     check.reset()
-    assert not check.dead
+    assert (check.dead, check.difference) == (False, 0.0)
     assert drive(check, 5.0, start=60 * SECOND) is None
+
+
+def test_a_reset_forgets_what_was_compared_just_before(check):
+    found = drive(check, 5.0, turning=0.0)
+    check.reset()
+    check.observe(round(found * SECOND) + PERIOD, 0.0, SPEED, RATE)
+    assert not check.dead
 
 
 def test_a_heading_that_jumps_is_the_compass(check):
@@ -109,6 +116,23 @@ def test_the_window_begins_anew_at_a_jump(check):
     assert check.difference == 0.0
     check.observe(round(0.8 * SECOND), 1.0 - 0.601 - 0.05, SPEED, 0.0)
     assert check.difference == pytest.approx(0.05)
+
+
+def test_what_lies_before_a_jump_is_not_compared_with_what_comes_after(check):
+    stamp, heading = 0, 0.0
+
+    def turn(by, steps):
+        nonlocal stamp, heading
+        for _ in range(steps):
+            stamp, heading = stamp + PERIOD, heading - by / steps
+            check.observe(stamp, heading % (2 * math.pi), SPEED, 0.0)
+
+    turn(0.13, 10)
+    turn(0.0, 45)
+    turn(1.0, 1)
+    turn(-0.13, 10)
+    assert check.difference == pytest.approx(-0.13)
+    assert not check.dead
 
 
 def test_headings_half_a_second_apart_are_compared_and_no_further(check):
@@ -189,11 +213,16 @@ def test_it_can_be_configured_not_to_look():
     assert rig.out.mode is GateMode.DRIVING
 
 
-def test_a_disarmed_truck_may_be_carried_about():
+@pytest.mark.parametrize("speed", [0.0, 0.2])
+def test_a_disarmed_truck_may_be_carried_or_pushed_about(speed):
     rig = Rig()
+    rig.silent = {"attitude"}
     for step in range(100):
+        rig.speed = speed
         rig.tick()
         rig.gate.observe_attitude(Attitude(**header(rig.now), heading=step * 0.02, roll=0.0, pitch=0.0))
+    rig.silent, rig.speed = set(), 0.0
+    rig.sense()
     assert rig.order(Order.ARM) == "ok"
 
 

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import SECTORS, Visibility
+from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility
 from tests.unit.gate.rig import Rig, scan
 
 MOUNT = (0.14, 0.0, 0.0)
@@ -188,3 +188,88 @@ def test_a_lidar_that_is_mounted_aside_and_turned_looks_from_there():
     (ahead,) = visibility.sectors_of(np.array([(1.1, 0.05 + 0.001)]))
     assert left in (middle - 1, middle)
     assert ahead == middle - SECTORS // 4
+
+
+# Sectors at their limits: a lidar at the origin with four beams to a sector, each in the middle of its quarter
+
+
+BEAMS = 4
+FAR, CLOSE = 2.0, 0.1
+MIDDLE = SECTORS // 2
+
+
+def looked(visibility, ranges, codes=None, *, stamp=SECOND, first=MIDDLE * BEAMS, left=True):
+    """When each sector of the field was seen, after a scan whose beams begin at the ``first`` one from the rear."""
+    step = SECTOR / BEAMS
+    ends = [-math.pi + (first + i + 0.5) * step for i in (0, len(ranges) - 1)]
+    begin, end = ends if left else reversed(ends)
+    codes = [255 if math.isfinite(distance) else 7 for distance in ranges] if codes is None else codes
+    arrays = {"ranges": np.array(ranges), "codes": np.array(codes, dtype=np.uint8)}
+    message = scan(stamp).model_copy(update={"start_angle": begin, "end_angle": end, **arrays})
+    visibility.observe(message, scan_points(message, (0.0, 0.0, 0.0)))
+    field = np.flatnonzero(visibility._field)
+    return dict(zip(field.tolist(), visibility.last_seen(field).tolist(), strict=True))
+
+
+def view(share=0.5):
+    return Visibility(Footprint(), (0.0, 0.0, 0.0), share)
+
+
+@pytest.mark.parametrize(
+    ("distance", "code", "sees"),
+    [
+        (FAR, 255, True),
+        (CLOSE, 255, False),
+        (math.inf, 255, False),
+        (math.inf, 0, True),
+        (math.inf, 2, True),
+        (math.inf, 3, False),
+        (FAR, 3, False),
+    ],
+)
+def test_a_beam_sees_what_lies_outside_the_body_or_that_nothing_is_there(distance, code, sees):
+    assert looked(view(), [distance] * BEAMS, [code] * BEAMS) == {MIDDLE: SECOND if sees else 0}
+
+
+def test_a_range_that_ends_at_the_edge_of_the_body_is_outside():
+    visibility = view()
+    edges = np.array([(LENGTH, 0.0), (-LENGTH, 0.0), (0.0, WIDTH), (0.0, -WIDTH)])
+    assert not visibility._on_body(edges, 0.0).any()
+    assert visibility._on_body(edges * 0.999, 0.0).all()
+    assert visibility._on_body(edges, 0.005).all()
+    assert not visibility._on_body(edges * 1.05, 0.005).any()
+
+
+@pytest.mark.parametrize(("failed", "sees"), [(1, True), (2, True), (3, False), (4, False)])
+def test_a_sector_is_seen_by_half_of_its_beams(failed, sees):
+    ranges = [math.inf] * failed + [FAR] * (BEAMS - failed)
+    assert looked(view(), ranges) == {MIDDLE: SECOND if sees else 0}
+
+
+@pytest.mark.parametrize(("beams", "known"), [(2, False), (3, True)])
+@pytest.mark.parametrize("left", [True, False])
+def test_a_sector_is_in_the_field_by_more_than_half_of_its_beams(beams, known, left):
+    assert looked(view(), [FAR] * beams, left=left) == ({MIDDLE: SECOND} if known else {})
+
+
+def test_every_sector_has_its_own_time_and_keeps_it_while_it_is_not_seen():
+    visibility, blind, clear = view(), [math.inf] * BEAMS, [FAR] * BEAMS
+    assert looked(visibility, [*clear, *blind]) == {MIDDLE: SECOND, MIDDLE + 1: 0}
+    assert looked(visibility, [*blind, *clear], stamp=SECOND + 5) == {MIDDLE: SECOND, MIDDLE + 1: SECOND + 5}
+    ahead_and_aside = np.array([(1.0, 0.01), (1.0, 0.25), (-1.0, 0.0)])
+    assert visibility.age(ahead_and_aside, SECOND + 7).tolist() == [7, 2, SECOND + 7]
+
+
+def test_a_scan_of_another_geometry_has_its_own_sectors():
+    visibility, clear = view(), [FAR] * BEAMS
+    for count, (first, sector) in enumerate([(MIDDLE, MIDDLE), (MIDDLE + 2, MIDDLE + 2), (MIDDLE, MIDDLE)]):
+        assert looked(visibility, clear, stamp=SECOND + count, first=first * BEAMS)[sector] == SECOND + count
+    assert looked(visibility, 2 * clear, stamp=9) == {MIDDLE: 9, MIDDLE + 1: 9}
+    assert looked(visibility, clear, stamp=9, left=False) == {MIDDLE: 9}
+
+
+def test_sectors_go_once_round_the_lidar():
+    bearings = -math.pi + (np.arange(SECTORS) + 0.5) * SECTOR
+    points = np.column_stack((np.cos(bearings), np.sin(bearings)))
+    assert view().sectors_of(points).tolist() == list(range(SECTORS))
+    assert view().sectors_of(np.array([(-1.0, 0.0)])).tolist() == [0], "straight behind begins anew"

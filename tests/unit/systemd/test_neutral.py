@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import runpy
 import select
 import sys
 import termios
@@ -254,14 +253,17 @@ def test_the_line_is_raw_at_its_rate_and_what_was_waiting_on_it_is_forgotten(neu
     controller.close()
 
 
-def test_as_a_program_it_ends_with_the_code_and_needs_the_ports(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "argv", [str(SCRIPT)])
+def ended(monkeypatch, *arguments):
+    """Exit code of the script run as a program."""
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+    spec = importlib.util.spec_from_file_location("__main__", SCRIPT)
     with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(SCRIPT), run_name="__main__")
-    assert end.value.code == 1
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    return end.value.code
+
+
+def test_as_a_program_it_ends_with_the_code_and_needs_the_ports(monkeypatch):
+    assert ended(monkeypatch) == 1
     controller = Controller(0, 0)
-    monkeypatch.setattr(sys, "argv", [str(SCRIPT), f"{controller.path}=3"])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert ended(monkeypatch, f"{controller.path}=3") == 0
     controller.close()
-    assert end.value.code == 0

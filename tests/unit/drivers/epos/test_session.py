@@ -10,7 +10,6 @@ from monstertruck_drivers.epos.driver import (
     FAILURE_LIMIT,
     QUICK_EXCHANGE,
     RAD_S_PER_RPM,
-    SAFE_DEADLINE,
     SLOW_EXCHANGE,
     EposDriver,
     Odometer,
@@ -19,9 +18,9 @@ from monstertruck_drivers.epos.driver import (
     settled,
 )
 from monstertruck_drivers.epos.exchange import RECENT
-from monstertruck_drivers.epos.protocol import OFF, Control, State
+from monstertruck_drivers.epos.protocol import OFF, Control, State, write_request
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import DeviceFaultError
+from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -33,6 +32,16 @@ MS = SECOND // 1000
 
 def seconds_between(instants: list[int]) -> list[float]:
     return [(later - before) / SECOND for before, later in pairwise(instants)]
+
+
+def test_a_session_begins_with_a_quick_stop_and_no_target():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+        first = [frame for _, frame in rig.emulator.frames][:2]
+        assert first == [write_request(od.CONTROLWORD, Control.QUICK_STOP, 1), write_request(od.TARGET_VELOCITY, 0, 1)]
+
+    on_bench(test)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +200,7 @@ def test_the_end_of_a_session_brakes_and_switches_off_within_its_time():
             ended = rig.clock.now()
             before = len(controls(rig))
         assert controls(rig)[before:] == [Control.QUICK_STOP, Control.DISABLE_VOLTAGE]
-        assert rig.clock.now() - ended <= SAFE_DEADLINE * SECOND
+        assert rig.clock.now() - ended <= 300 * MS
         assert abs(rig.shaft_rpm) <= 60
 
     on_bench(test)
@@ -262,6 +271,36 @@ def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
                 await rig.settle(2.5)
             assert rig.newest.mode is DriveMode.ENABLED
             assert rig.events.reasons().count(Reason.DEVICE_READY) == 1, "one session"
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("error", [DeviceTimeoutError("silence"), ProtocolError("rubbish")])
+@pytest.mark.parametrize(("between", "ends"), [(99, True), (2, False)])
+def test_three_failures_in_a_row_end_a_session(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, between: int, ends: bool
+):
+    cycle, cycles = _DriveSession._cycle, 0
+
+    async def failing(session: _DriveSession) -> None:
+        nonlocal cycles
+        cycles += 1
+        if cycles % (between + 1) == 0:
+            await cycle(session)
+        else:
+            raise error
+
+    monkeypatch.setattr(_DriveSession, "_cycle", failing)
+
+    async def test(rig: Rig) -> None:
+        if ends:
+            with pytest.raises(type(error)):
+                await rig.session()
+            assert cycles == 3
+        else:
+            async with rig.driving():
+                await rig.settle(1.0)
+            assert cycles > 20
 
     on_bench(test)
 

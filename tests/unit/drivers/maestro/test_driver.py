@@ -5,6 +5,7 @@ import math
 import pytest
 
 from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (
     DeviceTimeoutError,
@@ -107,6 +108,78 @@ def test_a_stale_command_from_before_the_session_is_not_obeyed():
             assert rig.pulse(1) is None
 
     on_bench(test)
+
+
+def targets(rig: Rig, channel: int) -> list[int]:
+    """All targets a channel was given, quarter microseconds."""
+    given = Decoder().feed(bytes(rig.emulator.received))
+    return [
+        item.value
+        for item in given
+        if isinstance(item, ServoCommand) and item.code is Code.SET_TARGET and item.data[0] == channel
+    ]
+
+
+def test_every_command_is_sent_once():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            before = len(targets(rig, 1))
+            for step in range(1, 6):
+                rig.gate.front = step / 10
+                await rig.settle(0.02)
+        assert len(set(targets(rig, 1)[before:])) == 5
+        assert len(targets(rig, 1)[before:]) == 5
+
+    on_bench(test)
+
+
+def test_what_a_maestro_forgets_at_power_up_is_sent_at_the_beginning_of_a_session():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(1)
+        given = Decoder().feed(bytes(rig.emulator.received))
+        settings = [
+            (item.code, item.data[0], item.value)
+            for item in given
+            if isinstance(item, ServoCommand) and item.code in (Code.SET_SPEED, Code.SET_ACCELERATION)
+        ]
+        assert settings == [
+            (Code.SET_SPEED, 1, 100),
+            (Code.SET_ACCELERATION, 1, 9),
+            (Code.SET_SPEED, 0, 80),
+            (Code.SET_ACCELERATION, 0, 0),
+        ]
+
+    config = MaestroConfig(front=ServoConfig(channel=1, acceleration=9), rear=ServoConfig(channel=0, speed=80))
+    on_bench(test, config, gate=False)
+
+
+def test_an_error_in_the_first_answer_of_a_session_is_reported():
+    async def test(rig: Rig) -> None:
+        rig.ready = lambda: rig.emulator.inject("error", "1")  # type: ignore[method-assign]
+        async with rig.driving():
+            await rig.out.count(1)
+        assert [event[0] for event in rig.events.kept] == [Reason.DEVICE_FAULT]
+        assert rig.out.kept[0].error_word == 2
+
+    on_bench(test)
+
+
+def test_what_is_sent_again_after_commands_have_stopped_leaves_the_line_low():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.gate.talking = False
+            await rig.settle(0.5)
+            assert not rig.outputs[-1][1]
+            before, changes = len(targets(rig, 1)), len(rig.outputs)
+            rig.emulator.inject("error", "1")
+            await rig.settle(0.2)
+            assert len(targets(rig, 1)) > before, "sent again"
+            assert len(rig.outputs) == changes
+
+    on_bench(test, MaestroConfig(deadman_channel=2, deadman_feed="always"))
 
 
 @pytest.mark.parametrize("feed", ["fresh", "always"])
