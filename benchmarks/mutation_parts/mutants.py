@@ -186,6 +186,11 @@ class _Finder(ast.NodeVisitor):
     def visit_Assert(self, node: ast.Assert) -> None:
         """States an invariant; checks nothing."""
 
+    def visit_keyword(self, node: ast.keyword) -> None:
+        """``strict=True`` of ``zip`` states an invariant too."""
+        if node.arg != "strict":
+            self.visit(node.value)
+
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
         """Words for people."""
 

@@ -349,7 +349,7 @@ class SteeringCheck:
     """
 
     def __init__(self, config: SteeringCheckConfig) -> None:
-        self._config = config
+        self.config = config
         self._window: deque[tuple[int, float, float]] = deque()
         """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
         self._heading = 0.0
@@ -373,7 +373,7 @@ class SteeringCheck:
             speed: of the wheels over ground, m/s; None = not known.
             rate: yaw rate that follows from the wheels' speeds and the commanded steering angles, rad/s, left positive.
         """
-        if heading is None or speed is None or abs(speed) < self._config.speed:
+        if heading is None or speed is None or abs(speed) < self.config.speed:
             self._window.clear()
             return
         if not self._window or stamp - self._window[-1][0] > GAP:
@@ -388,7 +388,7 @@ class SteeringCheck:
         commanded += rate * dt
         self._window.append((stamp, commanded, measured + turned))
         self._heading = heading
-        while self._window[-1][0] - self._window[0][0] > self._config.window * SECOND:
+        while self._window[-1][0] - self._window[0][0] > self.config.window * SECOND:
             self._window.popleft()
         self._compare()
 
@@ -402,7 +402,7 @@ class SteeringCheck:
         _, commanded_now, measured_now = self._window[-1]
         commanded, measured = commanded_now - commanded_then, measured_now - measured_then
         self.difference = measured - commanded
-        allowed = self._config.tolerance + self._config.share * max(abs(commanded), abs(measured))
+        allowed = self.config.tolerance + self.config.share * max(abs(commanded), abs(measured))
         self.dead |= abs(self.difference) > allowed
 
 

@@ -148,9 +148,9 @@ class CauseBuilder:
         yield Measurement(name="pause", value=self.pause, unit="s", limit=self._config.tick_stall)
 
     def _turn(self, _now: int) -> Iterator[Measurement]:
-        if self._check is not None and self._config.turning is not None:
-            limit = self._config.turning.tolerance
-            yield Measurement(name="yaw difference", value=self._check.difference, unit="rad", limit=limit)
+        if (check := self._check) is not None:
+            limit = check.config.tolerance
+            yield Measurement(name="yaw difference", value=check.difference, unit="rad", limit=limit)
 
     def _obstacle(self, now: int) -> Iterator[Measurement]:
         age = _age(self._sensors.scan, now)

@@ -470,7 +470,7 @@ class _DriveSession:
         if control is Control.SHUTDOWN:
             await self._prepare()
         at_rest = abs(self._rpm) <= self._config.standstill_rpm
-        if self._state is State.QUICK_STOP and control is Control.ENABLE and late > REENABLE_LIMIT and at_rest:
+        if self._state is State.QUICK_STOP and late > REENABLE_LIMIT and at_rest:
             control = Control.DISABLE_VOLTAGE
         if control is not None:
             await self._control(control)

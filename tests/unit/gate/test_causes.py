@@ -62,6 +62,12 @@ def test_an_outage_counts_for_what_began_before_its_end(ended, counts):
     assert (len(behind(found)) == 2) is counts
 
 
+@pytest.mark.parametrize("state", [state for state in ServiceState if state is not ServiceState.READY])
+def test_an_outage_goes_on_until_the_service_is_ready(state):
+    found = outages(LOST, ("lidar", state, NOW - 1, {"reason": Reason.DEVICE_TIMEOUT}))
+    assert behind(found)[1][0] is Reason.DEVICE_LOST
+
+
 def test_the_end_of_an_outage_is_its_first_ready_and_the_next_failure_begins_another():
     late = ("lidar", ServiceState.READY, NOW + SECOND, {})
     found = outages(LOST, ("lidar", ServiceState.READY, NOW - 1, {}), late)

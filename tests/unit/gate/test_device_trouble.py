@@ -31,6 +31,13 @@ def test_a_blocked_shaft_stops_and_disarms_within_a_second(speed):
     assert rig.order(Order.ARM) is Reason.OK
 
 
+def test_it_can_be_configured_not_to_look():
+    rig = Rig(blocked=None).driving(speed=0.2)
+    held(rig, 50)
+    assert rig.out.mode is GateMode.DRIVING
+    assert rig.trips == []
+
+
 def test_a_slow_shaft_is_not_blocked():
     rig = Rig().driving(speed=0.2)
     for _ in range(100):

@@ -76,6 +76,15 @@ def test_an_obstacle_is_kept_while_its_sector_is_not_seen_and_the_view_before_is
     assert covered == (free if kept else math.inf)
 
 
+@pytest.mark.parametrize("bearing", [0.0, math.pi / 2, -math.pi / 2, 0.8])
+@pytest.mark.parametrize(("offset", "kept"), [(-0.01, 1), (0.01, 0)])
+def test_obstacles_are_kept_as_far_off_as_any_corner_can_reach(bearing, offset, kept):
+    checked = guard()
+    distance = REACH + RADIUS + 0.02 + offset
+    looked(checked, (distance * math.cos(bearing), distance * math.sin(bearing)))
+    assert len(checked._points) == kept
+
+
 def test_an_obstacle_kept_does_not_add_up():
     checked = guard()
     looked(checked, (FRONT + 0.2, 0.0))
@@ -230,6 +239,13 @@ def test_what_goes_where_the_lidar_does_not_see_has_the_limit_of_reverse(twist, 
     assert motion(BODIES["mecanum"]).max_pace(twist) == limit
 
 
+@pytest.mark.parametrize(("forward", "limit"), [(0.1, 0.21), (0.0999, 0.15)])
+def test_a_motion_of_which_half_goes_ahead_has_the_limit_of_driving_ahead(forward, limit, monkeypatch):
+    moved = motion()
+    monkeypatch.setattr(moved, "pace", lambda _: 0.2)
+    assert moved.max_pace((forward, 0.0, 0.0)) == limit
+
+
 def test_progress_is_the_measured_share_of_a_way():
     moved = motion(BODIES["differential"])
     way = (1.0, 0.0, 0.0)
@@ -299,6 +315,38 @@ def test_a_truck_at_rest_before_a_wall_does_not_set_off():
         assert rig.out.speeds == (0.0,)
     assert Reason.OBSTACLE_STOP in rig.out.reasons
     assert rig.trips == [], "nothing was stopped"
+
+
+def test_what_stops_a_slow_truck_in_time_is_no_quick_stop():
+    rig = Rig().driving(speed=0.03)
+    rig.obstacles = wall(0.06)
+    rig.tick()
+    assert Reason.OBSTACLE_STOP in rig.out.reasons
+    assert rig.out.action is DriveAction.RUN
+    assert not rig.trips[-1].quick
+
+
+def test_a_truck_that_was_stopped_by_an_obstacle_goes_on_at_twice_the_speed_below_which_it_stops(monkeypatch):
+    rig = Rig().driving(speed=0.2)
+    rig.obstacles = wall(0.3)
+    for allowed, blocked in ((0.0201, False), (0.0199, True), (0.0399, True), (0.0401, False), (0.0201, False)):
+        monkeypatch.setattr(rig.gate._obstacles, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
+        rig.tick()
+        assert (Reason.OBSTACLE_STOP in rig.out.reasons) is blocked
+        assert (Reason.OBSTACLE_SLOW in rig.out.reasons) is not blocked
+
+
+def test_a_truck_at_rest_and_one_of_unknown_speed_need_no_distance_to_stop():
+    rig = Rig()
+    rig.silent = {"drive"}
+    rig.tick()
+    assert rig.out.stopping_distance == 0.0
+    rig.silent = set()
+    rig.tick()
+    assert rig.out.stopping_distance == 0.0
+    rig.speed = -0.2
+    rig.tick()
+    assert rig.out.stopping_distance == pytest.approx(0.2 * 0.08 + 0.2**2 / 2)
 
 
 def test_what_appears_before_a_truck_that_brakes_is_a_quick_stop():

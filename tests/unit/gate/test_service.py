@@ -161,8 +161,9 @@ def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
             answer = getattr(bench.service, name)(None)
             assert getattr(answer, "reason", answer) is Reason.INTERNAL
             begin = clock.now()
-            with pytest.raises(ExceptionGroup):
+            with pytest.raises(ExceptionGroup) as raised:
                 await task
+            assert [type(bug) for bug in raised.value.exceptions] == [AttributeError], "the bug itself"
             assert clock.now() - begin < SECOND // 1000, "not only at the next tick"
             assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
 

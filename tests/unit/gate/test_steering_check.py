@@ -226,6 +226,30 @@ def test_a_disarmed_truck_may_be_carried_or_pushed_about(speed):
     assert rig.order(Order.ARM) == "ok"
 
 
+@pytest.mark.parametrize(
+    ("changes", "armed", "steering", "judged"),
+    [
+        ({}, True, True, True),
+        ({"tilt_valid": False}, True, True, False),
+        ({"heading_disturbed": True}, True, True, False),
+        ({}, False, True, False),
+        ({}, True, False, False),
+    ],
+)
+def test_a_heading_is_judged_if_it_and_the_steering_are_known_while_the_truck_is_armed(
+    changes, armed, steering, judged, monkeypatch
+):
+    rig = Rig()
+    if armed:
+        rig.armed()
+    if not steering:
+        rig.now += SECOND
+    headings = []
+    monkeypatch.setattr(rig.gate._steering_check, "observe", lambda _stamp, heading, *_: headings.append(heading))
+    rig.gate.observe_attitude(Attitude(**header(rig.now), **({"heading": 0.5, "roll": 0.0, "pitch": 0.0} | changes)))
+    assert headings == ([0.5] if judged and armed else [None])
+
+
 @pytest.mark.parametrize("kind", ["ackermann", "wheels"])
 def test_every_body_that_servos_steer_is_checked(kind):
     robot = Robot(kind).armed()

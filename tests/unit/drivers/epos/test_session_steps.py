@@ -151,6 +151,48 @@ def test_a_controlword_may_come_in_the_wrong_state_and_no_other_error_is_passed_
     steps(test)
 
 
+@pytest.mark.parametrize(
+    ("mark", "state", "action", "raises"),
+    [
+        (None, State.ENABLED, DriveAction.RUN, False),
+        (7, State.SWITCH_ON_DISABLED, DriveAction.DISABLE, False),
+        (7, State.SWITCH_ON_DISABLED, DriveAction.RUN, True),
+        (7, State.ENABLED, DriveAction.DISABLE, True),
+    ],
+)
+def test_a_controller_without_its_mark_restarted_which_ends_a_session_that_uses_it(
+    mark: int | None, state: State, action: DriveAction, raises: bool
+):
+    async def test(rig: Steps) -> None:
+        rig.driver.mark, rig.session._reported = mark, state
+        rig.driver.odometer.update(5, rig.clock.now(), 1e6)
+        rig.line.values[od.MARK] = 3
+        rig.say(action)
+        with pytest.raises(DeviceRestartedError) if raises else contextlib.nullcontext():
+            await rig.session._check_mark()
+        assert rig.line.written == [(od.MARK, 4)]
+        assert rig.driver.mark == 4
+        assert rig.events.reasons() == [Reason.DEVICE_RESTARTED] * (mark is not None)
+        continued = rig.driver.odometer.update(9, rig.clock.now() + SECOND, 1e6)
+        assert continued == (4 if mark is None else 0)
+
+    steps(test)
+
+
+def test_a_mark_that_is_still_there_and_a_controller_that_takes_none_are_no_restart():
+    async def test(rig: Steps) -> None:
+        rig.driver.mark = rig.line.values[od.MARK] = 3
+        await rig.session._check_mark()
+        assert rig.line.written == []
+        rig.line.values[od.MARK] = 9
+        rig.line.refusals[od.MARK] = ObjectError("mark", 0x06020000)
+        await rig.session._check_mark()
+        assert rig.driver.mark == 3
+        assert rig.events.kept == []
+
+    steps(test)
+
+
 # Faults
 
 
@@ -248,7 +290,9 @@ def test_a_quick_stop_is_sent_once_each_time_it_is_wanted(state: State):
         session._state, session._sent_rpm = state, 0
         for count in (1, 2):
             rig.say(DriveAction.QUICK_STOP)
+            assert session._is_urgent()
             await session._act()
+            assert not session._is_urgent()
             await session._act()
             assert rig.line.controls == [Control.QUICK_STOP] * count
             assert session._state is (State.QUICK_STOP if state in POWERED else state)

@@ -6,10 +6,9 @@ import pytest
 
 from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
 from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
+from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import (
-    DeviceTimeoutError,
-)
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import BatteryLevel, DriveFeedback, DriveMode
 from tests.unit.drivers.maestro.rig import Rig, on_bench
@@ -118,6 +117,67 @@ def targets(rig: Rig, channel: int) -> list[int]:
         for item in given
         if isinstance(item, ServoCommand) and item.code is Code.SET_TARGET and item.data[0] == channel
     ]
+
+
+def test_the_line_is_driven_well_to_either_side_of_its_threshold():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+        await rig.settle(0.1)
+        assert set(targets(rig, 2)) == {4000, 8000}
+
+    on_bench(test, LINE)
+
+
+def test_the_battery_is_read_by_the_first_poll():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(1)
+            assert len(rig.battery.kept) == 1
+
+    on_bench(test)
+
+
+def test_an_error_alone_makes_feedback_untrusted():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            assert rig.out.kept[-1].trusted
+            rig.emulator.inject("error", "1")
+            await rig.settle(0.2)
+            assert rig.pulse(1) is not None
+        assert [sample.trusted for sample in rig.out.kept if sample.error_word] == [False]
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("error", [DeviceTimeoutError("silence"), ProtocolError("rubbish")])
+@pytest.mark.parametrize(("between", "ends"), [(99, True), (2, False)])
+def test_three_polls_in_a_row_without_an_answer_end_a_session(monkeypatch, error: Exception, between: int, ends: bool):
+    ask, polls = MaestroSession.ask, 0
+
+    async def failing(session: MaestroSession, *requests: bytes) -> list[int]:
+        nonlocal polls
+        polls += bool(rig_ready)
+        if not rig_ready or polls % (between + 1) == 0:
+            return await ask(session, *requests)
+        raise error
+
+    monkeypatch.setattr(MaestroSession, "ask", failing)
+    rig_ready: list[int] = []
+
+    async def test(rig: Rig) -> None:
+        rig.ready = lambda: rig_ready.append(1)  # type: ignore[method-assign]
+        if ends:
+            with pytest.raises(type(error)):
+                await rig.session()
+            assert polls == 3
+        else:
+            async with rig.driving():
+                await rig.settle(1.0)
+            assert polls > 15
+
+    on_bench(test)
 
 
 def test_every_command_is_sent_once():
