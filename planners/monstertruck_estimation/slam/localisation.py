@@ -14,11 +14,10 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
 from monstertruck_estimation.slam.global_search import GlobalLocaliser
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
-from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, status_of
+from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, fits, status_of
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scan_matcher import (
-    LOW_OVERLAP,
     MatchStatus,
     PlanarMatcher,
     ScanMatch,
@@ -163,15 +162,20 @@ class LocalisationEstimator:
         self, scan: Scan, delta: Array, guess: Array, covariance: Array, mount: Vector
     ) -> tuple[ScanMatch, LocalisationStatus]:
         match = self._front.match(scan, delta, guess, covariance, self._submap)
+        if not fits(match):
+            # The predicted motion may be wrong: by a late odometry, or by stamps that are not those of the scans.
+            before = compose(guess, inverse(delta))
+            still = self._front.match(scan, np.zeros(3), before, covariance, self._submap)
+            match = still if fits(still) else match
         place, turn = deviations(match.covariance)
-        fits = match.accepted and match.overlap >= LOW_OVERLAP
-        if fits:
+        good = fits(match)
+        if good:
             evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
-            fits = evidence.contradiction <= MAX_CONTRADICTION
-        if match.accepted and not fits and _apart(match.pose, guess):
+            good = evidence.contradiction <= MAX_CONTRADICTION
+        if match.accepted and not good and _apart(match.pose, guess):
             match = rejected(guess, covariance, MatchStatus.FAR)
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
-        self._misfits = 0 if fits else self._misfits + 1
+        self._misfits = 0 if good else self._misfits + 1
         self.counts["rejected"] += not match.accepted
         if self._misfits >= 3 * LOST_AFTER or place > LOST_DEVIATION[0] or turn > LOST_DEVIATION[1]:
             self._global, self._tracking = self._search_anew(), False

@@ -24,8 +24,9 @@ EMPTY = [*ROOM[:4], *ROOM[8:]]
 """The same room without the box in its middle."""
 
 
-def followed(saved: SavedMap, walls, truth, *, odom=True, start=None) -> list[SlamEstimate]:
-    """Estimates at the true poses, ten a second."""
+def followed(saved: SavedMap, walls, truth, *, odom=True, start=None, wheels=None) -> list[SlamEstimate]:
+    """Estimates at the true poses, ten a second; odometry is true, too, or what ``wheels`` say."""
+    wheels = truth if wheels is None else wheels
     estimator, rng = LocalisationEstimator(saved, MapperConfig(), start), np.random.default_rng(3)
     estimates = []
     for k, pose in enumerate(truth):
@@ -36,7 +37,7 @@ def followed(saved: SavedMap, walls, truth, *, odom=True, start=None) -> list[Sl
             angle_increment=LIDAR.angle_increment,
             range_min=LIDAR.range_min,
             range_max=LIDAR.range_max,
-            odom=tuple(between(truth[0], pose).tolist()) if odom else None,
+            odom=tuple(between(wheels[0], wheels[k]).tolist()) if odom else None,
         )
         estimate = estimator.step(prepare_input(inputs, 30.0, estimator.twist), inputs)
         assert estimate is not None
@@ -96,6 +97,15 @@ def test_a_wrong_place_is_refuted_within_metres():
     beyond = [k for k, pose in enumerate(truth) if pose[0] > 4.0]
     assert estimates[-1].status not in {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE}
     assert any(estimates[k].status not in PLACED for k in beyond)
+
+
+def test_one_wrong_odometry_moves_nothing():
+    truth = rounds(30, laps=0.2)
+    wheels = truth.copy()
+    wheels[15] += (1.4, 0.0, 2.5)
+    estimates = followed(SavedMap(drawn(), None), ROOM, truth, start=tuple(truth[0].tolist()), wheels=wheels)
+    for estimate, pose in zip(estimates, truth, strict=True):
+        assert math.hypot(*(np.array(estimate.pose) - pose)[:2]) < 0.1
 
 
 @pytest.mark.parametrize(
