@@ -95,6 +95,8 @@ class Result:
     track: np.ndarray
     width: float = 0.0
     lost: bool = False
+    untrue: bool = False
+    """The tracker reported the goal as reached from further off than its tolerance."""
 
     @property
     def work_ms(self) -> float:
@@ -249,6 +251,7 @@ def drive(
         worst=float(error.max()),
         end=1000 * end if outcome in ENDED else math.inf,
         lost=outcome is Reason.PATH_LOST,
+        untrue=outcome is Reason.GOAL_REACHED and end > config.goal_tolerance,
         steps_ms=1000 * np.array(work),
         track=poses,
         width=swept(poses[len(poses) // 20 :], points),
@@ -291,6 +294,7 @@ def report(part: Part, table: dict) -> None:
     for name in KINDS:
         runs = [r for key, r in table.items() if key[4] == name]
         part.add(f"{name}.not_arrived", sum(not r.arrived for r in runs), 0 if name in MUST_ARRIVE else None)
+        part.add(f"{name}.reported_reached_but_off", sum(r.untrue for r in runs), 0)
         part.add(f"{name}.off_the_end_max_mm", max(r.end for r in runs))
         part.add(f"{name}.step_ms", float(np.median([r.work_ms for r in runs])))
         part.add(f"{name}.step_p99_ms", max(r.longest_ms for r in runs))
