@@ -183,9 +183,17 @@ def known(file: Path, *, again: bool) -> dict[str, dict[str, str]]:
 
 
 def sample(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
-    """So many of them, drawn with a seed, in the order drawn; all of them for 0."""
-    order = np.random.default_rng(seed).permutation(len(every))
-    return [every[index] for index in order[: count or None].tolist()]
+    """So many of them, drawn with a seed, in the order drawn; all of them for 0.
+
+    The place of a mutant follows from itself: an edit elsewhere leaves it in the sample.
+    """
+    seen: Counter[str] = Counter()
+
+    def place(mutant: Mutant) -> bytes:
+        seen[mutant.key] += 1
+        return hashlib.blake2s(repr((seed, mutant.key, seen[mutant.key])).encode()).digest()
+
+    return sorted(every, key=place)[: count or None]
 
 
 def judged(

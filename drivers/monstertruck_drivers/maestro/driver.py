@@ -76,7 +76,9 @@ class MaestroDriver:
 
     def _start_session(self) -> None:
         self._command: SteeringCommand | None = None
-        self._fresh = False
+        """Newest one."""
+        self._fresh: SteeringCommand | None = None
+        """The same, until it is stale."""
         self._failing = False
         self._misses = 0
 
@@ -113,7 +115,7 @@ class MaestroDriver:
             await self._follow(session, schedule.step())
             session.require_link()
             self._watch(session)
-            if self._fresh or self._command is None or self._config.deadman_feed == "always":
+            if self._fresh is not None or self._command is None or self._config.deadman_feed == "always":
                 await self._poll(session, self._battery if cycle % every == 0 else None)
             cycle += 1
 
@@ -122,8 +124,7 @@ class MaestroDriver:
 
         def pass_on(command: SteeringCommand) -> bool:
             if self._is_fresh(command):
-                self._command = command
-                self._fresh = True
+                self._command = self._fresh = command
                 session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
             return True
 
@@ -135,8 +136,8 @@ class MaestroDriver:
 
     def _watch(self, session: MaestroSession) -> None:
         """Release the deadman when commands stop."""
-        if self._fresh and self._command is not None and not self._is_fresh(self._command):
-            self._fresh = False
+        if self._fresh is not None and not self._is_fresh(self._fresh):
+            self._fresh = None
             session.send(*self._line(session, high=False))
             text = f"no steering command for {self._config.command_timeout} s: servos hold"
             self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
@@ -157,7 +158,7 @@ class MaestroDriver:
             packets.append(session.encode.set_acceleration(servo.channel, servo.acceleration))
         if self._command is not None:
             packets += self._targets(session, self._command)
-        alive = self._fresh and self._command is not None and self._command.deadman
+        alive = self._fresh is not None and self._fresh.deadman
         session.send(*packets, *self._line(session, high=alive))
 
     async def _poll(self, session: MaestroSession, battery: "BatteryInput | None") -> None:

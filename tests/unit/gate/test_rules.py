@@ -415,7 +415,7 @@ def test_a_pause_is_a_stall_beyond_its_limit_and_lasts_its_dwell():
     while rig.now < stalled + SECOND // 2 - TICK:
         rig.tick()
         assert Reason.TICK_STALLED in rig.out.reasons
-    rig.tick(2)
+    rig.tick()
     assert Reason.TICK_STALLED not in rig.out.reasons
 
 

@@ -46,6 +46,19 @@ def test_commands_and_their_deadman(age: float, action: DriveAction, rpm: float,
     assert wanted(command(action, rpm), SECOND + round(age * SECOND), CONFIG) == expected
 
 
+@pytest.mark.parametrize(
+    ("age", "before", "after"),
+    [
+        (SECOND // 4, Wanted(State.ENABLED, -1000), Wanted(State.ENABLED, 0)),
+        (SECOND, Wanted(State.ENABLED, 0), STOP),
+    ],
+)
+def test_a_command_counts_to_the_last_instant_of_its_time(age: int, before: Wanted, after: Wanted):
+    run = command(DriveAction.RUN, 1000)
+    assert wanted(run, SECOND + age, CONFIG) == before
+    assert wanted(run, SECOND + age + 1, CONFIG) == after
+
+
 def test_no_command_is_off_and_the_sign_is_configured():
     assert wanted(None, 0, CONFIG) == OFF
     forward = EposConfig(inverted=False)

@@ -52,6 +52,7 @@ class Controller:
     def __init__(self, clock: HandClock) -> None:
         self.values: dict[ObjectEntry, int] = {}
         self.written: list[tuple[ObjectEntry, int]] = []
+        self.asked: list[ObjectEntry] = []
         self.refusals: dict[ObjectEntry, Exception] = {}
         """Errors of writes."""
         self.takes = 0
@@ -62,6 +63,7 @@ class Controller:
         self._clock = clock
 
     async def read(self, entry: ObjectEntry, _attempts: int = 1) -> int:
+        self.asked.append(entry)
         self._clock.time += self.takes
         return self.values.get(entry, 0)
 
@@ -101,8 +103,9 @@ class Steps:
         self.commands.put(DriveCommand(stamp=now, received=now, seq=0, action=action, speed=0.0, motor_velocity=rate))
 
 
-def steps(test: Callable[[Steps], Coroutine[Any, Any, None]], **config: Any) -> None:
-    asyncio.run(test(Steps(EposConfig(inverted=False, **config))))
+def steps(test: Callable[[Steps], Coroutine[Any, Any, None]], *, inverted: bool = False) -> None:
+    """Run ``test`` with a session that began a second after the clock."""
+    asyncio.run(test(Steps(EposConfig(inverted=inverted))))
 
 
 # The beginning
@@ -378,7 +381,110 @@ def test_a_controller_that_is_not_settled_is_looked_at_in_every_cycle():
     steps(test)
 
 
+def test_feedback_is_of_the_middle_of_its_exchange():
+    async def test(rig: Steps) -> None:
+        rig.line.began, rig.line.ended = SECOND - 40 * MS, SECOND - 20 * MS
+        rig.line.values |= {od.VELOCITY_AVERAGED: -60, od.POSITION: 7, od.STATUSWORD: State.ENABLED.value}
+        await rig.session._cycle()
+        (sample,) = rig.out.kept
+        assert (sample.stamp, sample.received) == (SECOND - 30 * MS, SECOND)
+        assert sample.velocity == pytest.approx(60 * RAD_S_PER_RPM)
+
+    steps(test, inverted=True)
+
+
+def test_the_current_has_the_robots_sign():
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._state = session._reported = State.SWITCH_ON_DISABLED
+        session._status_due = SECOND + 1
+        rig.line.values[od.CURRENT] = 500
+        await session._cycle()
+        assert session._current == -0.5
+
+    steps(test, inverted=True)
+
+
+def test_after_a_failed_exchange_the_controller_is_asked_for_its_mark_once_and_prepared_anew():
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._state = session._reported = State.ENABLED
+        session._doubtful = True
+        session._status_due = session._current_due = rig.clock.now() + SECOND
+        rig.driver.mark = rig.line.values[od.MARK] = 3
+        rig.say(DriveAction.RUN, 900)
+        await session._cycle()
+        assert rig.line.asked.count(od.MARK) == 1
+        assert not session._prepared
+        assert rig.line.written == [], "not faster before it is known"
+        await session._cycle()
+        assert rig.line.asked.count(od.MARK) == 1
+        assert rig.line.written == [(od.TARGET_VELOCITY, 900)]
+
+    steps(test)
+
+
+def test_a_target_whose_write_fails_is_sent_again():
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._state, session._sent_rpm = State.ENABLED, 900
+        rig.say(DriveAction.RUN, 100)
+        rig.line.refusals[od.TARGET_VELOCITY] = DeviceTimeoutError("silence")
+        with pytest.raises(DeviceTimeoutError):
+            await session._act()
+        rig.line.refusals.clear()
+        await session._act()
+        await session._act()
+        assert rig.line.written == [(od.TARGET_VELOCITY, 100)] * 2
+
+    steps(test)
+
+
 # Power states
+
+
+def test_mode_limits_and_ramps_are_written_once_with_no_target():
+    config = EposConfig()
+
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._prepared, session._sent_rpm = False, 900
+        rig.line.values[od.MODE_DISPLAY] = od.PROFILE_VELOCITY
+        await session._prepare()
+        await session._prepare()
+        assert session._sent_rpm == 0
+        assert rig.line.written == [
+            (od.MODE, 3),
+            (od.TARGET_VELOCITY, 0),
+            (od.MAX_VELOCITY, config.max_motor_rpm),
+            (od.ACCELERATION, config.acceleration_rpm_s),
+            (od.DECELERATION, config.deceleration_rpm_s),
+            (od.QUICK_STOP_DECELERATION, config.quick_stop_deceleration_rpm_s),
+        ]
+
+    steps(test)
+
+
+def test_a_controller_that_does_not_take_the_mode_is_not_driven():
+    async def test(rig: Steps) -> None:
+        rig.session._prepared = False
+        rig.line.values[od.MODE_DISPLAY] = 1
+        with pytest.raises(ProtocolError, match="mode 1 instead of 3"):
+            await rig.session._prepare()
+        assert rig.line.written == [(od.MODE, 3)]
+
+    steps(test)
+
+
+@pytest.mark.parametrize("state", State)
+def test_a_controller_is_prepared_on_its_way_from_off_to_running(state: State):
+    async def test(rig: Steps) -> None:
+        rig.session._state, rig.session._prepared = state, False
+        rig.line.values[od.MODE_DISPLAY] = od.PROFILE_VELOCITY
+        await rig.session._step(State.ENABLED)
+        assert rig.session._prepared is (state is State.SWITCH_ON_DISABLED)
+
+    steps(test)
 
 
 @pytest.mark.parametrize("asked", [False, True])

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
-from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
+from monstertruck_drivers.maestro.protocol import Code, Decoder, Encoder, ServoCommand
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
@@ -351,6 +351,21 @@ def test_lasting_errors_are_reported_once():
                 rig.emulator.inject("error", "1")
             await rig.settle(0.2)
         assert rig.events.reasons() == [Reason.DEVICE_FAULT]
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_a_single_servo_without_pulses_is_noticed(channel: int):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            rig.gate.talking = False
+            rig.port.device.take(Encoder().set_target(channel, 0))
+            await rig.settle(0.1)
+            assert rig.pulse(channel) is not None
+            assert "pulses off" in rig.events.kept[0][2]
+        assert sum(not sample.trusted for sample in rig.out.kept[5:]) == 1
 
     on_bench(test)
 
