@@ -96,7 +96,10 @@ class ObstacleLimits(Schema):
     """Share of the beams in each sector of travel (10 degrees) that must see: measure a range, or meet nothing within
     the lidar's range. A recorded URG-04LX has 0.95 to 1.0 of them, and less than half in one of 800 sectors."""
     unseen_speed: Positive = 0.1
-    """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck."""
+    """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
+    Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
+    memory_distance: Share = 1.0
+    """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
     open_ground: bool = False
     """Whether a scan without any range is believed: otherwise it counts as none, whatever its beams say."""
 
@@ -326,6 +329,7 @@ WEAKER_BELOW: Final = (
     "obstacle.ahead",
     "obstacle.side_clearance",
     "obstacle.crawl",
+    "obstacle.memory_distance",
     "obstacle.seen",
     "blocked.share",
     "short_faults_within",

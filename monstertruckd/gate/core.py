@@ -338,6 +338,8 @@ class Gate:
             self._causes.pause = elapsed / SECOND
         dt = min(elapsed, 2 * period) / SECOND
 
+        # A truck that is not armed may be carried.
+        self._obstacles.move(now, self._sensors.twist(now) if self._states.active else None, elapsed / SECOND)
         assessment = self._sensors.assess(now)
         blocks = self._blocks(assessment, now)
         self._report(now, blocks, assessment.values, always=self.mode is GateMode.DRIVING)

@@ -6,10 +6,11 @@ and of the driven wheels, m/s. It is the speed of the base for a truck that driv
 for a body that turns on the spot.
 
 A beam without a range may be free ground, or a covered or dazzled sensor: ``Visibility`` says which directions the
-lidar sees.
+lidar sees. Where it does not look, in reverse, sideways and on the spot, ``ScanMemory`` has what earlier scans saw.
 """
 
 import math
+from collections import deque
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -18,8 +19,15 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.chassis import MAX_ANGLE, STILL, Angles, Chassis, Speeds
 from monstertruck_kinematics.drive import Twist
-from monstertruck_kinematics.elementary import Array, KinematicsError
-from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
+from monstertruck_kinematics.elementary import Array, KinematicsError, integrate
+from monstertruck_planners.collision import (
+    Footprint,
+    ScanPoints,
+    first_contact,
+    placed,
+    points_relative,
+    swept_poses,
+)
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
@@ -38,7 +46,7 @@ SWEEPS: Final = 256
 
 AHEAD: Final = 0.5
 """A motion whose forward speed is a lesser share of its pace than this has the limit of reverse: part of the footprint
-goes where the lidar sees nothing."""
+goes where the lidar does not look."""
 
 MAX_SPEED: Final = 1e3
 """Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
@@ -59,7 +67,20 @@ OUTLINE: Final = 12
 MARGIN: Final = 0.005
 """Ground this near to the body is not travelled, m."""
 
+MEMORY: Final = 30 * SECOND
+"""Scans are remembered for so long, ns: somebody may step onto ground that was free, or take an obstacle away."""
+MEMORY_STEP: Final = 0.1
+"""Travelled distance between two remembered scans, m."""
+MEMORY_SCANS: Final = 40
+DRIFT: Final = 0.03
+"""The footprint is so much smaller against remembered points, m: the wheels do not tell better where they are."""
+FIELD_EDGE: Final = 0.1
+"""Points so near to the edge of the lidar's field are remembered, rad: turns of the wheels' dead reckoning are off."""
+POSES_KEPT: Final = 64
+"""Ticks whose pose is known: a scan is placed where it was taken."""
+
 Sectors = NDArray[np.intp]
+Pose = tuple[float, float, float]
 
 
 class Visibility:
@@ -99,7 +120,9 @@ class Visibility:
             self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
             self._field = self._beams * abs(increment) > PRESENT * SECTOR
         sees = scan.codes <= NO_ECHO
-        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~self._on_body(points, 0.0)
+        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~_on_body(
+            self._footprint, points, 0.0
+        )
         seen = np.bincount(self._sector_of_beam, weights=sees, minlength=SECTORS) >= self._share * self._beams
         self._seen_at[seen & self._field] = scan.stamp
 
@@ -110,14 +133,8 @@ class Visibility:
 
     def travelled(self, poses: Array) -> Sectors:
         """Sectors of the ground that the footprint covers at the poses (m, 3), but not where the body is."""
-        half_length, half_width = self._footprint.half_length, self._footprint.half_width
-        along, across = np.linspace(-half_length, half_length, OUTLINE), np.linspace(-half_width, half_width, OUTLINE)
-        ends, sides = np.full(OUTLINE, half_length), np.full(OUTLINE, half_width)
-        x = np.concatenate((along, along, ends, -ends)) + self._footprint.offset
-        y = np.concatenate((sides, -sides, across, across))
-        c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        outline = np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2).reshape(-1, 2)
-        return np.unique(self.sectors_of(outline[~self._on_body(outline, MARGIN)]))
+        outline = _outline(self._footprint, poses).reshape(-1, 2)
+        return np.unique(self.sectors_of(outline[~_on_body(self._footprint, outline, MARGIN)]))
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
         """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
@@ -127,16 +144,135 @@ class Visibility:
         """How long ago the sector of every point (n, 2) in base was seen, ns."""
         return now - self._seen_at[self.sectors_of(points)]
 
-    def _on_body(self, points: Array, margin: float) -> NDArray[np.bool_]:
-        body = self._footprint
-        on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
-            np.abs(points[:, 1]) < body.half_width + margin
-        )
-        return on
-
 
 def _sector(bearings: Array) -> Sectors:
     return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
+
+
+def _on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
+    """Which points (n, 2) in base lie on the body, or nearer to it than ``margin``, m."""
+    on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
+        np.abs(points[:, 1]) < body.half_width + margin
+    )
+    return on
+
+
+def _outline(body: Footprint, poses: Array) -> Array:
+    """Points on the edges of the footprint at every pose (m, 3), shape (m, n, 2), m."""
+    half_length, half_width = body.half_length, body.half_width
+    along, across = np.linspace(-half_length, half_length, OUTLINE), np.linspace(-half_width, half_width, OUTLINE)
+    ends, sides = np.full(OUTLINE, half_length), np.full(OUTLINE, half_width)
+    x = np.concatenate((along, along, ends, -ends)) + body.offset
+    y = np.concatenate((sides, -sides, across, across))
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    return np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2)
+
+
+class _Taken(NamedTuple):
+    """A scan, and where it was taken."""
+
+    scan: LaserScan
+    pose: Pose
+    """Of base, in the frame of the memory."""
+    travelled: float
+    """m."""
+    points: Array
+    """Its returns near the body in the frame of the memory, shape (n, 2), m."""
+
+
+class ScanMemory:
+    """What earlier scans saw of the ground around the body, in a frame that dead reckoning by the wheels moves it in.
+
+    Args:
+        footprint: the body's outline.
+        mount: pose of the lidar in base, m, m, rad.
+        distance: travelled distance for which points are remembered, m.
+    """
+
+    def __init__(self, footprint: Footprint, mount: Pose, distance: float) -> None:
+        self._footprint = footprint
+        self._mount = mount
+        self._distance = distance
+        self.forget()
+
+    def forget(self) -> None:
+        """It is not known how the body has moved."""
+        self._pose: Pose = (0.0, 0.0, 0.0)
+        self._travelled = 0.0
+        self._ticks: deque[tuple[int, Pose, float]] = deque(maxlen=POSES_KEPT)
+        self._newest: _Taken | None = None
+        self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
+
+    def move(self, now: int, twist: Twist[float], dt: float) -> None:
+        """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
+        if twist != STILL:
+            self._pose = integrate(self._pose, *twist, dt)
+            self._travelled += (
+                math.hypot(twist[0], twist[1]) + abs(twist[2]) * self._footprint.circumscribed_radius
+            ) * dt
+        self._ticks.append((now, self._pose, self._travelled))
+
+    def observe(self, scan: LaserScan, points: Array) -> None:
+        """Take a scan.
+
+        Args:
+            scan: the revolution.
+            points: its returns near the body in base, shape (n, 2), m.
+        """
+        present = scan.stamp, self._pose, self._travelled
+        _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - scan.stamp), default=present)
+        there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        self._newest = _Taken(scan, pose, travelled, there)
+        if not self._taken or travelled - self._taken[-1].travelled >= MEMORY_STEP:
+            self._taken.append(self._newest)
+
+    def points(self) -> Array:
+        """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
+        newest = self._newest
+        if newest is None:
+            return np.empty((0, 2))
+        kept = [
+            taken.points
+            for taken in self._taken
+            if newest.travelled - taken.travelled < self._distance and newest.scan.stamp - taken.scan.stamp < MEMORY
+        ]
+        points = points_relative(np.concatenate((newest.points[:0], *kept)), newest.pose)
+        beams, edge = self._beams(newest.scan, points)[0], FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
+        looked = (beams >= edge) & (beams < len(newest.scan.ranges) - edge)
+        return points[~looked & ~_on_body(self._footprint, points, 0.0)]
+
+    def seen(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
+        seen = np.zeros(len(points), np.bool_)
+        newest = self._newest
+        if newest is None:
+            return seen
+        there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
+        for taken in (newest, *reversed(self._taken)):
+            (left,) = np.nonzero(~seen)
+            if newest.scan.stamp - taken.scan.stamp >= MEMORY or len(left) == 0:
+                break
+            local = points_relative(there[left], taken.pose)
+            seen[left] = _on_body(self._footprint, local, DRIFT) | self._free(taken.scan, local)
+        return seen
+
+    def _free(self, scan: LaserScan, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2) in base the scan saw free."""
+        beams, distances = self._beams(scan, points)
+        inside = (beams >= 0) & (beams < len(scan.ranges))
+        beams = np.where(inside, beams, 0)
+        codes = scan.codes[beams]
+        free: NDArray[np.bool_] = (
+            inside & ((codes == VALID_BEAM) | (codes <= NO_ECHO)) & (scan.ranges[beams] > distances)
+        )
+        return free
+
+    def _beams(self, scan: LaserScan, points: Array) -> tuple[NDArray[np.intp], Array]:
+        """Number of the beam towards each point (n, 2) in base, beyond the scan's where it has none; distance, m."""
+        local = points_relative(points, self._mount)
+        bearings = np.arctan2(local[:, 1], local[:, 0])
+        beams = np.round((bearings - scan.start_angle) / (scan.angle_increment or math.tau)).astype(np.intp)
+        return beams, np.hypot(local[:, 0], local[:, 1])
 
 
 class ObstacleGuard:
@@ -155,17 +291,27 @@ class ObstacleGuard:
         self._footprint = footprint
         self._scan_points = points
         self._visibility = Visibility(footprint, points.mount, config.obstacle.seen)
+        self._memory = ScanMemory(footprint, points.mount, config.obstacle.memory_distance)
         self._keep = round(config.scan.stale_after * SECOND)
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
         """Seconds from the newest scan back to the one that saw the sectors of the newest ways; None = none did."""
+        self.known = math.inf
+        """Distance along the newest ways to ground that no scan has seen, m; +inf if none is within reach."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._stopping(config.speed, delay, config.obstacle.deceleration)
         self._near = self._reach + footprint.circumscribed_radius + config.obstacle.side_clearance
         self._sweep = lru_cache(SWEEPS)(self._swept)
+
+    def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
+        """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
+        if twist is None:
+            self._memory.forget()
+        else:
+            self._memory.move(now, twist, dt)
 
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
@@ -175,6 +321,7 @@ class ObstacleGuard:
         age = self._visibility.age(self._points, scan.stamp)
         # What was seen in a sector stays while the sector is not seen, until that is too old.
         self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
+        self._memory.observe(scan, near)
         self._stamp = scan.stamp
         self._checked = None
 
@@ -188,7 +335,10 @@ class ObstacleGuard:
         if self._checked != rounded:
             self._checked = rounded
             self._look(rounded)
-            self._free = min(self._free_distance(*way) for way in rounded)
+            hidden = [way for way in rounded if way[0] * TWIST_STEP < AHEAD]
+            behind = self._memory.points() if hidden else None
+            self._free = min(self._free_distance(*way, behind if way in hidden else None) for way in rounded)
+            self.known = min((self._known_distance(*way) for way in hidden), default=math.inf)
         return self._free
 
     def _look(self, ways: frozenset[tuple[int, int, int]]) -> None:
@@ -205,10 +355,18 @@ class ObstacleGuard:
         poses = swept_poses(way, distances)
         return distances, poses, self._visibility.travelled(poses)
 
-    def _free_distance(self, x: int, y: int, turn: int) -> float:
+    def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None) -> float:
         distances, poses, _ = self._sweep(x, y, turn)
-        contact = first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)
-        return math.inf if contact is None else float(distances[contact - 1])
+        contacts = [first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)]
+        if remembered is not None:
+            contacts.append(first_contact(self._footprint, poses, remembered, -DRIFT))
+        return min((float(distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf)
+
+    def _known_distance(self, x: int, y: int, turn: int) -> float:
+        distances, poses, _ = self._sweep(x, y, turn)
+        outline = _outline(self._footprint, poses)
+        known = self._memory.seen(outline.reshape(-1, 2)).reshape(outline.shape[:2]).all(axis=1)
+        return math.inf if known.all() else float(distances[max(int(np.argmin(known)) - 1, 0)])
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
@@ -468,6 +626,9 @@ class CommandLimiter:
             limits[Reason.LIDAR_BLIND] = 0.0
         elif unseen:
             limits[Reason.LIDAR_SLOW] = self._config.obstacle.unseen_speed
+        allowed = max(self._obstacles.allowed_speed(self._obstacles.known, now), self._config.obstacle.unseen_speed)
+        if allowed < max(map(motion.pace, twists)):
+            limits[Reason.UNSEEN_SLOW] = allowed
         measured = self._sensors.shaft_speeds(now)
         speed = max(motion.progress(measured, way) for way in ways) if measured else 0.0
         approaching = speed > self._config.standstill

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
+from monstertruck_kinematics.drive import Twist
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas import topics
@@ -204,12 +205,15 @@ class SensorMonitor:
         """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
         return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
+    def twist(self, now: int) -> Twist[float] | None:
+        """Velocity of the base by the measured shaft speeds and the newest steering angles; None without the former."""
+        rolling, angles = self.shaft_speeds(now), self.angles
+        return self._chassis.twist(self._chassis.input_speeds(rolling, *angles), *angles) if rolling else None
+
     def turn_rate(self, now: int) -> float:
-        """Yaw rate by the measured shaft speeds and the newest steering angles, rad/s; 0 without the former."""
-        rolling = self.shaft_speeds(now)
-        return (
-            self._chassis.twist(self._chassis.input_speeds(rolling, *self.angles), *self.angles)[2] if rolling else 0.0
-        )
+        """Yaw rate of ``twist``, rad/s; 0 without it."""
+        twist = self.twist(now)
+        return 0.0 if twist is None else twist[2]
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
         """Feedback of all shafts; empty unless all of it is fresh."""

@@ -84,6 +84,7 @@ class Reason(StrEnum):
     SERVO_LIMIT = "servo_limit", 68, "a steering servo is at the end of its range: less steering than requested"
     LIDAR_SLOW = "lidar_slow", 70, "the lidar does not see where the truck is to go: speed limited"
     LIDAR_BLIND = "lidar_blind", 71, "the lidar has not seen for too long where the truck is to go"
+    UNSEEN_SLOW = "unseen_slow", 76, "ground that no scan has seen lately: speed limited"
     SHAFT_BLOCKED = "shaft_blocked", 72, "a driven shaft does not turn although it is commanded to"
     FAULTS_REPEAT = "faults_repeat", 73, "short faults come again and again"
     WEAKENED = "weakened", 77, "configured less safe than by default"

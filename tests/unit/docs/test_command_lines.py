@@ -42,6 +42,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         app, ["install-service", "--config", str(ROOT / "configs" / "truck.yaml"), "--root", str(folder / "system")]
     )
     assert installed.exit_code == 0, installed.output
+    # For lines that add stations, whichever line is first.
+    authority = CliRunner().invoke(app, ["security", "init", "--folder", str(folder / "security")])
+    assert authority.exit_code == 0, authority.output
     return folder
 
 

@@ -49,6 +49,8 @@ SERVICES = {
     "steering": Reason.STEERING_STALE,
 }
 CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
+ANY_GROUND = {"unseen_speed": 1.0}
+"""Settings for obstacles that take ground no scan has seen for seen."""
 
 
 def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, battery_measured=False, **config):

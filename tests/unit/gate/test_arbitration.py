@@ -13,7 +13,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from tests.unit.gate.rig import CHASSIS, DRIVETRAIN, STEERING, TICK, Rig
+from tests.unit.gate.rig import ANY_GROUND, CHASSIS, DRIVETRAIN, STEERING, TICK, Rig
 
 
 def seconds(ticks):
@@ -154,7 +154,7 @@ def test_standstill_needs_a_sample_from_after_the_stop():
 
 
 def test_motion_limits_hold_on_the_way_up_and_down():
-    rig = Rig().armed()
+    rig = Rig(obstacle=ANY_GROUND).armed()
     rig.driver = {"speed": 0.21, "front": 0.3, "rear": -0.15}
     speeds, fronts = [0.0], [0.0]
     for _ in range(40):
@@ -195,7 +195,7 @@ def test_crab_goes_as_fast_as_straight_and_a_curve_as_fast_as_the_wheels_may():
 
 
 def test_reversing_has_its_own_limit():
-    assert Rig().driving(speed=-0.2, ticks=60).out.speeds[0] == pytest.approx(-0.15)
+    assert Rig(obstacle=ANY_GROUND).driving(speed=-0.2, ticks=60).out.speeds[0] == pytest.approx(-0.15)
 
 
 def test_servo_angles_belong_to_the_axle_angles():

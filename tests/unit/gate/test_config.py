@@ -43,6 +43,7 @@ DELIVERED = {
         "crawl": 0.02,
         "seen": 0.5,
         "unseen_speed": 0.1,
+        "memory_distance": 1.0,
         "open_ground": False,
     },
     "event_interval": 1.0,

@@ -16,6 +16,7 @@ from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import ObstacleGuard
 from monstertruckd.gate.sensors import SensorMonitor
 from tests.unit.gate.rig import (
+    ANY_GROUND,
     BODIES,
     CHASSIS,
     SERVICES,
@@ -225,7 +226,7 @@ def test_either_axle_beyond_its_limit_is_clipped_at_it(axle, side):
 
 @pytest.mark.parametrize(("speed", "limit"), [(0.21, 0.21), (-0.15, 0.15)])
 def test_each_direction_is_clipped_at_its_own_limit(speed, limit):
-    at, beyond = Rig().driving(speed=speed), Rig().driving(speed=speed * 1.01)
+    at, beyond = (Rig(obstacle=ANY_GROUND).driving(speed=share * speed) for share in (1.0, 1.01))
     assert Reason.CLIPPED not in at.out.reasons
     assert Reason.CLIPPED in beyond.out.reasons
     assert abs(beyond.out.speeds[0]) == pytest.approx(limit)

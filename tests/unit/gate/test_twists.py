@@ -8,7 +8,7 @@ import pytest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import Robot
+from tests.unit.gate.rig import ANY_GROUND, Robot
 
 SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
 
@@ -16,7 +16,7 @@ SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
 @pytest.mark.parametrize("kind", ["differential", "skid_steer", "omni", "mecanum", "wheels"])
 @pytest.mark.parametrize("turn", [0.5, -0.5])
 def test_bodies_that_can_turn_on_the_spot(kind, turn):
-    robot = Robot(kind).driving(wz=turn, ticks=150)
+    robot = Robot(kind, obstacle=ANY_GROUND).driving(wz=turn, ticks=150)
     vx, vy, wz = robot.made
     assert (vx, wz) == pytest.approx((0.0, turn), abs=1e-9)
     assert vy == pytest.approx(0.03 * turn if kind == "skid_steer" else 0.0, abs=1e-9)  # round the sides' ICRs
@@ -27,7 +27,7 @@ def test_bodies_that_can_turn_on_the_spot(kind, turn):
 @pytest.mark.parametrize("kind", ["omni", "mecanum", "wheels"])
 @pytest.mark.parametrize("side", [0.1, -0.1])
 def test_bodies_that_can_move_sideways(kind, side):
-    robot = Robot(kind).driving(vy=side, ticks=200)
+    robot = Robot(kind, obstacle=ANY_GROUND).driving(vy=side, ticks=200)
     assert robot.made == pytest.approx((0.0, side, 0.0), abs=1e-9)
     assert robot.out.reasons == ()
 
@@ -101,7 +101,7 @@ def test_huge_twists_are_clipped_in_their_direction(kind, fastest):
 
 def test_no_wheel_is_faster_than_allowed_on_the_spot_and_sideways():
     for asked in ({"wz": 5.0}, {"vy": 0.5}, {"vx": -0.5}):
-        robot = Robot("mecanum").driving(**asked, ticks=100)
+        robot = Robot("mecanum", obstacle=ANY_GROUND).driving(**asked, ticks=100)
         assert max(map(abs, robot.shafts)) == pytest.approx(0.15)  # not ahead: the limit of reverse
         assert Reason.CLIPPED in robot.out.reasons
     assert max(Robot("mecanum").driving(vx=0.5, ticks=100).shafts) == pytest.approx(0.21)
@@ -156,7 +156,7 @@ def test_wheels_turn_no_further_than_they_must():
 
 @pytest.mark.parametrize("kind", ["differential", "mecanum", "wheels"])
 def test_an_obstacle_that_a_corner_would_touch_stops_turning_on_the_spot(kind):
-    free = Robot(kind).driving(wz=0.5, ticks=100)
+    free = Robot(kind, obstacle=ANY_GROUND).driving(wz=0.5, ticks=100)
     assert free.out.reasons == ()
     # Left of the front: a turn to the left brings the corner there, one to the right takes it away.
     near = Robot(kind).armed()

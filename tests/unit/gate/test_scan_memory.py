@@ -1,0 +1,198 @@
+"""What earlier scans saw guards the truck where its lidar does not look."""
+
+import math
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.limiter import DRIFT, MEMORY, ScanMemory
+from tests.unit.gate.rig import TICK, Rig, scan
+
+FOOTPRINT = Footprint()
+BACK = FOOTPRINT.half_length - FOOTPRINT.offset
+MOUNT = (0.14, 0.0, 0.0)
+
+
+def memory(distance=2.0):
+    return ScanMemory(FOOTPRINT, MOUNT, distance)
+
+
+def drive(remembered, metres, turn=0.0, now=SECOND, speed=0.2):
+    """Move on an arc in ticks; returns the time at its end."""
+    for _ in range(round(abs(metres) / speed / 0.02)):
+        now += TICK
+        remembered.move(now, (math.copysign(speed, metres), 0.0, turn), 0.02)
+    return now
+
+
+def points_of(message):
+    seen = np.isfinite(message.ranges).nonzero()[0]
+    bearing = message.start_angle + message.angle_increment * seen
+    points = np.column_stack((0.14 + message.ranges[seen] * np.cos(bearing), message.ranges[seen] * np.sin(bearing)))
+    return points[np.hypot(*points.T) < 1.0]
+
+
+def see(remembered, now, *obstacles):
+    """Take a scan; returns the remembered points."""
+    message = scan(now, *obstacles)
+    remembered.observe(message, points_of(message))
+    return remembered.points()
+
+
+def test_without_a_scan_nothing_is_known():
+    assert memory().points().shape == (0, 2)
+    assert not seen(memory(), 0.0)
+
+
+def test_a_point_stays_where_it_was_seen_as_the_truck_passes_it():
+    remembered = memory()
+    assert len(see(remembered, SECOND, (0.3, 0.4))) == 0
+    now = drive(remembered, 0.6)
+    ((x, y),) = see(remembered, now)
+    assert (x, y) == pytest.approx((-0.3, 0.4), abs=0.01)
+
+
+def test_a_point_turns_about_a_turning_truck():
+    remembered = memory()
+    see(remembered, SECOND, (0.4, -0.3))
+    now = drive(remembered, 0.2 * math.pi / 2, turn=1.0)  # a quarter of a circle of 0.2 m
+    ((x, y),) = see(remembered, now)
+    assert (x, y) == pytest.approx((-0.3 - 0.2, -(0.4 - 0.2)), abs=0.02)
+
+
+def test_where_the_lidar_looks_its_scan_counts():
+    remembered = memory()
+    see(remembered, SECOND, (0.5, 0.0))
+    assert len(see(remembered, drive(remembered, 0.02))) == 0
+    assert len(see(remembered, drive(remembered, 0.1))) == 0
+
+
+def test_a_scan_is_placed_where_it_was_taken():
+    remembered = memory()
+    now = drive(remembered, 0.2)
+    see(remembered, SECOND, (0.3, 0.4))  # comes late: taken before the truck moved
+    ((x, _),) = see(remembered, drive(remembered, 0.4, now=now))
+    assert x == pytest.approx(-0.3, abs=0.015)
+
+
+def test_points_are_forgotten_after_their_distance_and_time():
+    remembered = memory(distance=0.5)
+    see(remembered, SECOND, (0.2, 0.4))
+    now = drive(remembered, 0.45)
+    assert len(see(remembered, now)) == 1
+    assert len(see(remembered, SECOND + MEMORY - 1)) == 1
+    assert len(see(remembered, SECOND + MEMORY)) == 0
+    assert len(see(remembered, drive(remembered, 0.1, now=now))) == 0
+
+
+def test_points_that_the_body_stands_on_are_none():
+    remembered = memory()
+    see(remembered, SECOND, (0.3, FOOTPRINT.half_width - 0.01))
+    assert len(see(remembered, drive(remembered, 0.5))) == 0
+
+
+def seen(remembered, *xs):
+    """Which points on the middle of the way are seen; a single one alone."""
+    found = remembered.seen(np.array([(x, 0.0) for x in xs]))
+    return bool(found[0]) if len(xs) == 1 else found.tolist()
+
+
+def test_ground_is_seen_where_beams_pass_and_the_body_stood():
+    remembered = memory()
+    see(remembered, SECOND)
+    assert seen(remembered, 0.0, 0.3, 0.6) == [True, True, True]
+    assert seen(remembered, -BACK + 0.01, -BACK - DRIFT + 0.01) == [True, True]
+    assert seen(remembered, -BACK - DRIFT - 0.01, -0.6) == [False, False]
+    see(remembered, drive(remembered, 0.4))
+    assert seen(remembered, -BACK - 0.3, -BACK - 0.4 - DRIFT + 0.01) == [True, True]
+    assert not seen(remembered, -BACK - 0.4 - DRIFT - 0.01)
+
+
+def test_ground_behind_an_obstacle_or_a_beam_without_an_answer_is_not_seen():
+    remembered = memory()
+    see(remembered, SECOND, *[(0.5, y / 200) for y in range(-120, 121)])
+    assert seen(remembered, 0.45, 0.55) == [True, False]
+    remembered = memory()
+    blind = scan(SECOND)
+    remembered.observe(blind.model_copy(update={"codes": np.full(682, 7, np.uint8)}), np.empty((0, 2)))
+    assert not seen(remembered, 0.6)
+
+
+def test_seen_ground_ages():
+    remembered = memory()
+    see(remembered, SECOND)
+    now = drive(remembered, 0.4)
+    see(remembered, now)
+    assert seen(remembered, -BACK - 0.3)
+    see(remembered, SECOND + MEMORY - 1)
+    assert seen(remembered, -BACK - 0.3)
+    see(remembered, SECOND + MEMORY)
+    assert not seen(remembered, -BACK - 0.3)
+
+
+# In the gate
+
+
+def surround(rig, *obstacles):
+    """Scans of obstacles that stay where they are while the truck drives straight on."""
+    sense = rig.sense
+
+    def look():
+        there = [(ox - rig.x, oy) for ox, oy in obstacles]
+        rig.obstacles = [(x, y) for x, y in there if abs(math.atan2(y, x - 0.14)) < math.radians(120)]
+        sense()
+
+    rig.sense = look
+    obey = rig._obey
+
+    def moved():
+        obey()
+        rig.x += rig.speed * 0.02
+
+    rig.x, rig._obey = 0.0, moved
+    return rig
+
+
+def test_reverse_is_slow_onto_ground_that_no_scan_has_seen_and_quicker_where_the_truck_came_from():
+    rig = surround(Rig()).driving(speed=-0.15)
+    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
+    assert rig.out.speeds[0] == pytest.approx(-0.1)
+    rig = surround(Rig(disarm_after=5.0)).driving(ticks=200, speed=0.2)
+    rig.driver = {"speed": -0.15}
+    rig.tick(40)
+    assert rig.out.reasons == ()
+    assert rig.out.speeds[0] == pytest.approx(-0.15)
+    while rig.x > 0.02:
+        rig.tick()
+    assert Reason.UNSEEN_SLOW in rig.out.reasons, "before the place where it began"
+    assert rig.out.speeds[0] == pytest.approx(-0.1, abs=0.005)
+
+
+@pytest.mark.parametrize(("side", "slows"), [(1.0, True), (-1.0, False)])
+def test_in_reverse_the_truck_slows_down_for_what_it_has_passed(side, slows):
+    post = (0.25, side * (FOOTPRINT.half_width + 0.03))  # free of the truck that drives straight on
+    rig = surround(Rig(disarm_after=5.0), post).driving(ticks=150, speed=0.2)
+    assert rig.out.mode is GateMode.DRIVING
+    assert rig.x - BACK > post[0], "passed, and out of the lidar's sight"
+    rig.driver = {"speed": -0.15, "front": 0.4, "rear": -0.4}  # the tail to the left
+    reasons = {reason for _ in range(80) for reason in rig.tick().reasons}
+    assert (Reason.OBSTACLE_SLOW in reasons) == slows
+
+
+def test_a_truck_that_is_not_armed_may_have_been_carried():
+    rig = surround(Rig(disarm_after=5.0)).driving(ticks=100, speed=0.2)
+    rig.driver = None
+    rig.order(Order.DISARM)
+    rig.tick(40)
+    assert rig.out.mode is GateMode.DISARMED
+    rig.order(Order.ARM)
+    rig.driver = {"speed": -0.15}
+    rig.tick(40)
+    assert rig.out.action is DriveAction.RUN
+    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
