@@ -1,0 +1,56 @@
+"""Backing towards what the lidar sees no more, through the whole daemon."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.world.obstacles import Disc
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.calibration_kit import LocalTruck
+from tests.daemon.test_saturation_virtual import NOMINAL
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+YARD = Path(__file__).resolve().parents[2] / "configs" / "yard.yaml"
+
+
+def test_the_truck_does_not_back_into_a_post_that_it_has_passed():
+    config = load_config(YARD, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+    config = with_overlay(config, {"sim": {"world": {"truck": NOMINAL}}})
+
+    async def main(clock: VirtualClock) -> set[Reason]:
+        rig = VirtualRig(config, clock)
+        with rig.bus.subscribe(topics.GATE, fifo(4096)) as gate:
+            async with rig.running():
+                await clock.sleep(3.0)
+                truck = LocalTruck(rig.daemon, clock)
+
+                async def drive(speed: float, angle: float, seconds: float) -> None:
+                    for _ in range(round(seconds / 0.1)):
+                        await truck.drive(speed, angle, -angle)
+                        await clock.sleep(0.1)
+
+                start = rig.world.truth(clock.now())
+                cos, sin = math.cos(start.yaw), math.sin(start.yaw)
+                post = Disc(start.x + 0.6 * cos - 0.3 * sin, start.y + 0.6 * sin + 0.3 * cos, 0.05)
+                rig.world.add(clock.now(), post)
+                await truck.arm()
+                await drive(0.2, 0.0, 6.0)
+                passed = rig.world.truth(clock.now())
+                assert math.dist((passed.x, passed.y), (start.x, start.y)) > 1.0
+                await drive(0.0, 0.3, 1.0)
+                gate.drain()
+                await drive(-0.15, 0.3, 6.0)
+                end = rig.world.truth(clock.now())
+                assert not rig.truth.array()[:, 5].any(), "touched"
+                assert math.dist((end.x, end.y), (passed.x, passed.y)) > 0.05, "backed up to it"
+                return {reason for state in gate.drain() for reason in state.reasons}
+
+    assert Reason.OBSTACLE_STOP in run_virtual(main, start=SECOND)
