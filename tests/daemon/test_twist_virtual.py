@@ -92,7 +92,8 @@ def test_turning_on_the_spot(name: str, side: int):
     seen = drive(name, (4.0, (0.0, 0.0, 0.5 * side)))
     ahead, aside, turned = seen.moved
     assert math.hypot(ahead, aside) < (0.1 if name == "skid_steer" else 0.02)  # its sides' ICRs are behind its middle
-    assert turned * side == pytest.approx(2.0, abs=0.8 if name == "independent" else 0.25)  # its wheels turn first
+    # Of 2.0: onto ground that no scan has seen it turns slower, and wheels that are steered turn first.
+    assert 1.2 < turned * side < 2.1
     assert not seen.truth[:, 5].any()
     assert set(seen.answers) == {Reason.OK}
     assert_odometry_agrees(seen)
