@@ -120,7 +120,7 @@ class Visibility:
             self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
             self._field = self._beams * abs(increment) > PRESENT * SECTOR
         sees = scan.codes <= NO_ECHO
-        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~_on_body(
+        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~on_body(
             self._footprint, points, 0.0
         )
         seen = np.bincount(self._sector_of_beam, weights=sees, minlength=SECTORS) >= self._share * self._beams
@@ -134,7 +134,7 @@ class Visibility:
     def travelled(self, poses: Array) -> Sectors:
         """Sectors of the ground that the footprint covers at the poses (m, 3), but not where the body is."""
         outline = _outline(self._footprint, poses).reshape(-1, 2)
-        return np.unique(self.sectors_of(outline[~_on_body(self._footprint, outline, MARGIN)]))
+        return np.unique(self.sectors_of(outline[~on_body(self._footprint, outline, MARGIN)]))
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
         """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
@@ -149,7 +149,7 @@ def _sector(bearings: Array) -> Sectors:
     return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
 
 
-def _on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
+def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
     """Which points (n, 2) in base lie on the body, or nearer to it than ``margin``, m."""
     on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
         np.abs(points[:, 1]) < body.half_width + margin
@@ -239,7 +239,7 @@ class ScanMemory:
         points = points_relative(np.concatenate((newest.points[:0], *kept)), newest.pose)
         beams, edge = self._beams(newest.scan, points)[0], FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
         looked = (beams >= edge) & (beams < len(newest.scan.ranges) - edge)
-        return points[~looked & ~_on_body(self._footprint, points, 0.0)]
+        return points[~looked & ~on_body(self._footprint, points, 0.0)]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
@@ -253,7 +253,7 @@ class ScanMemory:
             if newest.scan.stamp - taken.scan.stamp >= MEMORY or len(left) == 0:
                 break
             local = points_relative(there[left], taken.pose)
-            seen[left] = _on_body(self._footprint, local, DRIFT) | self._free(taken.scan, local)
+            seen[left] = on_body(self._footprint, local, DRIFT) | self._free(taken.scan, local)
         return seen
 
     def _free(self, scan: LaserScan, points: Array) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility
+from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, on_body
 from tests.unit.gate.rig import Rig, scan
 
 MOUNT = (0.14, 0.0, 0.0)
@@ -232,12 +232,11 @@ def test_a_beam_sees_what_lies_outside_the_body_or_that_nothing_is_there(distanc
 
 
 def test_a_range_that_ends_at_the_edge_of_the_body_is_outside():
-    visibility = view()
     edges = np.array([(LENGTH, 0.0), (-LENGTH, 0.0), (0.0, WIDTH), (0.0, -WIDTH)])
-    assert not visibility._on_body(edges, 0.0).any()
-    assert visibility._on_body(edges * 0.999, 0.0).all()
-    assert visibility._on_body(edges, 0.005).all()
-    assert not visibility._on_body(edges * 1.05, 0.005).any()
+    assert not on_body(Footprint(), edges, 0.0).any()
+    assert on_body(Footprint(), edges * 0.999, 0.0).all()
+    assert on_body(Footprint(), edges, 0.005).all()
+    assert not on_body(Footprint(), edges * 1.05, 0.005).any()
 
 
 @pytest.mark.parametrize(("failed", "sees"), [(1, True), (2, True), (3, False), (4, False)])
