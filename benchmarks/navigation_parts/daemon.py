@@ -41,10 +41,9 @@ POST = 0.1
 """Radius, m."""
 GAP = 0.9
 """From the truck's middle to the post, m."""
-QUICK: dict[str, Any] = {
+IN_THE_LOOP: dict[str, Any] = {
     "recorder": None,
     "blackbox": None,
-    "planner": {"route": {"effort": 8000}},
     "placement": {"planner": "loop", "local_planner": "loop", "tracker": "loop"},
 }
 
@@ -96,10 +95,12 @@ def random_goal(truth: DistanceField, low: np.ndarray, size: np.ndarray, rng: np
             return float(pose[0]), float(pose[1]), float(pose[2])
 
 
-def drive(goal: Goal, seed: int, *, surprise: bool) -> dict[str, Any]:
-    """One run."""
-    base = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0]
-    config = with_overlay(with_overlay(base, QUICK), {"sim": {"seed": seed}})
+def drive(goal: Goal, seed: int, *, surprise: bool, base: str = "goals.yaml", seconds: float = 600.0) -> dict[str, Any]:
+    """One run with the configuration ``base``, given up after some seconds of driving."""
+    config = with_overlay(load_config(CONFIGS / base, SimulatedTruckConfig)[0], IN_THE_LOOP)
+    if isinstance(config.planner.route, HybridConfig):
+        config = with_overlay(config, {"planner": {"route": {"effort": 8000}}})
+    config = with_overlay(config, {"sim": {"seed": seed}, "planner": {"timeout": seconds}})
     row: dict[str, Any] = {"goal": goal, "surprise": surprise}
     digest = hashlib.sha256()
 

@@ -76,6 +76,11 @@ def test_bad_goals_are_refused_with_the_reason_and_nothing_moves():
                 "goal", {**trip.header(), "nonce": "another", "goal": {"x": 4.0, "y": 3.9, "yaw": 0.0}}
             )
         assert refused.value.refusal is Reason.BAD_NONCE
+        with pytest.raises(RequestRefusedError, match="goal in frame 'base': expected 'odom' or 'map'") as refused:
+            await trip.rig.daemon.rpc.call(
+                "goal", {**trip.header(), "frame": "base", "goal": {"x": 4.0, "y": 3.9, "yaw": 0.0}}
+            )
+        assert refused.value.refusal is Reason.BAD_INPUT
         with pytest.raises(RequestRefusedError) as refused:
             await trip.order("cancel")
         assert refused.value.refusal is Reason.NOT_FOUND
