@@ -1,14 +1,17 @@
 """The driver against the emulator on the virtual clock: commands, deadman, battery."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.driver import BatteryInput, MaestroDriver
 from monstertruck_drivers.maestro.protocol import Code, Decoder, Encoder, ServoCommand
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import BatteryLevel, DriveFeedback, DriveMode
 from tests.unit.drivers.maestro.rig import Rig, on_bench
@@ -457,3 +460,59 @@ def test_without_a_battery_input_none_is_read():
         assert b"\x90\x05" not in bytes(rig.emulator.received)
 
     on_bench(test, MaestroConfig(battery=None))
+
+
+def test_the_battery_is_read_no_more_often_than_the_rest():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.out.count(5)
+        assert len(rig.battery.kept) == len(rig.out.kept)
+        assert [sample.stamp for sample in rig.battery.kept] == [sample.stamp for sample in rig.out.kept]
+
+    on_bench(test, MaestroConfig(poll_rate=5.0, battery_rate=50.0))
+
+
+def test_a_battery_that_is_measured_elsewhere_is_not_read():
+    async def test(rig: Rig) -> None:
+        rig.driver = MaestroDriver(MaestroConfig(), rig.port, rig.clock, rig.commands, rig.out, None, rig.events)
+        async with rig.driving():
+            await rig.out.count(3)
+        assert b"\x90\x05" not in bytes(rig.emulator.received)
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize(("raw", "at_limit"), [(0, True), (1, False), (1022, False), (1023, True)])
+def test_a_reading_at_either_end_of_the_scale_is_no_measurement(raw: int, at_limit: bool):
+    taken = []
+    monitor = SimpleNamespace(take=lambda *given, at_limit: taken.append((*given, at_limit)))
+    config = MaestroConfig().battery
+    assert config is not None
+    BatteryInput(config, monitor).take(3, 5, raw)  # type: ignore[arg-type]
+    assert taken == [(3, 5, config.volts(raw), at_limit)]
+
+
+# Samples
+
+
+def test_feedback_is_of_the_middle_of_its_question():
+    async def test(rig: Rig) -> None:
+        rig.port.device.faults.delay = 0.02
+        async with rig.driving():
+            await rig.out.count(5)
+        delays = [(sample.received - sample.stamp) / SECOND for sample in rig.out.kept]
+        assert delays == pytest.approx([0.02] * len(delays), abs=1e-6), "there and back"
+
+    on_bench(test)
+
+
+@pytest.mark.parametrize(("late", "obeyed"), [(0, True), (1, False)])
+def test_a_command_is_obeyed_to_the_last_instant_of_its_time(late: int, obeyed: bool):
+    async def test(rig: Rig) -> None:
+        stamp = rig.clock.now() - SECOND // 4 - late
+        command = SteeringCommand(
+            stamp=stamp, received=stamp, seq=0, front=0.0, rear=0.0, front_servo=0.1, rear_servo=0.0
+        )
+        assert rig.driver._is_fresh(command) is obeyed
+
+    on_bench(test, gate=False)
