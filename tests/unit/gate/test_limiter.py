@@ -317,6 +317,15 @@ def test_a_truck_at_rest_before_a_wall_does_not_set_off():
     assert rig.trips == [], "nothing was stopped"
 
 
+@pytest.mark.parametrize(("speed", "action"), [(0.01, DriveAction.RUN), (0.0101, DriveAction.QUICK_STOP)])
+def test_a_truck_approaches_from_more_than_standstill_on(speed, action, monkeypatch):
+    rig = Rig().driving(speed=0.1)
+    monkeypatch.setattr(rig.gate._motion, "progress", lambda *_: speed)
+    rig.obstacles = wall(0.01)
+    rig.tick()
+    assert rig.out.action is action
+
+
 def test_what_stops_a_slow_truck_in_time_is_no_quick_stop():
     rig = Rig().driving(speed=0.03)
     rig.obstacles = wall(0.06)

@@ -305,6 +305,28 @@ def test_whoever_drove_or_stopped_keeps_lower_roles_out_until_armed(first, then,
     assert rig.drive(speed=0.1, **lower) is Reason.OK
 
 
+def test_whoever_drove_for_a_single_tick_keeps_lower_roles_out_too():
+    rig = Rig().armed()
+    rig.drive(source="high", role=Role.GAMEPAD, speed=0.0, lease=0.03)
+    rig.tick()
+    assert rig.out.holder == "high"
+    rig.tick(2)
+    assert (rig.out.mode, rig.out.holder) == (GateMode.ARMED, None)
+    assert rig.drive(source="low", role=Role.STATION, speed=0.0) is Reason.LOWER_PRIORITY
+
+
+def test_an_order_to_arm_while_somebody_drives_lets_lower_roles_drive_afterwards():
+    rig = Rig().armed()
+    rig.drive(source="high", role=Role.GAMEPAD, speed=0.0)
+    rig.tick()
+    assert rig.order(Order.ARM) is Reason.OK
+    rig.drive(source="high", role=Role.GAMEPAD, speed=0.0)
+    rig.tick()
+    assert rig.out.holder == "high"
+    rig.tick(20)
+    assert rig.drive(source="low", role=Role.STATION, speed=0.0) is Reason.OK
+
+
 @pytest.mark.parametrize("role", [Role.GAMEPAD, Role.KEYBOARD, Role.STATION])
 def test_a_lease_runs_to_its_last_instant(role):
     rig = Rig(leases={role.value: 0.2}).armed()

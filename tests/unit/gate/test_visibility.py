@@ -219,6 +219,8 @@ def view(share=0.5):
     ("distance", "code", "sees"),
     [
         (FAR, 255, True),
+        (LENGTH + 0.01, 255, True),
+        (LENGTH - 0.01, 255, False),
         (CLOSE, 255, False),
         (math.inf, 255, False),
         (math.inf, 0, True),
