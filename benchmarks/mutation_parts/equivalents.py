@@ -3,7 +3,9 @@
 from typing import Final
 
 GATE: Final = "monstertruckd/gate/"
+DRIVE: Final = "drivers/monstertruck_drivers/epos/driver.py"
 NANOSECOND: Final = "a nanosecond, at the very beginning of time"
+UNREAD: Final = "set before it is read"
 CACHE: Final = "the cached value is computed once more"
 
 EQUIVALENTS: Final[dict[str, str]] = {
@@ -24,7 +26,9 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed[0] != now -> True": CACHE,
     f"{GATE}sensors.py::SensorMonitor.speed: 0 -> (1)": CACHE,
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
-    f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": "set before it is read",
+    f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": UNREAD,
+    f"{DRIVE}::_DriveSession._idle: 0 -> (1)": "a nanosecond less to wait",
+    f"{DRIVE}::_DriveSession.__init__: 1 -> (2)": UNREAD,
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",
     f"{GATE}latch.py::Mark.engaged: 2 -> (3)": "any second byte is damage",
 }

@@ -173,6 +173,13 @@ def test_every_part_of_the_outline_travels_over_its_ground(way, ground, offset):
     assert set(opposite).isdisjoint(travelled)
 
 
+@pytest.mark.parametrize(("way", "travels"), [(0.004, False), (0.006, True), (-0.004, False), (-0.006, True)])
+def test_ground_within_half_a_centimetre_of_the_body_is_not_travelled(way, travels):
+    visibility = Visibility(Footprint(), MOUNT, 0.5)
+    for pose in ((way, 0.0, 0.0), (0.0, way, 0.0)):
+        assert (len(visibility.travelled(np.array([pose]))) > 0) is travels
+
+
 def test_a_turn_on_the_spot_travels_over_the_ground_of_all_corners():
     visibility = Visibility(Footprint(), MOUNT, 0.5)
     travelled = visibility.travelled(swept_poses((0.0, 0.0, 5.0), np.linspace(0.0, 0.1, 20)))
