@@ -306,6 +306,11 @@ def wall(distance):
     return tuple((FRONT + distance, y / 100) for y in range(-15, 16, 3))
 
 
+def test_before_a_way_was_checked_nothing_stops_the_truck():
+    limiter = Rig().gate._limiter
+    assert (limiter.blocked, limiter.blind, limiter.emergency, limiter.free) == (False, False, False, None)
+
+
 def test_a_truck_at_rest_before_a_wall_does_not_set_off():
     rig = Rig().armed()
     rig.obstacles = wall(0.04)

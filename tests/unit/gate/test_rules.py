@@ -390,6 +390,16 @@ def test_a_disarm_order_while_stopping_counts_at_rest_and_not_later():
     assert rig.out.mode is GateMode.ARMED, "the order does not count twice"
 
 
+@pytest.mark.parametrize("check", ["turning", "blocked"])
+def test_a_truck_without_one_of_the_checks_is_armed_driven_and_disarmed_all_the_same(check):
+    rig = Rig(**{check: None}).driving()
+    assert rig.order(Order.DISARM) is Reason.OK
+    rig.driver = None
+    rig.tick(40)
+    assert rig.out.mode is GateMode.DISARMED
+    assert rig.order(Order.ARM) is Reason.OK
+
+
 def test_a_disarm_order_while_driving_stops_by_the_ordinary_ramp_first():
     rig = Rig().driving()
     assert rig.order(Order.DISARM) is Reason.OK
