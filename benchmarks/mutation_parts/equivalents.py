@@ -27,6 +27,10 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}sensors.py::SensorMonitor.speed: 0 -> (1)": CACHE,
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
     f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": UNREAD,
+    f"{GATE}service.py::GateService._publish: (output.mode is GateMode.ESTOPPED) != self._latched -> True": (
+        "what is stored is compared once more with the mode"
+    ),
+    f"{GATE}service.py::GateService._tick_for_ever: 0 -> (1)": "a tick a nanosecond earlier",
     f"{DRIVE}::_DriveSession._idle: 0 -> (1)": "a nanosecond less to wait",
     f"{DRIVE}::_DriveSession.__init__: 1 -> (2)": UNREAD,
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",

@@ -367,6 +367,6 @@ class _Feed:
 
     def poll(self) -> None:
         message = self._subscription.latest
-        if message is not None and message is not self._seen:
+        if message is not self._seen:
             self._seen = message
             self._observe(message)

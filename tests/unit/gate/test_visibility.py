@@ -277,7 +277,7 @@ def test_a_scan_of_another_geometry_has_its_own_sectors():
 
 
 def test_sectors_go_once_round_the_lidar():
-    bearings = -math.pi + (np.arange(SECTORS) + 0.5) * SECTOR
+    bearings = -math.pi + (np.arange(36) + 0.5) * math.radians(10)
     points = np.column_stack((np.cos(bearings), np.sin(bearings)))
-    assert view().sectors_of(points).tolist() == list(range(SECTORS))
+    assert view().sectors_of(points).tolist() == list(range(36))
     assert view().sectors_of(np.array([(-1.0, 0.0)])).tolist() == [0], "straight behind begins anew"
