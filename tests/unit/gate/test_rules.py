@@ -12,9 +12,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import BatteryLevel, DriveMode
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.config import GateConfig, TiltLimits
 from monstertruckd.gate.limiter import ObstacleGuard
-from monstertruckd.gate.sensors import SensorMonitor
+from monstertruckd.gate.sensors import SensorMonitor, _Tilt
 from tests.unit.gate.rig import (
     ANY_GROUND,
     BODIES,
@@ -207,6 +207,20 @@ def test_a_tilt_counts_from_its_limit_on_and_until_it_is_less_by_the_hysteresis(
     assert tilted(limit - 0.034)
     assert not tilted(limit - 0.036)
     assert not tilted(limit - 0.034)
+
+
+@pytest.mark.parametrize("name", ["slow", "stop"])
+def test_a_tilt_at_its_very_limit_counts(name):
+    limits = TiltLimits()
+    tilt, limit = _Tilt(limits), getattr(limits, name)
+    for angle, counts in (
+        (math.nextafter(limit, 0.0), False),
+        (limit, True),
+        (limit - limits.hysteresis, True),
+        (math.nextafter(limit - limits.hysteresis, 0.0), False),
+    ):
+        tilt.update(angle)
+        assert getattr(tilt, name) is counts
 
 
 # Requests

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
@@ -574,6 +575,18 @@ def test_power_goes_off_only_once_the_motor_rests(rpm: int, switched_off: bool):
             assert spent == pytest.approx(0.01)
         else:
             assert spent == pytest.approx(0.3 - 0.04 + 0.01), "the first look after that time"
+
+    steps(test)
+
+
+@pytest.mark.parametrize(("counts", "moved"), [(900_001, True), (900_002, False), (-900_001, True), (-900_002, False)])
+def test_a_position_moves_no_faster_than_half_as_fast_again_as_the_motor_can(counts: int, moved: bool):
+    async def test(rig: Steps) -> None:
+        rig.session._counts_per_turn = 2000
+        rig.session._publish(0, rig.clock.now())
+        rig.session._publish(counts, rig.clock.now() + SECOND)
+        turns = rig.out.kept[-1].position / (2 * math.pi)
+        assert turns == pytest.approx(counts / 2000 if moved else 0.0)
 
     steps(test)
 
