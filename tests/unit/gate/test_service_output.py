@@ -183,6 +183,20 @@ def test_the_latch_is_tried_again_every_second_and_marked_until_it_is_stored():
     assert disk.closed == 1
 
 
+def test_a_stop_that_was_reset_before_it_could_be_stored_leaves_the_disk_alone():
+    disk = Disk(failures=1)
+
+    async def scenario(bench):
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.1)
+        assert bench.order(Order.RESET).reason is Reason.OK
+        await bench.clock.sleep(2.0)
+        assert disk.asked == [True]
+        assert disk.marks[-1] is False
+
+    on_bench(scenario, disk, inline)
+
+
 def test_a_mark_stays_when_the_latch_could_not_be_stored_to_the_end():
     disk = Disk(failures=100)
 

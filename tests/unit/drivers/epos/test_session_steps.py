@@ -306,6 +306,16 @@ def test_a_quick_stop_is_sent_once_each_time_it_is_wanted(state: State):
     steps(test)
 
 
+@pytest.mark.parametrize(("rpm", "urgent"), [(899, True), (900, False), (901, False), (-900, True)])
+def test_a_slower_target_is_urgent_and_no_other(rpm: int, urgent: bool):
+    async def test(rig: Steps) -> None:
+        rig.session._state, rig.session._sent_rpm = State.ENABLED, 900
+        rig.say(DriveAction.RUN, rpm)
+        assert rig.session._is_urgent() is urgent
+
+    steps(test)
+
+
 def test_a_faster_target_waits_for_its_turn_and_a_slower_one_does_not():
     async def test(rig: Steps) -> None:
         session = rig.session
