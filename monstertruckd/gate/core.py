@@ -125,7 +125,7 @@ class Gate:
         services: Mapping[str, Reason],
         nonce: str,
         battery_measured: bool,
-        latched: bool = False,
+        latched: bool,
     ) -> None:
         self._config = config
         self._chassis = chassis

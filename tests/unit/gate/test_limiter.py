@@ -311,6 +311,14 @@ def test_before_a_way_was_checked_nothing_stops_the_truck():
     assert (limiter.blocked, limiter.blind, limiter.emergency, limiter.free) == (False, False, False, None)
 
 
+def test_standstill_forgets_what_stopped_the_truck():
+    limiter = Rig().gate._limiter
+    limiter.blocked = limiter.blind = limiter.emergency = True
+    limiter.free = 0.1
+    limiter.halt()
+    assert (limiter.blocked, limiter.blind, limiter.emergency, limiter.free) == (False, False, False, None)
+
+
 def test_a_truck_at_rest_before_a_wall_does_not_set_off():
     rig = Rig().armed()
     rig.obstacles = wall(0.04)

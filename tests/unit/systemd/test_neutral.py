@@ -253,6 +253,10 @@ def test_the_line_is_raw_at_its_rate_and_what_was_waiting_on_it_is_forgotten(neu
     controller.close()
 
 
+def test_the_codec_is_looked_for_in_a_checkout_and_in_an_installation(neutral):
+    assert sys.path[-2:] == [str(SCRIPT.parents[1] / "drivers"), str(SCRIPT.parents[2])]
+
+
 def ended(monkeypatch, *arguments):
     """Exit code of the script run as a program."""
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
