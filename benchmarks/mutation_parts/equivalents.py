@@ -26,6 +26,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed[0] != now -> True": CACHE,
     f"{GATE}sensors.py::SensorMonitor.speed: 0 -> (1)": CACHE,
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
+    f"{GATE}sensors.py::SteeringCheck._begin: 0.0 -> (1.0)": "turns are compared by their differences",
     f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": UNREAD,
     f"{GATE}service.py::GateService._publish: (output.mode is GateMode.ESTOPPED) != self._latched -> True": (
         "what is stored is compared once more with the mode"

@@ -67,7 +67,7 @@ def test_what_a_body_cannot_do_is_refused_by_name(config, expected):
 )
 def test_a_ceiling_is_still_within_it_up_to_rounding(name, limit):
     unchecked = GateConfig().model_copy
-    for excess, found in ((0.0, []), (0.5e-9, []), (1.5e-9, [f"gate.{name}"])):
+    for excess, found in ((0.0, []), (1e-9, []), (1.5e-9, [f"gate.{name}"])):
         refused = beyond(unchecked(update={name: limit + excess}), BODY)
         assert [text.split()[0] for text in refused] == found
 

@@ -228,6 +228,9 @@ def test_every_drive_is_stopped_and_counts(neutral, second):
 def test_the_line_is_raw_at_its_rate_and_what_was_waiting_on_it_is_forgotten(neutral, monkeypatch):
     controller = Controller(0, 0)
     os.write(controller.master, b"rubbish")
+    cooked = termios.tcgetattr(controller.slave)
+    cooked[3] |= termios.ECHO | termios.ICANON
+    termios.tcsetattr(controller.slave, termios.TCSANOW, cooked)
     flushed, closed = [], []
     monkeypatch.setattr(neutral.termios, "tcflush", lambda line, queue: flushed.append(queue))
     settings = {}
