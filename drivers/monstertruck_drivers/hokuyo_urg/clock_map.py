@@ -120,16 +120,24 @@ class ClockMap:
         above = prompt - self._lowest(self._window) if len(self._newest) == PROMPT else 0.0
         self.late = round(above) if above > LATE else 0
         if not self.late:
-            breaks = self._drift.breaks
+            breaks, drift = self.slews, self.drift
             self._drift.add(elapsed, sample)
-            if above > APART or self._drift.breaks > breaks:
+            if self.slews > breaks and self._reference is not None:
+                # Samples since the slew say nothing of the latency.
+                before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
+                self._find_latency(self._reference, before, drift)
+                self._keep_latency()
+            if above > APART or abs(self.drift - drift) > BREAK:
                 self._window.clear()
                 self._window.extend(self._newest)
             else:
                 self._window.append((elapsed, sample))
         self._envelope = self._lowest(self._window)
         if self._reference is not None:
-            self._find_latency(self._reference, sample)
+            self._settling.append((elapsed, sample))
+            self._find_latency(self._reference, self._settling, self.drift)
+            if elapsed > SETTLE:
+                self._keep_latency()
 
     def _lowest(self, samples: Iterable[tuple[int, int]]) -> float:
         """The envelope of samples at the newest one's time."""
@@ -137,21 +145,21 @@ class ClockMap:
 
     def _restart(self, waited: int, arrival: int) -> None:
         """The counter began anew: by the latency found so far."""
-        self._reference = None
-        self._settling.clear()
+        self._keep_latency()
         self._elapsed += waited
         self._newest.clear()
         self._window.clear()
         self._drift.forget()
         self._take(self._elapsed, arrival - self._elapsed)
 
-    def _find_latency(self, reference: int, sample: int) -> None:
+    def _find_latency(self, reference: int, samples: Iterable[tuple[int, int]], drift: float) -> None:
         """The least time from the counter to the arrival, as the comparison at the start tells it."""
-        self._settling.append((self._elapsed, sample))
-        self._latency = round(min(value - reference - self.drift * elapsed for elapsed, value in self._settling))
-        if self._elapsed > SETTLE:
-            self._reference = None
-            self._settling.clear()
+        self._latency = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
+
+    def _keep_latency(self) -> None:
+        """It is no longer looked for."""
+        self._reference = None
+        self._settling.clear()
 
 
 class Drift:

@@ -92,9 +92,15 @@ def test_the_stamp_never_steps_backwards():
 
 
 def two_clocks(
-    *, seconds: int, drift_ppm: float = 0.0, slew: float = 0.0, jump_ms: float = 0.0, jitter_ms: float = 10.0
+    *,
+    seconds: int,
+    drift_ppm: float = 0.0,
+    slew: float = 0.0,
+    jump_ms: float = 0.0,
+    jitter_ms: float = 10.0,
+    at: float = 40.0,
 ) -> tuple[np.ndarray, ClockMap]:
-    """Errors of the stamps, ms, of a stream whose host's clock is slewed by a share ``slew`` from 40 to 45 s.
+    """Errors of the stamps, ms, of a stream whose host's clock is slewed by a share ``slew`` for 5 s from ``at`` s.
 
     From 60 s on scans arrive ``jump_ms`` later.
     """
@@ -103,7 +109,7 @@ def two_clocks(
     truth = origin + 2 * SECOND + (np.arange(seconds * 10) * 100 * MS / rate).astype(np.int64)
 
     def host(time: np.ndarray) -> np.ndarray:
-        return (time + slew * np.clip(time - origin - 40 * SECOND, 0, 5 * SECOND)).astype(np.int64)
+        return (time + slew * np.clip(time - origin - at * SECOND, 0, 5 * SECOND)).astype(np.int64)
 
     counters = ((truth - origin) * rate // MS + 3_000_000).astype(np.int64) % WRAP
     late = rng.uniform(0, jitter_ms, len(truth)) + jump_ms * (truth - origin > 60 * SECOND)
@@ -131,6 +137,14 @@ def test_slews_are_followed(slew: float):
     assert np.abs(errors).max() < 110
     assert np.abs(errors[-300:]).max() < 5
     assert mapping.late == 0
+
+
+@pytest.mark.parametrize("at", [8.0, 11.5, 16.0, 18.0])
+@pytest.mark.parametrize("slew", [-0.1, -0.037, -0.01, 0.01, 0.037, 0.1])
+def test_slews_while_the_latency_is_being_found_are_followed(slew: float, at: float):
+    """As after the start of the computer, when its clock is set."""
+    errors, _ = two_clocks(seconds=60, slew=slew, at=at)
+    assert np.abs(errors[300:]).max() < 50
 
 
 def test_scans_that_become_late_are_late():
