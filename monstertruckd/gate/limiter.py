@@ -71,7 +71,7 @@ MEMORY: Final = 30 * SECOND
 """Scans are remembered for so long, ns: somebody may step onto ground that was free, or take an obstacle away."""
 MEMORY_STEP: Final = 0.1
 """Travelled distance between two remembered scans, m."""
-MEMORY_SCANS: Final = 40
+MEMORY_SCANS: Final = 20
 DRIFT: Final = 0.03
 """The footprint is so much smaller against remembered points, m: the wheels do not tell better where they are."""
 FIELD_EDGE: Final = 0.1

@@ -3,10 +3,11 @@
 import asyncio
 import itertools
 import math
+from unittest.mock import AsyncMock
 
 import pytest
 
-from monstertruck_drivers.epos.driver import RAD_S_PER_RPM
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, _DriveSession
 from monstertruck_drivers.epos.protocol import Control, State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (
@@ -222,7 +223,12 @@ def test_a_power_cycle_while_idle_is_no_secret_either():
     on_bench(test)
 
 
-def test_a_counter_that_restarted_while_unplugged_is_no_motion():
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_counter_that_restarted_while_unplugged_is_no_motion(marked: bool, monkeypatch: pytest.MonkeyPatch):
+    """Also with a controller that knows no object to keep a mark in."""
+    if not marked:
+        monkeypatch.setattr(_DriveSession, "_check_mark", AsyncMock())
+
     async def test(rig: Rig) -> None:
         async with rig.supervised():
             await rig.drive(6_000)

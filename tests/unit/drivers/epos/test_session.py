@@ -236,32 +236,6 @@ def test_a_latched_quick_stop_is_left_through_power_off_once_it_has_not_helped_f
     on_bench(test)
 
 
-def test_a_controller_that_takes_no_mark_and_was_off_while_unplugged_goes_on_where_it_was(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    async def unmarked(session: _DriveSession, attempts: int = 1) -> None:
-        """The controller knows no object to keep a mark in."""
-
-    monkeypatch.setattr(_DriveSession, "_check_mark", unmarked)
-
-    async def test(rig: Rig) -> None:
-        async with rig.supervised():
-            await rig.drive(6_000)
-            await rig.settle(1.0)
-            rig.gate.say(DriveAction.QUICK_STOP)
-            await rig.settle(1.0)
-            position = rig.newest.position
-            rig.port.unplug()
-            rig.emulator.power_cycle()
-            await rig.settle(60.0)
-            rig.port.plug()
-            await rig.settle(1.5)
-            assert rig.newest.received > rig.clock.now() - SECOND // 10
-            assert rig.newest.position == position
-
-    on_bench(test)
-
-
 def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
     async def test(rig: Rig) -> None:
         async with rig.driving():
