@@ -2,9 +2,22 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 
 import pytest
 import uvloop
+
+UNIT = Path(__file__).parent / "unit"
+TRACED = (UNIT / "schemas", UNIT / "gate", UNIT / "runtime" / "wire")
+WIRE_FORMATS = ("protocol", "parser", "codec")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the parts whose coverage is a gate: they run under the tracer, which would slow all others."""
+    for item in items:
+        wire_format = UNIT / "drivers" in item.path.parents and any(word in item.nodeid for word in WIRE_FORMATS)
+        if wire_format or any(folder in item.path.parents for folder in TRACED):
+            item.add_marker("traced")
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -68,3 +68,55 @@ def test_bytecode_is_compiled_with_the_environment(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(bootstrap.subprocess, "run", lambda command, **_: commands.append(command))
     bootstrap.sync(("dev",))
     assert "--compile-bytecode" in commands[0]
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch):
+    """Arguments of every check that was run, and the exit codes of those of pytest, which a test fills."""
+    ran: list[tuple[str, ...]] = []
+    codes: list[int] = []
+
+    def run(program: Path, *arguments: str) -> int:
+        if program.name != "pytest":
+            return 0
+        ran.append(arguments)
+        return codes.pop(0) if codes else 0
+
+    monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
+    monkeypatch.setattr(bootstrap, "run", run)
+    return ran, codes
+
+
+def test_tests_that_failed_beside_others_are_run_once_more_alone(steps):
+    ran, codes = steps
+    codes += [0, 1, 0]
+    assert bootstrap.check([]) == 0
+    assert len(ran) == 5
+    assert ran[2] == (*ran[1], *bootstrap.FAILED_ALONE)
+
+
+@pytest.mark.parametrize("again", [1, 5])
+def test_tests_that_fail_twice_or_are_not_found_again_fail_the_check(steps, again: int):
+    ran, codes = steps
+    codes += [1, again]
+    assert bootstrap.check([]) == again
+    assert len(ran) == 2
+
+
+def test_a_step_that_ran_no_tests_is_not_tried_again(steps):
+    ran, codes = steps
+    codes += [2]
+    assert bootstrap.check([]) == 2
+    assert len(ran) == 1
+
+
+def test_every_test_belongs_to_one_step(steps):
+    ran, _ = steps
+    bootstrap.check([])
+    chosen = [arguments[arguments.index("-m") + 1] for arguments in ran]
+    for wall in (True, False):
+        for virtual in (True, False):
+            for traced in (True, False):
+                marks = {"wall": wall, "virtual": virtual, "traced": traced}
+                count = sum(eval(expression, {}, marks) for expression in chosen)
+                assert count == 1 or (wall and virtual)

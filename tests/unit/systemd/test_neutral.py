@@ -109,8 +109,8 @@ def neutral(monkeypatch):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(module, "time", Clock())
-    patient = SimpleNamespace(select=lambda r, w, e, seconds: select.select(r, w, e, 6 * seconds))  # a busy computer
-    monkeypatch.setattr(module, "select", patient)
+    slower = SimpleNamespace(select=lambda r, w, e, seconds: select.select(r, w, e, 6 * seconds))  # a busy computer
+    monkeypatch.setattr(module, "select", slower)
     return module
 
 
@@ -228,6 +228,7 @@ def test_every_drive_is_stopped_and_counts(neutral, second):
 def test_the_line_is_raw_at_its_rate_and_what_was_waiting_on_it_is_forgotten(neutral, monkeypatch):
     controller = Controller(0, 0)
     os.write(controller.master, b"rubbish")
+    assert select.select([controller.slave], [], [], 10)[0]  # arrived while the line is raw: no echo for the controller
     cooked = termios.tcgetattr(controller.slave)
     cooked[3] |= termios.ECHO | termios.ICANON
     termios.tcsetattr(controller.slave, termios.TCSANOW, cooked)
