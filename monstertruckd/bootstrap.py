@@ -36,6 +36,8 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
 """Where the tests of the parts are whose coverage is a gate (marked in tests/conftest.py)."""
+TESTS = ("-n", "2", "--hypothesis-profile", "ci")
+"""Two at a time; property tests have the same examples every time, and no time limit. Plain pytest draws new ones."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
@@ -148,14 +150,11 @@ def check(arguments: list[str]) -> int:
         (tools / "ruff", ["format", "--check", "."]),
         (tools / "mypy", []),
         (tools / "lint-imports", []),
-        (pytest, ["-n", "2", "-m", "not wall and not virtual and not traced", *arguments]),
-        (
-            pytest,
-            ["-n", "2", "-m", "traced and not wall and not virtual", "--cov", "--cov-report=", *arguments],
-        ),
+        (pytest, [*TESTS, "-m", "not wall and not virtual and not traced", *arguments]),
+        (pytest, [*TESTS, "-m", "traced and not wall and not virtual", "--cov", "--cov-report=", *TRACED]),
         (tools / "coverage", ["report"]),
-        (pytest, ["-n", "2", "-m", "virtual", *arguments]),
-        (pytest, ["-n", "2", "-m", "wall", *arguments]),
+        (pytest, [*TESTS, "-m", "virtual", *arguments]),
+        (pytest, [*TESTS, "-m", "wall", *arguments]),
     ]
     for program, rest in steps:
         code = step(program, rest)
