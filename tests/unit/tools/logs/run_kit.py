@@ -1,5 +1,8 @@
 """A short log of several topics, and what is in it."""
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -45,3 +48,15 @@ def write(file: Path, messages=40, compression="lz4") -> list[tuple]:
             log.flush()
     log.finish()
     return written
+
+
+@contextmanager
+def flipped(log: Path, place: int, bit: int) -> Iterator[None]:
+    """A log with one bit flipped for a while, in place: a disk under load needs long for thousands of new files."""
+    with log.open("r+b", buffering=0) as file:
+        byte = os.pread(file.fileno(), 1, place)[0]
+        os.pwrite(file.fileno(), bytes([byte ^ bit]), place)
+        try:
+            yield
+        finally:
+            os.pwrite(file.fileno(), bytes([byte]), place)

@@ -1,10 +1,5 @@
 """No flipped bit loses or makes a message unreported."""
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -18,20 +13,8 @@ from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.logs.summary import info
-from tests.unit.tools.logs.run_kit import compass, write
+from tests.unit.tools.logs.run_kit import compass, flipped, write
 from tests.unit.tools.replay_check.log_surgery import chunks
-
-
-@contextmanager
-def flipped(log: Path, place: int, bit: int) -> Iterator[None]:
-    """A log with one bit flipped for a while, in place: a disk under load needs long for thousands of new files."""
-    with log.open("r+b", buffering=0) as file:
-        byte = os.pread(file.fileno(), 1, place)[0]
-        os.pwrite(file.fileno(), bytes([byte ^ bit]), place)
-        try:
-            yield
-        finally:
-            os.pwrite(file.fileno(), bytes([byte]), place)
 
 
 @pytest.mark.parametrize("length", [1 << 40, 1 << 63])

@@ -15,6 +15,7 @@ from monstertruckd.tools.cli.main import main
 from monstertruckd.tools.logs.messages import real_offset
 from monstertruckd.tools.logs.summary import LogState, LogSummary, list_logs
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate
+from tests.unit.tools.logs.run_kit import flipped
 
 
 @pytest.fixture
@@ -54,12 +55,13 @@ def test_no_damage_of_one_log_hides_the_others(folder: Path):
     whole = sound.read_bytes()
     index = int.from_bytes(whole[-28:-20], "little")
     damaged = folder / "run-5.mcap"
+    damaged.write_bytes(whole)
     for place in range(index, len(whole) - 8):
-        damaged.write_bytes(whole[:place] + bytes([whole[place] ^ 0x80]) + whole[place + 1 :])
-        *others, last = list_logs(folder)
-        assert last.state is LogState.DAMAGED
-        assert len(others) == 4
-        assert real_offset(LogReader(damaged)) == MAY_2026
+        with flipped(damaged, place, 0x80):
+            *others, last = list_logs(folder)
+            assert last.state is LogState.DAMAGED
+            assert len(others) == 4
+            assert real_offset(LogReader(damaged)) == MAY_2026
 
 
 def test_what_dates_a_log_may_be_damaged_or_a_name_lead_nowhere(folder: Path):
