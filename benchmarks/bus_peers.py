@@ -38,7 +38,7 @@ RANGES = np.random.default_rng(1).uniform(0.1, 5.5, BEAMS)
 CODES = np.full(BEAMS, VALID_BEAM, np.uint8)
 for _array in (RANGES, CODES):
     _array.flags.writeable = False
-PATIENCE = 5.0
+TIMEOUT = 5.0
 OTHER = {"ping": "echo", "echo": "ping"}
 
 
@@ -142,7 +142,7 @@ async def pings(put: Callable[[int], None], receive: Callable[[], Awaitable[obje
                 await asyncio.sleep(max(0.0, due - time.monotonic()))
             begin = time.perf_counter_ns()
             put(number)
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(TIMEOUT):
                 await receive()
             times.append(time.perf_counter_ns() - begin)
         print(json.dumps(times), flush=True)

@@ -16,7 +16,7 @@ import rospy
 from sensor_msgs.msg import LaserScan
 
 BEAMS = 682
-PATIENCE = 5.0
+TIMEOUT = 5.0
 
 
 def main() -> None:
@@ -47,7 +47,7 @@ def main() -> None:
             scan = LaserScan(angle_min=-2.086, angle_max=2.086, angle_increment=0.00613, range_max=5.6, ranges=ranges)
             scan.header.seq, scan.header.stamp, scan.header.frame_id = number, rospy.Time.now(), "lidar"
             out.publish(scan)
-            assert arrived.acquire(timeout=PATIENCE)
+            assert arrived.acquire(timeout=TIMEOUT)
             times.append(time.perf_counter_ns() - begin)
         print(json.dumps(times), flush=True)
 

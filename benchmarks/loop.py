@@ -42,7 +42,7 @@ from monstertruckd.tools.simulation.operator import drive_lap
 HERE = Path(__file__).resolve().parent
 FULL = HERE.parent / "configs" / "full.yaml"
 WARM_UP = 5.0
-PATIENCE = 60.0
+TIMEOUT = 60.0
 GOALS = {
     "late_p99_over_floor_ms": 1.5,
     "callbacks_over_2ms": 0,
@@ -173,7 +173,7 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
                 with client.subscribe(topics.PATH, latest()) as paths:
                     await paths.next()
             tasks.append(asyncio.create_task(drive(client, clock, drives, laps=not goals)))
-            async with clock.deadline(PATIENCE):
+            async with clock.deadline(TIMEOUT):
                 while not drives.states:
                     await clock.sleep(0.1)
             await clock.sleep(WARM_UP)
@@ -239,7 +239,7 @@ async def compare(clock: Clock, rounds: int, seconds: float, added: str | None) 
             config.write_text(json.dumps(sections))
         output = Path(folder) / "simulate.txt"
         async with program(output, "simulate", "--config", str(config)):
-            async with clock.deadline(PATIENCE):
+            async with clock.deadline(TIMEOUT):
                 while b"ready" not in output.read_bytes():
                     await clock.sleep(0.1)
             for _ in range(rounds):

@@ -31,7 +31,7 @@ from navigation_parts.deformation_world import (
 
 STRATEGIES = ("start_to_end", "start_to_next", "point_to_point", "skip_failures", "start_to_receding_end")
 CARS = ("2ws", "4ws")
-LIMIT, PATIENCE = 90.0, 12.0
+LIMIT, TIMEOUT = 90.0, 12.0
 ANGLE = 0.4
 """Greatest axle angle of a plan, rad."""
 
@@ -74,7 +74,7 @@ def drive(scenario: Scenario, car: str, config: LocalPlannerConfig, limit: float
     cycles, trace, reasons = [], [], []
     violations, contacts, touching, least, waited, t = 0, 0, False, math.inf, 0.0, 0.0
     reached = False
-    while t < limit and waited < PATIENCE and not reached:
+    while t < limit and waited < TIMEOUT and not reached:
         world.at(t, truck.pose)
         world.scan(truck.pose, window)
         begin = time.thread_time()

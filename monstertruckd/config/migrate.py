@@ -21,15 +21,18 @@ Step = Callable[[YamlText], None]
 
 RENAMED: Final = (
     (("gate", "obstacle", "beside"), "side_clearance"),
+    (("odometry", "compass", "patience"), "steady_time"),
     (("placement", "deformer"), "local_planner"),
     (("planner", "deform"), "local_planner"),
     (("planner", "ladder"), "recovery"),
     (("planner", "local", "beside"), "rejoin_distance"),
+    (("planner", "local", "patience"), "blocked_timeout"),
     (("planner", "local", "rejoin"), "rejoin_clearance"),
     (("planner", "route", "greed"), "heuristic_weight"),
     (("planner", "sightings"), "blocked_scans"),
     (("slam", "mapper", "thinning"), "pruning"),
     (("tracker", "turn_within"), "steering_distance"),
+    (("usb", "patience"), "empty_timeout"),
 )
 """Keys of version 1, as of release 0.1.0, and what version 2 calls their last part."""
 

@@ -13,7 +13,7 @@ from typing import Final, TextIO
 
 DEPTH: Final = 1000
 """Records waiting for a stuck terminal or journal; beyond that they are lost and counted."""
-PATIENCE: Final = 1.0
+TIMEOUT: Final = 1.0
 """Seconds the end of the process waits for a stuck output."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels of syslog, which journald reads from a line's head."""
@@ -93,12 +93,12 @@ class LogOutputThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what still waits, as far as the output takes it within ``PATIENCE``."""
+        """Write what still waits, as far as the output takes it within ``TIMEOUT``."""
         try:
-            self._handler.records.put(None, timeout=PATIENCE)
+            self._handler.records.put(None, timeout=TIMEOUT)
         except queue.Full:
             return
-        self._thread.join(PATIENCE)
+        self._thread.join(TIMEOUT)
 
     def _run(self) -> None:
         while (record := self._handler.records.get()) is not None:

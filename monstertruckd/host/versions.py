@@ -14,7 +14,7 @@ from monstertruckd import __version__
 
 PACKAGES: Final = ("eclipse-zenoh", "mcap", "numpy", "pydantic", "uvloop")
 ROOT: Final = Path(__file__).resolve().parents[2]
-PATIENCE: Final = 2.0
+TIMEOUT: Final = 2.0
 """Seconds git may take."""
 
 
@@ -41,7 +41,7 @@ def checkout(root: Path) -> str | None:
         return None
     command = [git, "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True)  # noqa: S603
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip()

@@ -70,6 +70,6 @@ class Os4000Config(Schema):
         return self
 
     @property
-    def patience(self) -> float:
+    def timeout(self) -> float:
         """Seconds without a correct sentence that end the session."""
         return max(self.silence, 5 / self.rate)

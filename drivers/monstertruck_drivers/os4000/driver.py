@@ -116,20 +116,20 @@ class Os4000Driver:
         return wrong
 
     async def _serve(self, session: Os4000Session) -> None:
-        patience = round(self._config.patience * SECOND)
-        limit, heard = self._clock.now() + patience, session.bytes_heard
+        timeout = round(self._config.timeout * SECOND)
+        limit, heard = self._clock.now() + timeout, session.bytes_heard
         while True:
             try:
                 sentences = await session.receive(max(limit - self._clock.now(), 0) / SECOND)
             except TimeoutError:
                 if session.bytes_heard == heard:
-                    raise DeviceTimeoutError(f"{self._port.name}: silent for {self._config.patience} s") from None
+                    raise DeviceTimeoutError(f"{self._port.name}: silent for {self._config.timeout} s") from None
                 raise ProtocolError(
                     f"{self._port.name}: {session.bytes_heard - heard} bytes, but no usable sentence "
-                    f"for {self._config.patience} s"
+                    f"for {self._config.timeout} s"
                 ) from None
             if self._publish(sentences):
-                limit, heard = self._clock.now() + patience, session.bytes_heard
+                limit, heard = self._clock.now() + timeout, session.bytes_heard
 
     def _publish(self, sentences: list[Sentence]) -> bool:
         """Publish what is usable; sentences that came in one burst are spaced by the period."""

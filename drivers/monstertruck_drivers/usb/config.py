@@ -73,7 +73,7 @@ class UsbConfig(Schema):
     """Seconds without a further loss after which losses are judged: those behind one hub are one loss of the hub"""
     settle: Seconds = 0.5
     """Seconds without change behind a returned hub before its devices start"""
-    patience: Seconds = 3.0
+    empty_timeout: Seconds = 3.0
     """Seconds a returned hub may stay empty until its devices count as unplugged"""
     stagger: Seconds = 0.3
     """Seconds between the start of a device that loads the hub and the one before it"""

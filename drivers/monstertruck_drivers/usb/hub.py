@@ -225,7 +225,7 @@ class HubCoordinator:
 
     def _pause(self, outage: _HubOutage) -> int:
         """Nanoseconds without change after which a returned hub's devices may start."""
-        return _ns(self._config.settle if self._back(outage) else self._config.patience)
+        return _ns(self._config.settle if self._back(outage) else self._config.empty_timeout)
 
     def _release(self, now: int) -> None:
         for outage in list(self._outages.values()):
@@ -365,7 +365,7 @@ def _nothing() -> None:
 
 BURST: Final = 0.02
 """Seconds in which announcements are gathered: a hub announces dozens at once."""
-IMPATIENT: Final = 0.5
+WAITING_RESCAN: Final = 0.5
 """Seconds between two looks while a driver waits for a hub."""
 PERIOD: Final = SECOND
 """Nanoseconds between two trees when nothing changes."""
@@ -445,7 +445,7 @@ class UsbService:
         snapshot = await self._machine.offload(lambda: read_tree(self._machine.sysfs))
         self._hubs.update(snapshot)
         # Who waits for a hub does not ask for a look, so without announcements one has to be quick oneself.
-        rescan = min(self._config.rescan, IMPATIENT) if self._hubs.waiting else self._config.rescan
+        rescan = min(self._config.rescan, WAITING_RESCAN) if self._hubs.waiting else self._config.rescan
         self._look_at = self._clock.now() + round(rescan * SECOND)
         for node in self._hubs.tree():
             if node.role is not None and node.autosuspend and self._reported_asleep.get(node.name) != node.replugs:

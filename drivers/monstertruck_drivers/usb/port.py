@@ -148,7 +148,7 @@ class PortPower:
             raise DeviceError(f"{place(name)}: uhubctl failed with {code}: {output}")
 
 
-OPEN_PATIENCE: Final = 2.0
+OPEN_TIMEOUT: Final = 2.0
 """Seconds a fresh node may refuse: it is announced before its driver and permissions are in place."""
 RETRY: Final = 0.05
 SHORT_SESSION: Final = 10 * SECOND
@@ -254,7 +254,7 @@ class HubPort:
             PortBusyError: another process holds it.
         """
         await self._cycle_if_hopeless()
-        give_up = self._machine.clock.now() + round(OPEN_PATIENCE * SECOND)
+        give_up = self._machine.clock.now() + round(OPEN_TIMEOUT * SECOND)
         while True:
             node = await self._node.resolve()
             device = self._machine.dev / node.name

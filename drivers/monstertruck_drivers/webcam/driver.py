@@ -125,20 +125,20 @@ class WebcamDriver:
         self._reported_mode = granted
 
     async def _serve(self, stream: FrameStream, ready: Ready) -> None:
-        patience = self._config.watchdog
-        limit, seen = self._clock.now() + round(patience * SECOND), 0
+        timeout = self._config.watchdog
+        limit, seen = self._clock.now() + round(timeout * SECOND), 0
         while True:
             try:
                 async with self._clock.deadline((limit - self._clock.now()) / SECOND):
                     frame = await stream.next()
             except TimeoutError:
                 if seen == 0:
-                    raise DeviceTimeoutError(f"{self._source.name}: no picture for {patience} s") from None
-                raise ProtocolError(f"{self._source.name}: {seen} pictures in {patience} s, none whole") from None
+                    raise DeviceTimeoutError(f"{self._source.name}: no picture for {timeout} s") from None
+                raise ProtocolError(f"{self._source.name}: {seen} pictures in {timeout} s, none whole") from None
             seen += 1
             if self._publish(frame):
                 ready()
-                limit, seen = self._clock.now() + round(patience * SECOND), 0
+                limit, seen = self._clock.now() + round(timeout * SECOND), 0
 
     def _publish(self, frame: CameraFrame) -> bool:
         received = self._clock.now()

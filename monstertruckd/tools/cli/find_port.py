@@ -17,28 +17,28 @@ SETTLE: Final = 0.4
 """Seconds after the first loss until all of it is seen: a hub takes its devices along."""
 
 
-async def find_cable(role: str, machine: Machine, say: Callable[[str], None], patience: float) -> UsbPortConfig:
+async def find_cable(role: str, machine: Machine, say: Callable[[str], None], timeout: float) -> UsbPortConfig:
     """Ask for a cable to be unplugged and plugged in again, and name its place.
 
     Args:
         role: what the cable leads to, for the questions and the baud rate.
         machine: where to look.
         say: shows one line to the user.
-        patience: seconds to wait for either.
+        timeout: seconds to wait for either.
 
     Raises:
         NoAnswerError: no cable was unplugged in time.
     """
     say(f"unplug the USB cable of: {role}")
     try:
-        async with machine.clock.deadline(patience):
+        async with machine.clock.deadline(timeout):
             device = await _unplugged(machine, say)
     except TimeoutError:
-        raise NoAnswerError(f"no cable was unplugged within {patience:g} s") from None
+        raise NoAnswerError(f"no cable was unplugged within {timeout:g} s") from None
     say(f"{role}: {place(device.name)}, {device.usb_id} {device.title}".rstrip())
     say("plug it in again")
     try:
-        async with machine.clock.deadline(patience):
+        async with machine.clock.deadline(timeout):
             while await machine.offload(lambda: read_device(machine.sysfs, device.name)) is None:
                 await machine.clock.sleep(POLL)
     except TimeoutError:

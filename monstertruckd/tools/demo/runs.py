@@ -32,7 +32,7 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import PERIOD, Follower
 
-PATIENCE = 60.0
+TIMEOUT = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
 
 
@@ -100,7 +100,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
         try:
-            lap = await drive_lap(client, clock, patience=PATIENCE)
+            lap = await drive_lap(client, clock, timeout=TIMEOUT)
             await clock.sleep(1.0)
             if given.get("map"):
                 await _appear((folder / "map.png").exists, clock)
@@ -124,11 +124,11 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
 async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]:
     """Enter once the simulator has said that its devices are plugged in."""
     try:
-        async with clock.deadline(PATIENCE):
+        async with clock.deadline(TIMEOUT):
             while b"ready" not in said():
                 await clock.sleep(0.05)
     except TimeoutError:
-        raise NoAnswerError(f"the simulator did not come up within {PATIENCE:g} s: {said()!r}") from None
+        raise NoAnswerError(f"the simulator did not come up within {TIMEOUT:g} s: {said()!r}") from None
     yield
 
 
@@ -194,7 +194,7 @@ async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subpro
 async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
     """A client, as soon as the daemon listens."""
     try:
-        async with clock.deadline(PATIENCE):
+        async with clock.deadline(TIMEOUT):
             while True:
                 try:
                     async with TruckClient(robot, endpoint, clock=clock, timeout=0.5) as client:
@@ -203,7 +203,7 @@ async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
                 except NotFoundError:
                     await clock.sleep(0.2)
     except TimeoutError:
-        raise NoAnswerError(f"the daemon did not come up within {PATIENCE:g} s at {endpoint}") from None
+        raise NoAnswerError(f"the daemon did not come up within {TIMEOUT:g} s at {endpoint}") from None
     return TruckClient(robot, endpoint, source=f"demo:{os.getpid()}", clock=clock)
 
 

@@ -18,7 +18,7 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 
 MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
 """Kernel modules by vendor; all others are USB-CDC."""
-PATIENCE: Final = 15.0
+TIMEOUT: Final = 15.0
 """Seconds for one device's whole answer; a scanner that measures has to be stopped first."""
 
 
@@ -115,10 +115,10 @@ async def _handshake(context: HostContext, role: str, device: Device[Schema], no
     check, kind = f"{role} handshake", device.kind
     again = context.command("probe", role, "--port", str(node))
     try:
-        async with context.computer.machine.clock.deadline(PATIENCE):
+        async with context.computer.machine.clock.deadline(TIMEOUT):
             answer = await _probe(context, role, device, kind, node)
     except TimeoutError:
-        return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {PATIENCE:g} s", again)
+        return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {TIMEOUT:g} s", again)
     except PortBusyError as error:
         return fail(check, error.reason, str(error), f"sudo fuser -v {node}")
     except WrongDeviceError as error:

@@ -36,7 +36,7 @@ CONNECT: Final = 10.0
 """Seconds in which the scheduler of a cluster must answer."""
 LEG: Final = 25
 """Faults of one truck."""
-PATIENCE: Final = 15.0
+TIMEOUT: Final = 15.0
 """Seconds after which a service that has not recovered is stuck."""
 RECOVERS_WITHIN: Final = 4.0
 """Seconds within which everything should be back: the goal of a lost hub."""
@@ -270,7 +270,7 @@ class _LegRun:
         while left:
             before = len(self._outcomes)
             async with DrillTruck.running(self._config, self._clock) as truck:
-                await truck.until(lambda: not truck.blockers(), PATIENCE)  # called within this turn only
+                await truck.until(lambda: not truck.blockers(), TIMEOUT)  # called within this turn only
                 for fault in left:
                     outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)))
                     if outcome is None:
@@ -317,7 +317,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Fault
     ended = clock.now()
     await apply(fault.end, context)
     truck.listen()
-    await truck.until(lambda: not truck.blockers(), PATIENCE)
+    await truck.until(lambda: not truck.blockers(), TIMEOUT)
     recovered = (clock.now() - ended) / SECOND
     blockers = truck.blockers()
     if not blockers and not await _drive(truck):
@@ -344,7 +344,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Fault
 async def _drive(truck: DrillTruck) -> bool:
     """Arm and come to speed."""
     truck.observer.arm()
-    return await truck.until(truck.drives, PATIENCE, Order.ARM)
+    return await truck.until(truck.drives, TIMEOUT, Order.ARM)
 
 
 def _reasons(report: Event | GateState | HealthTable) -> Iterator[Reason]:

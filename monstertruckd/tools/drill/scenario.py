@@ -36,7 +36,7 @@ SENSORS: Final[Mapping[str, Topic[Any]]] = {
     "drive": topics.DRIVE,
     "steering": topics.STEERING,
 }
-PATIENCE: Final = 10.0
+TIMEOUT: Final = 10.0
 """Seconds in which a sound truck is ready, and drives when it is armed."""
 ALL: Final = 1 << 20
 """Depth of queues that must not lose anything."""
@@ -161,7 +161,7 @@ class Scenario:
         resumes: the truck goes on by itself afterwards, by the gate's rule for short faults.
         by_station: a station drives, not the tracker.
         overlay: configuration it needs.
-        patience: seconds in which the truck has to recover; a replugged device: 2 s.
+        timeout: seconds in which the truck has to recover; a replugged device: 2 s.
     """
 
     fault: Fault[ScenarioContext]
@@ -174,7 +174,7 @@ class Scenario:
     resumes: bool = False
     by_station: bool = False
     overlay: Mapping[str, Any] = field(default_factory=dict)
-    patience: float = 2.0
+    timeout: float = 2.0
 
     @property
     def name(self) -> str:
@@ -293,7 +293,7 @@ class _ScenarioRun:
             if self.truck.rig.daemon_ended:
                 return self._reaction(exited=True)
             await apply(fault.end, self.context)
-            recovered = await self.truck.until(self._drivable, scenario.patience)
+            recovered = await self.truck.until(self._drivable, scenario.timeout)
             after = (self.clock.now() - self.ended) / SECOND if recovered else None
             await self.clock.sleep(0.5)
             moved = abs(self.observer.speed) > AT_REST
@@ -328,7 +328,7 @@ class _ScenarioRun:
         return not self.truck.blockers()
 
     async def _require(self, condition: Callable[[], bool], what: str, order: Order | None = None) -> None:
-        if not await self.truck.until(condition, PATIENCE, order):
+        if not await self.truck.until(condition, TIMEOUT, order):
             blockers = ", ".join(self.truck.blockers()) or "nothing"
             raise NoAnswerError(f"{self.scenario.name}: waited for {what}; blocked by {blockers}")
 
@@ -481,7 +481,7 @@ def _afterwards(scenario: Scenario, got: Reaction) -> Iterator[str]:
     if scenario.expect is Expect.EXIT:
         return
     if scenario.recovers and got.recovered_after_s is None:
-        yield f"not recovered within {scenario.patience:g} s"
+        yield f"not recovered within {scenario.timeout:g} s"
     if scenario.recovers and not got.drove_again:
         yield "cannot be driven again"
     if scenario.expect is not Expect.ENDURE and got.moved_by_itself is not scenario.resumes:

@@ -105,7 +105,7 @@ def of_device(role: str) -> Iterator[Scenario]:
         stop,
         seen=stale,
         device=role,
-        patience=4.0,
+        timeout=4.0,
     )
     yield noise(role)
     yield Scenario(
@@ -127,7 +127,7 @@ def with_line() -> Iterator[Scenario]:
             seen=(Reason.DRIVE_STALE,),
             device="drive",
             overlay=LINE,
-            patience=4.0,
+            timeout=4.0,
         )
 
 
@@ -151,7 +151,7 @@ def wrong_devices() -> Iterator[Scenario]:
             ),
             Expect.REFUSE,
             down=dict(zip((one, other), reasons, strict=True)),
-            patience=4.0,
+            timeout=4.0,
         )
 
 
@@ -237,7 +237,7 @@ def of_the_truck() -> Iterator[Scenario]:
         Expect.STOP,
         seen=(Reason.DRIVE_FAULT,),
         down={"drive": Reason.DEVICE_FAULT},
-        patience=15.0,
+        timeout=15.0,
     )
     yield Scenario(
         Fault("drive: over-current that passes", command("drive", "fault over_current passing")),
@@ -277,14 +277,14 @@ def of_the_truck() -> Iterator[Scenario]:
         Fault("battery critical", set_charge(0.02), set_charge(1.0), hold=20.0),
         Expect.STOP_AHEAD,
         seen=(Reason.BATTERY_CRITICAL,),
-        patience=60.0,
+        timeout=60.0,
     )
     yield Scenario(
         Fault("battery critical before arming", set_charge(0.02), set_charge(1.0), hold=17.0),
         Expect.REFUSE,
         seen=(Reason.BATTERY_CRITICAL,),
         lead=15.0,
-        patience=60.0,
+        timeout=60.0,
     )
     yield Scenario(
         Fault("obstacle 0.6 m ahead", place_obstacle(0.6), clear_obstacles, hold=8.0),

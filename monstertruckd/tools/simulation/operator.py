@@ -96,13 +96,13 @@ class Lap:
         return float(np.sqrt(np.mean(self.cross_track**2))) if len(self.cross_track) else 0.0
 
 
-async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0, limit: float = 600.0) -> Lap:
+async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, limit: float = 600.0) -> Lap:
     """Arm the truck, watch the tracker drive its path to the end, disarm; after a stop that disarms it, arm it again.
 
     Args:
         operator: gives the orders.
         clock: time.
-        patience: seconds to wait until the truck can be armed.
+        timeout: seconds to wait until the truck can be armed.
         limit: seconds the path may take.
 
     Raises:
@@ -113,7 +113,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
         operator.subscribe(topics.STOP, latest()) as stop,
         operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
     ):
-        await _arm(operator, clock, patience)
+        await _arm(operator, clock, timeout)
         start = clock.now()
         cross_track: list[float] = []
         interruptions: list[Reason] = []
@@ -129,7 +129,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
                     state = gate.latest
                     if state is not None and not state.mode.active and len(interruptions) < INTERRUPTIONS:
                         interruptions.append(stop.latest.reason if stop.latest is not None else Reason.DISARMED)
-                        await _arm(operator, clock, patience)
+                        await _arm(operator, clock, timeout)
         except TimeoutError:
             held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""
             raise NoAnswerError(f"path not finished within {limit:g} s ({held or 'nothing held the truck'})") from None
@@ -137,10 +137,10 @@ async def drive_lap(operator: Operator, clock: Clock, *, patience: float = 30.0,
             await operator.disarm()
 
 
-async def _arm(operator: Operator, clock: Clock, patience: float) -> None:
+async def _arm(operator: Operator, clock: Clock, timeout: float) -> None:
     refusal = ""
     try:
-        async with clock.deadline(patience):
+        async with clock.deadline(timeout):
             while True:
                 try:
                     await operator.arm()
@@ -150,5 +150,5 @@ async def _arm(operator: Operator, clock: Clock, patience: float) -> None:
                     return
                 await clock.sleep(0.25)
     except TimeoutError:
-        text = f"the truck could not be armed within {patience:g} s: {refusal or 'no answer'}"
+        text = f"the truck could not be armed within {timeout:g} s: {refusal or 'no answer'}"
         raise NoAnswerError(text) from None

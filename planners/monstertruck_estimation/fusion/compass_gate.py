@@ -86,7 +86,7 @@ def gate_heading(
     disturbed if the device says so, the field's strength is not that of the start, or the local deviation has crept
     further than that. Neither locks the compass out:
     ``config.recover`` good ones over ``config.regain`` let it in again (next to a magnet, too, there is a place where
-    the heading is right), and so does one that is steadily off for ``config.patience``, as a
+    the heading is right), and so does one that is steadily off for ``config.steady_time``, as a
     new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it.
     """
     gate, disturbed = _field(gate, innovation, config)
@@ -129,7 +129,7 @@ def _good(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust
     gate = replace(gate, good=gate.good + 1)
     (x, y, yaw), (x0, y0, yaw0) = innovation.place, gate.good_from
     far = math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0)) >= config.regain
-    long = innovation.stamp - gate.good_since >= config.patience * SECOND
+    long = innovation.stamp - gate.good_since >= config.steady_time * SECOND
     return gate, gate.good >= config.recover and (far or long)
 
 
@@ -143,7 +143,7 @@ def _far(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust)
             return HeadingUse.HOME, replace(gate, disturbed=False, good=0, home_good=0)
     steady = abs(wrap_angle(innovation.residual - gate.last)) <= config.local
     gate = _off(gate, innovation, steady=steady)
-    if innovation.stamp - gate.steady_since < config.patience * SECOND:
+    if innovation.stamp - gate.steady_since < config.steady_time * SECOND:
         return HeadingUse.LEFT_OUT, gate
     home = gate.home or innovation.north
     return HeadingUse.ANCHORED, replace(gate, disturbed=False, good=0, home=home, home_good=0)

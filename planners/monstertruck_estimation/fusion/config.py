@@ -44,8 +44,8 @@ class HeadingTrust(Schema):
     recover: Annotated[int, Field(ge=1)] = 10
     """Good headings in a row until a compass that was disturbed counts again,"""
     regain: Positive = 2.0
-    """over at least so many metres, or radians, or else over the time of patience."""
-    patience: Positive = 10.0
+    """over at least so many metres, or radians, or else over the steady time."""
+    steady_time: Positive = 10.0
     """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
 
 

@@ -48,7 +48,7 @@ class LocalConfig(Schema):
     """More than that is needed to go back to the route, m..."""
     rejoin_distance: Positive = 0.06
     """...and the truck may be this far from it, m, counting 0.3 m a radian."""
-    patience: Positive = 2.0
+    blocked_timeout: Positive = 2.0
     """Seconds without a way round something after which the route counts as blocked."""
     detour: Positive = 45.0
     """Seconds of deformation that do not bring the truck on along its route, after which the same holds."""

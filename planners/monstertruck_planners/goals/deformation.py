@@ -136,7 +136,7 @@ class RouteDeformation:
 
     def blocked(self, now: int) -> bool:
         """Whether the route leads nowhere: no way round for some time, or a detour without end."""
-        return (self.held_up and now - self._since > self._local.patience * SECOND) or (
+        return (self.held_up and now - self._since > self._local.blocked_timeout * SECOND) or (
             self.deformed and now - self._onward > self._local.detour * SECOND
         )
 

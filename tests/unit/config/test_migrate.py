@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruckd.config.edit import YamlText
 from monstertruckd.config.load import load_config, load_tree, load_truck
@@ -124,9 +125,13 @@ planner:
   deform: {{ kind: rsband }}  # round obstacles
   ladder: [wait, replan]
   "sightings": 4
-  local: {{ beside: 0.07, rejoin: 0.02 }}
+  local: {{ beside: 0.07, rejoin: 0.02, patience: 3.0 }}
   route: {{ kind: hybrid, greed: 1.5 }}
 placement: {{ deformer: loop }}
+odometry:
+  kind: fusion
+  compass: {{ patience: 20.0 }}
+usb: {{ patience: 4.0 }}
 gate:
   obstacle: {{ beside: 0.03 }}
 slam:
@@ -153,7 +158,12 @@ def check_0_1_0(config: TruckConfig) -> None:
     assert planner.local_planner.kind == "rsband"
     assert (planner.recovery, planner.blocked_scans) == (("wait", "replan"), 4)
     assert (planner.local.rejoin_distance, planner.local.rejoin_clearance) == (0.07, 0.02)
+    assert planner.local.blocked_timeout == 3.0
     assert planner.route.heuristic_weight == 1.5
+    assert isinstance(config.odometry, FusionConfig)
+    assert config.odometry.compass is not None
+    assert config.odometry.compass.steady_time == 20.0
+    assert config.usb.empty_timeout == 4.0
     assert config.placement.local_planner == "loop"
     assert config.gate.obstacle.side_clearance == 0.03
     assert config.slam is not None

@@ -23,7 +23,7 @@ from tests.unit.drivers.kit import Events, Kept, background
 
 T = TypeVar("T")
 
-PATIENCE = 10
+ATTEMPTS = 10
 """Tries of an exchange that the library gives only 34 ms."""
 
 
@@ -54,7 +54,7 @@ class Library:
         self.port.closePort()
 
     def repeated(self, call: Callable[[], tuple[T, int, int]]) -> tuple[T, int]:
-        for _ in range(PATIENCE):
+        for _ in range(ATTEMPTS):
             value, result, error = call()
             if result == sdk.COMM_SUCCESS:
                 return value, error

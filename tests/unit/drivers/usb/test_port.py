@@ -8,7 +8,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort, PtyPort
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
-from monstertruck_drivers.usb.port import OPEN_PATIENCE, HubNode, HubPort
+from monstertruck_drivers.usb.port import OPEN_TIMEOUT, HubNode, HubPort
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, WrongDeviceError
 from monstertruck_schemas.event import Severity
@@ -119,7 +119,7 @@ def test_a_fresh_node_may_refuse_for_a_while(tmp_path: Path):
         start = bench.clock.now()
         with pytest.raises(PortBusyError):
             await bench.ports["compass"].open()
-        assert (bench.clock.now() - start) / SECOND == pytest.approx(OPEN_PATIENCE, abs=0.2)
+        assert (bench.clock.now() - start) / SECOND == pytest.approx(OPEN_TIMEOUT, abs=0.2)
         holder.close()
 
     play(tmp_path, scene)

@@ -109,8 +109,8 @@ def test_usb_shows_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     )
 
 
-def find(bench: Bench, role: str, said: list[str], patience: float = 60.0) -> "asyncio.Task[UsbPortConfig]":
-    return asyncio.create_task(find_cable(role, bench.machine, said.append, patience))
+def find(bench: Bench, role: str, said: list[str], timeout: float = 60.0) -> "asyncio.Task[UsbPortConfig]":
+    return asyncio.create_task(find_cable(role, bench.machine, said.append, timeout))
 
 
 def test_the_cable_that_is_pulled_is_found(tmp_path: Path):
@@ -159,7 +159,7 @@ def test_a_hub_several_cables_or_a_stick_are_not_taken(tmp_path: Path):
     play(tmp_path, scene, watched=False)
 
 
-def test_patience_ends(tmp_path: Path):
+def test_the_search_ends_at_its_time_out(tmp_path: Path):
     said: list[str] = []
 
     async def scene(bench: Bench) -> None:
@@ -233,8 +233,8 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path):
 
 
 def test_find_port_prints_the_line_and_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    async def found(role: str, machine: Machine, say: Any, patience: float) -> UsbPortConfig:
-        assert (role, patience) == ("lidar", 5.0)
+    async def found(role: str, machine: Machine, say: Any, timeout: float) -> UsbPortConfig:
+        assert (role, timeout) == ("lidar", 5.0)
         assert isinstance(machine.sysfs, Sysfs)
         return PORTS["lidar"]
 
