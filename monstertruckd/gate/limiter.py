@@ -11,6 +11,7 @@ lidar sees. Where it does not look, in reverse, sideways and on the spot, ``Scan
 
 import math
 from collections import deque
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -23,9 +24,11 @@ from monstertruck_kinematics.elementary import Array, KinematicsError, integrate
 from monstertruck_planners.collision import (
     Footprint,
     ScanPoints,
+    beyond,
     first_contact,
     placed,
     points_relative,
+    relative,
     swept_poses,
 )
 from monstertruck_runtime.clock import SECOND
@@ -40,6 +43,9 @@ POSES: Final = 20
 
 TWIST_STEP: Final = 0.005
 """Ways are rounded to this before the sweep, m/m and rad/m: an error of 2 mm at its end, and most sweeps are cached."""
+
+GROUND_STEP: Final = 2
+"""Poses from one to the next of which the ground is looked at."""
 
 SWEEPS: Final = 256
 """Sweeps cached."""
@@ -66,12 +72,20 @@ OUTLINE: Final = 12
 """Points on each edge of the footprint from which the directions of travel are found."""
 MARGIN: Final = 0.005
 """Ground this near to the body is not travelled, m."""
+TOUCH: Final = 1e-6
+"""A point that enters the footprint by less is on its edge, m."""
 
 MEMORY: Final = 30 * SECOND
 """Scans are remembered for so long, ns: somebody may step onto ground that was free, or take an obstacle away."""
 MEMORY_STEP: Final = 0.1
 """Travelled distance between two remembered scans, m."""
 MEMORY_SCANS: Final = 20
+SPACING: Final = 0.02
+"""Of remembered points along an outline, less than their drift, m."""
+VIEW_STEP: Final = 0.3
+"""Distance (m) and turn (rad) together between two of the scans that tell which ground is free: each sees more than
+what the truck is long and half of what is around it, and ground that none of these few saw only slows the truck."""
+VIEWS: Final = 7
 DRIFT: Final = 0.03
 """The footprint is so much smaller against remembered points, m: the wheels do not tell better where they are."""
 FIELD_EDGE: Final = 0.1
@@ -131,10 +145,10 @@ class Visibility:
         x, y, yaw = self._mount
         return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
 
-    def travelled(self, poses: Array) -> Sectors:
-        """Sectors of the ground that the footprint covers at the poses (m, 3), but not where the body is."""
-        outline = _outline(self._footprint, poses).reshape(-1, 2)
-        return np.unique(self.sectors_of(outline[~on_body(self._footprint, outline, MARGIN)]))
+    def travelled(self, ground: Array) -> Sectors:
+        """Sectors of the points (n, 2) in base, m, that the body does not stand on."""
+        sectors = self.sectors_of(ground[~on_body(self._footprint, ground, MARGIN)])
+        return np.bincount(sectors, minlength=SECTORS).nonzero()[0]
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
         """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
@@ -157,14 +171,34 @@ def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
     return on
 
 
-def _outline(body: Footprint, poses: Array) -> Array:
-    """Points on the edges of the footprint at every pose (m, 3), shape (m, n, 2), m."""
+def outline(body: Footprint) -> Array:
+    """Points on the edges of the footprint in base, shape (n, 2), m."""
     half_length, half_width = body.half_length, body.half_width
     along, across = np.linspace(-half_length, half_length, OUTLINE), np.linspace(-half_width, half_width, OUTLINE)
     ends, sides = np.full(OUTLINE, half_length), np.full(OUTLINE, half_width)
     x = np.concatenate((along, along, ends, -ends)) + body.offset
-    y = np.concatenate((sides, -sides, across, across))
+    return np.column_stack((x, np.concatenate((sides, -sides, across, across))))
+
+
+def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
+    """Points of the ground that a motion covers and that its pose before did not cover.
+
+    Args:
+        body: the footprint.
+        edges: its ``outline``.
+        poses: of base at equal steps of one twist, the present one first, shape (m, 3), m, m, rad.
+
+    Returns:
+        Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
+    """
+    (step,) = _at(edges, poses[1:2])
+    return _at(edges[~on_body(body, step, TOUCH)], poses[1:])
+
+
+def _at(points: Array, poses: Array) -> Array:
+    """Points (n, 2) of a body at every pose (m, 3), shape (m, n, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x, y = points.T
     return np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2)
 
 
@@ -174,10 +208,14 @@ class _Taken(NamedTuple):
     scan: LaserScan
     pose: Pose
     """Of base, in the frame of the memory."""
+    lidar: Pose
+    """In the frame of the memory."""
     travelled: float
     """m."""
     points: Array
     """Its returns near the body in the frame of the memory, shape (n, 2), m."""
+    free: Array
+    """How far the beams saw free ground, m; 0 is added before the first and after the last."""
 
 
 class ScanMemory:
@@ -202,6 +240,7 @@ class ScanMemory:
         self._ticks: deque[tuple[int, Pose, float]] = deque(maxlen=POSES_KEPT)
         self._newest: _Taken | None = None
         self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
+        self._views: deque[_Taken] = deque(maxlen=VIEWS)
 
     def move(self, now: int, twist: Twist[float], dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
@@ -221,10 +260,15 @@ class ScanMemory:
         """
         present = scan.stamp, self._pose, self._travelled
         _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - scan.stamp), default=present)
+        points = spaced(points, SPACING)
         there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
-        self._newest = _Taken(scan, pose, travelled, there)
+        (lidar,) = placed(np.array([self._mount]), pose).tolist()
+        free = np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, 0.0)
+        self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1))
         if not self._taken or travelled - self._taken[-1].travelled >= MEMORY_STEP:
             self._taken.append(self._newest)
+        if not self._views or _apart(pose, self._views[-1].pose) >= VIEW_STEP:
+            self._views.append(self._newest)
 
     def points(self) -> Array:
         """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
@@ -232,47 +276,75 @@ class ScanMemory:
         if newest is None:
             return np.empty((0, 2))
         kept = [
-            taken.points
-            for taken in self._taken
-            if newest.travelled - taken.travelled < self._distance and newest.scan.stamp - taken.scan.stamp < MEMORY
+            taken.points for taken in _fresh(self._taken, newest) if newest.travelled - taken.travelled < self._distance
         ]
-        points = points_relative(np.concatenate((newest.points[:0], *kept)), newest.pose)
-        beams, edge = self._beams(newest.scan, points)[0], FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
+        there = np.concatenate((newest.points[:0], *kept))
+        beams = _beams((newest,), there)[0][0]
+        edge = FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
         looked = (beams >= edge) & (beams < len(newest.scan.ranges) - edge)
-        return points[~looked & ~on_body(self._footprint, points, 0.0)]
+        points = points_relative(there[~looked], newest.pose)
+        return points[~on_body(self._footprint, points, 0.0)]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
-        seen = np.zeros(len(points), np.bool_)
         newest = self._newest
         if newest is None:
-            return seen
+            return np.zeros(len(points), np.bool_)
         there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
-        for taken in (newest, *reversed(self._taken)):
-            (left,) = np.nonzero(~seen)
-            if newest.scan.stamp - taken.scan.stamp >= MEMORY or len(left) == 0:
-                break
-            local = points_relative(there[left], taken.pose)
-            seen[left] = on_body(self._footprint, local, DRIFT) | self._free(taken.scan, local)
-        return seen
+        taken = newest, *_fresh(self._views, newest)
+        beams, distances = _beams(taken, there)
+        ends = np.cumsum([len(scan.free) for scan in taken])[:, None]
+        starts = np.concatenate(([[0]], ends[:-1]))
+        free = np.concatenate([scan.free for scan in taken])[np.clip(starts + 1 + beams, starts, ends - 1)]
+        beyond_x, beyond_y = beyond(self._footprint, np.array([scan.pose for scan in taken]), there)
+        seen = (free > distances) | ((beyond_x < DRIFT) & (beyond_y < DRIFT))
+        return np.asarray(seen.any(axis=0))
 
-    def _free(self, scan: LaserScan, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2) in base the scan saw free."""
-        beams, distances = self._beams(scan, points)
-        inside = (beams >= 0) & (beams < len(scan.ranges))
-        beams = np.where(inside, beams, 0)
-        codes = scan.codes[beams]
-        free: NDArray[np.bool_] = (
-            inside & ((codes == VALID_BEAM) | (codes <= NO_ECHO)) & (scan.ranges[beams] > distances)
-        )
-        return free
 
-    def _beams(self, scan: LaserScan, points: Array) -> tuple[NDArray[np.intp], Array]:
-        """Number of the beam towards each point (n, 2) in base, beyond the scan's where it has none; distance, m."""
-        local = points_relative(points, self._mount)
-        bearings = np.arctan2(local[:, 1], local[:, 0])
-        beams = np.round((bearings - scan.start_angle) / (scan.angle_increment or math.tau)).astype(np.intp)
-        return beams, np.hypot(local[:, 0], local[:, 1])
+def spaced(points: Array, spacing: float) -> Array:
+    """Of points (n, 2) in the order of the beams, one on every ``spacing`` of the line along them, m."""
+    along = np.cumsum(np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T))
+    return points[np.diff(along // spacing, prepend=-1.0) > 0]
+
+
+def _apart(one: Pose, other: Pose) -> float:
+    """Distance (m) and turn (rad) together."""
+    return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
+
+
+def _fresh(kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
+    return [taken for taken in kept if newest.scan.stamp - taken.scan.stamp < MEMORY]
+
+
+def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Array]:
+    """Number of every scan's beam towards each point, beyond the scan's where it has none; distance, m.
+
+    Args:
+        scans: m of them.
+        points: in the frame of the memory, shape (n, 2), m.
+
+    Returns:
+        Two of shape (m, n).
+    """
+    x, y = relative(points, np.array([scan.lidar for scan in scans]))
+    first = np.array([scan.scan.start_angle for scan in scans])
+    step = np.array([scan.scan.angle_increment or math.tau for scan in scans])
+    return np.rint((np.arctan2(y, x) - first[:, None]) / step[:, None]).astype(np.intp), np.hypot(x, y)
+
+
+class _Sweep(NamedTuple):
+    """What a way covers."""
+
+    distances: Array
+    """Of its poses, shape (m,), m."""
+    poses: Array
+    """Of base, shape (m, 3)."""
+    ground: Array
+    """Points that the body does not stand on, shape (n, 2), m."""
+    before: Array
+    """Distance of the pose before the one that reaches each of them, shape (n,), m."""
+    sectors: Sectors
+    """Around the lidar."""
 
 
 class ObstacleGuard:
@@ -304,6 +376,7 @@ class ObstacleGuard:
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._stopping(config.speed, delay, config.obstacle.deceleration)
         self._near = self._reach + footprint.circumscribed_radius + config.obstacle.side_clearance
+        self._outline = outline(footprint)
         self._sweep = lru_cache(SWEEPS)(self._swept)
 
     def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
@@ -338,35 +411,41 @@ class ObstacleGuard:
             hidden = [way for way in rounded if way[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
             self._free = min(self._free_distance(*way, behind if way in hidden else None) for way in rounded)
-            self.known = min((self._known_distance(*way) for way in hidden), default=math.inf)
+            self.known = self._known_distance(hidden)
         return self._free
 
     def _look(self, ways: frozenset[tuple[int, int, int]]) -> None:
         """Find how long ago all sectors of the ways were seen; those outside the lidar's field do not count."""
-        seen = np.concatenate([self._visibility.last_seen(self._sweep(*way)[2]) for way in ways])
+        seen = np.concatenate([self._visibility.last_seen(self._sweep(*way).sectors) for way in ways])
         oldest = int(seen.min(initial=self._stamp))
         self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
 
-    def _swept(self, x: int, y: int, turn: int) -> tuple[Array, Array, Sectors]:
-        """Distances, poses and sectors of a way in steps of ``TWIST_STEP``; no corner moves further than the base."""
+    def _swept(self, x: int, y: int, turn: int) -> _Sweep:
+        """A way in steps of ``TWIST_STEP``; no corner moves further than the base."""
         vx, vy, wz = way = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
         corner = math.hypot(vx, vy) + abs(wz) * self._footprint.circumscribed_radius
         distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(corner, 1.0)))
         poses = swept_poses(way, distances)
-        return distances, poses, self._visibility.travelled(poses)
+        ground = ground_ahead(self._footprint, self._outline, poses[::GROUND_STEP])
+        before = np.repeat(distances[::GROUND_STEP][:-1], ground.shape[1])
+        ground = ground.reshape(-1, 2)
+        return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
 
     def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None) -> float:
-        distances, poses, _ = self._sweep(x, y, turn)
-        contacts = [first_contact(self._footprint, poses, self._points, self._config.obstacle.side_clearance)]
+        sweep = self._sweep(x, y, turn)
+        contacts = [first_contact(self._footprint, sweep.poses, self._points, self._config.obstacle.side_clearance)]
         if remembered is not None:
-            contacts.append(first_contact(self._footprint, poses, remembered, -DRIFT))
-        return min((float(distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf)
+            contacts.append(first_contact(self._footprint, sweep.poses, remembered, -DRIFT))
+        return min(
+            (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
+        )
 
-    def _known_distance(self, x: int, y: int, turn: int) -> float:
-        distances, poses, _ = self._sweep(x, y, turn)
-        outline = _outline(self._footprint, poses)
-        known = self._memory.seen(outline.reshape(-1, 2)).reshape(outline.shape[:2]).all(axis=1)
-        return math.inf if known.all() else float(distances[max(int(np.argmin(known)) - 1, 0)])
+    def _known_distance(self, ways: list[tuple[int, int, int]]) -> float:
+        sweeps = [self._sweep(*way) for way in ways]
+        if not sweeps:
+            return math.inf
+        seen = self._memory.seen(np.concatenate([sweep.ground for sweep in sweeps]))
+        return float(np.concatenate([sweep.before for sweep in sweeps])[~seen].min(initial=math.inf))
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""

@@ -141,16 +141,22 @@ def rectangle_distance(footprint: Footprint, poses: Array, points: Array) -> Arr
     Returns:
         Shape (m, n), m; negative inside.
     """
-    return _distance(*_beyond(footprint, poses, points))
+    return _distance(*beyond(footprint, poses, points))
 
 
-def _beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, Array]:
-    """How far every point lies beyond the footprint's ends and sides, each of shape (m, n), m."""
+def beyond(footprint: Footprint, poses: Array, points: Array) -> tuple[Array, Array]:
+    """How far every point lies beyond the footprint's ends and sides at every pose, each of shape (m, n), m."""
+    x, y = relative(points, poses)
+    return np.abs(x - footprint.offset) - footprint.half_length, np.abs(y) - footprint.half_width
+
+
+def relative(points: Array, poses: Array) -> tuple[Array, Array]:
+    """X and y of points (n, 2) in the frame of every pose (m, 3), each of shape (m, n)."""
     at_x, at_y, yaw = poses.T
     c, s = np.cos(yaw), np.sin(yaw)
-    x = np.column_stack((c, s)) @ points.T - (c * at_x + s * at_y)[:, None]
-    y = np.column_stack((-s, c)) @ points.T - (c * at_y - s * at_x)[:, None]
-    return np.abs(x - footprint.offset) - footprint.half_length, np.abs(y) - footprint.half_width
+    x: Array = np.column_stack((c, s)) @ points.T - (c * at_x + s * at_y)[:, None]
+    y: Array = np.column_stack((-s, c)) @ points.T - (c * at_y - s * at_x)[:, None]
+    return x, y
 
 
 def _distance(beyond_x: Array, beyond_y: Array) -> Array:
@@ -210,7 +216,7 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     near = points_near(points, poses, footprint.circumscribed_radius + margin)
     if len(near) == 0:
         return None
-    beyond_x, beyond_y = _beyond(footprint, poses, near)
+    beyond_x, beyond_y = beyond(footprint, poses, near)
     # The exact distance is computed only for points that are touched.
     touching = (beyond_x < margin) & (beyond_y < margin)
     points_touched = touching.any(axis=0)

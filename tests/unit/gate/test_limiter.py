@@ -58,7 +58,8 @@ def test_a_corner_that_moves_ahead_of_the_body_is_checked_to_the_end_of_its_reac
 @pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 5.0), (0.6, 0.0, 4.0), (0.1, 0.0, 0.0)])
 def test_no_corner_moves_further_between_two_poses_than_the_base_does_straight_on(way):
     steps = tuple(round(part / 0.005) for part in way)
-    distances, poses, _ = guard()._sweep(*steps)
+    sweep = guard()._sweep(*steps)
+    distances, poses = sweep.distances, sweep.poses
     assert distances[-1] == pytest.approx(REACH)
     assert len(distances) == math.ceil(20 * max(math.hypot(way[0], way[1]) + abs(way[2]) * RADIUS, 1.0) - 1e-9)
     corner = (FOOTPRINT.half_length, FOOTPRINT.half_width, 0.0)

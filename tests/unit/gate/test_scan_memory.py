@@ -11,7 +11,7 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import DRIFT, MEMORY, ScanMemory
+from monstertruckd.gate.limiter import DRIFT, MEMORY, ScanMemory, spaced
 from tests.unit.gate.rig import TICK, Rig, scan
 
 FOOTPRINT = Footprint()
@@ -134,6 +134,92 @@ def test_seen_ground_ages():
     assert seen(remembered, -BACK - 0.3)
     see(remembered, SECOND + MEMORY)
     assert not seen(remembered, -BACK - 0.3)
+
+
+def test_ground_is_known_by_a_few_scans_of_the_way_here():
+    remembered = memory()
+    now = SECOND
+    for _ in range(20):
+        see(remembered, now)
+        now = drive(remembered, 0.1, now=now)
+    see(remembered, now)
+    assert all(seen(remembered, *np.arange(-1.2, 1.0, 0.01)))
+    for _ in range(30):
+        see(remembered, now)
+        now = drive(remembered, 0.1, now=now)
+    see(remembered, now)
+    assert all(seen(remembered, *np.arange(-1.2, 1.0, 0.01)))
+    assert not any(seen(remembered, -3.0, -3.2, -4.8)), "longer ago than the few scans reach"
+
+
+def test_ground_that_the_corners_of_a_turning_truck_pass_is_known():
+    remembered = memory()
+    now = SECOND
+    for _ in range(20):
+        see(remembered, now)
+        for _ in range(6):
+            now += TICK
+            remembered.move(now, (0.0, 0.0, 1.0), 0.02)
+    see(remembered, now)
+    around = np.linspace(0.0, 2 * math.pi, 60)
+    assert remembered.seen(FOOTPRINT.circumscribed_radius * np.column_stack((np.cos(around), np.sin(around)))).all()
+
+
+def fan(stamp, beams, bearing=0.0, increment=0.1, reach=1.0):
+    """A scan of so many beams about a bearing, all of which end at ``reach``."""
+    half = increment * (beams - 1) / 2
+    figures = {"start_angle": bearing - half, "end_angle": bearing + half}
+    return scan(stamp).model_copy(
+        update={"ranges": np.full(beams, reach), "codes": np.full(beams, 255, np.uint8), **figures}
+    )
+
+
+def test_a_scan_sees_as_far_as_its_beams_reach_and_as_wide_as_they_are():
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    remembered.observe(fan(SECOND, 11), np.empty((0, 2)))
+
+    def sees(bearing, distance):
+        return bool(remembered.seen(distance * np.array([(math.cos(bearing), math.sin(bearing))]))[0])
+
+    for bearing in (-0.54, -0.5, 0.0, 0.5, 0.54):
+        assert sees(bearing, 0.99)
+        assert not sees(bearing, 1.01)
+    assert not sees(-0.56, 0.9)
+    assert not sees(0.56, 0.9)
+    assert not sees(math.pi - 0.1, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("mount", "point"), [((0.2, 0.1, math.pi / 2), (0.2, 1.0)), ((-0.2, 0.1, math.pi), (-1.1, 0.1))]
+)
+def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
+    remembered = ScanMemory(FOOTPRINT, mount, 2.0)
+    remembered.observe(fan(SECOND, 3), np.empty((0, 2)))
+    (x, y), (ahead_x, ahead_y) = point, (math.cos(mount[2]), math.sin(mount[2]))
+    here, beyond, aside = (x, y), (x + 0.2 * ahead_x, y + 0.2 * ahead_y), (x + 0.3 * ahead_y, y + 0.3 * ahead_x)
+    assert remembered.seen(np.array([here, beyond, aside])).tolist() == [True, False, False]
+
+
+def test_scans_of_different_geometry_are_remembered_each_by_its_own():
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    for second, (beams, bearing) in enumerate([(21, 2.0), (5, 0.0), (11, math.pi / 2)], 1):
+        now = second * SECOND
+        remembered.observe(fan(now, beams, bearing), np.empty((0, 2)))
+        remembered.move(now, (0.3, 0.0, 0.0), 1.0)
+    remembered.observe(fan(now, 3, -math.pi / 2), np.empty((0, 2)))
+    there = np.array([(-1.4, 0.7), (-0.3, 0.9), (-0.3, -0.9), (0.3, 0.0), (0.0, -0.9), (0.45, 0.0)])
+    assert remembered.seen(there).tolist() == [True, True, False, True, True, False]
+
+
+def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
+    wall = np.column_stack((np.linspace(0.0, 1.0, 501), np.full(501, 0.5)))
+    post = np.array([(0.5, 0.3)])
+    kept = spaced(np.concatenate((wall[:250], post, wall[250:])), 0.02)
+    assert len(kept) == pytest.approx(52, abs=2)
+    assert (post == kept).all(axis=1).any()
+    assert np.diff(kept[:, 0]).max() < 0.025
+    assert (kept[0] == wall[0]).all()
+    assert spaced(wall[:0], 0.02).shape == (0, 2)
 
 
 # In the gate

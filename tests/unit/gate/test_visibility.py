@@ -10,20 +10,26 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, on_body
+from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, ground_ahead, on_body, outline
 from tests.unit.gate.rig import Rig, scan
 
+FOOTPRINT = Footprint()
 MOUNT = (0.14, 0.0, 0.0)
 ALL = (-120.0, 120.0)
 AHEAD = swept_poses((1.0, 0.0, 0.0), np.linspace(0.0, 0.4, 20))
 LEFT = swept_poses((1.0, 0.0, 2.0), np.linspace(0.0, 0.4, 40))
 
 
+def travelled_by(visibility, poses, body=FOOTPRINT):
+    """Sectors of the ground that the body newly covers at poses."""
+    return visibility.travelled(ground_ahead(body, outline(body), poses).reshape(-1, 2))
+
+
 def seen(message):
     """Sectors that one scan sees, of those ahead."""
     visibility = Visibility(Footprint(), MOUNT, 0.5)
     visibility.observe(message, scan_points(message, MOUNT))
-    return visibility.last_seen(visibility.travelled(AHEAD)) > 0
+    return visibility.last_seen(travelled_by(visibility, AHEAD)) > 0
 
 
 @pytest.mark.parametrize("code", [3, 4, 5, *range(6, 20)])
@@ -132,12 +138,12 @@ def test_few_failed_beams_are_a_view():
 def test_sectors_of_travel_are_those_of_the_ground_it_takes():
     visibility = Visibility(Footprint(), MOUNT, 0.5)
     visibility.observe(message := scan(SECOND), scan_points(message, MOUNT))
-    ahead, left = visibility.travelled(AHEAD), visibility.travelled(LEFT)
+    ahead, left = travelled_by(visibility, AHEAD), travelled_by(visibility, LEFT)
     middle = SECTORS // 2
     assert {middle - 1, middle} <= set(ahead)
     assert {middle - 9, middle + 8}.isdisjoint(ahead)
     assert max(left) > max(ahead)
-    back = visibility.travelled(swept_poses((-1.0, 0.0, 0.0), np.linspace(0.0, 0.4, 20)))
+    back = travelled_by(visibility, swept_poses((-1.0, 0.0, 0.0), np.linspace(0.0, 0.4, 20)))
     assert len(visibility.last_seen(back)) < len(back)
 
 
@@ -164,8 +170,9 @@ ENDS = [
 @pytest.mark.parametrize(("way", "ground"), ENDS)
 @pytest.mark.parametrize("offset", [0.0, 0.1])
 def test_every_part_of_the_outline_travels_over_its_ground(way, ground, offset):
-    visibility = Visibility(Footprint(offset=offset), MOUNT, 0.5)
-    travelled = visibility.travelled(swept_poses(way, np.linspace(0.0, 0.2, 20)))
+    body = Footprint(offset=offset)
+    visibility = Visibility(body, MOUNT, 0.5)
+    travelled = travelled_by(visibility, swept_poses(way, np.linspace(0.0, 0.2, 20)), body)
     points = np.array(ground) + np.array((offset, 0.0))
     assert set(visibility.sectors_of(points)) <= set(travelled)
     middle = points.mean(axis=0)
@@ -177,12 +184,34 @@ def test_every_part_of_the_outline_travels_over_its_ground(way, ground, offset):
 def test_ground_within_half_a_centimetre_of_the_body_is_not_travelled(way, travels):
     visibility = Visibility(Footprint(), MOUNT, 0.5)
     for pose in ((way, 0.0, 0.0), (0.0, way, 0.0)):
-        assert (len(visibility.travelled(np.array([pose]))) > 0) is travels
+        assert (len(travelled_by(visibility, np.array([(0.0, 0.0, 0.0), pose]))) > 0) is travels
+
+
+@pytest.mark.parametrize("body", [FOOTPRINT, Footprint(offset=0.1)])
+def test_a_step_covers_the_ground_that_its_leading_edge_reaches(body):
+    front, back = body.offset + body.half_length, body.offset - body.half_length
+    for sign, edge in ((1.0, front), (-1.0, back)):
+        ground = ground_ahead(body, outline(body), swept_poses((sign, 0.0, 0.0), np.linspace(0.0, 0.2, 5)))
+        for points, distance in zip(ground, (0.05, 0.1, 0.15, 0.2), strict=True):
+            assert points[:, 0].min() >= min(edge, edge + sign * distance) - 1e-9
+            assert points[:, 0].max() <= max(edge, edge + sign * distance) + 1e-9
+            inner = np.abs(points[:, 1]) < body.half_width - 0.01
+            assert points[inner, 0] == pytest.approx(edge + sign * distance)
+            assert inner.sum() > 8
+            assert np.abs(points[:, 1]).max() == pytest.approx(body.half_width)
+
+
+def test_a_tail_that_swings_out_by_a_millimetre_a_step_covers_ground():
+    poses = swept_poses((1.0, 0.0, 0.5), np.linspace(0.0, 0.2, 41))
+    ground = ground_ahead(FOOTPRINT, outline(FOOTPRINT), poses)
+    tail = ground[..., 0] < -LENGTH + 0.1
+    assert ground[tail][:, 1].min() < -WIDTH - 0.008
+    assert len(ground_ahead(FOOTPRINT, outline(FOOTPRINT), np.zeros((5, 3))).reshape(-1, 2)) == 0
 
 
 def test_a_turn_on_the_spot_travels_over_the_ground_of_all_corners():
     visibility = Visibility(Footprint(), MOUNT, 0.5)
-    travelled = visibility.travelled(swept_poses((0.0, 0.0, 5.0), np.linspace(0.0, 0.1, 20)))
+    travelled = travelled_by(visibility, swept_poses((0.0, 0.0, 5.0), np.linspace(0.0, 0.1, 20)))
     turned = np.array([math.atan2(y, x) + 0.4 for x in (LENGTH, -LENGTH) for y in (WIDTH, -WIDTH)])
     corners = math.hypot(LENGTH, WIDTH) * np.column_stack((np.cos(turned), np.sin(turned)))
     assert set(visibility.sectors_of(corners)) <= set(travelled)
