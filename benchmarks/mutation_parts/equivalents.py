@@ -34,6 +34,10 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}service.py::GateService._tick_for_ever: 0 -> (1)": "a tick a nanosecond earlier",
     f"{DRIVE}::_DriveSession._idle: 0 -> (1)": "a nanosecond less to wait",
     f"{DRIVE}::_DriveSession.__init__: 1 -> (2)": UNREAD,
+    f"{DRIVE}::_DriveSession._cycle: "
+    "await self._read(od.CURRENT) / 1000 * self._sign -> ((await self._read(od.CURRENT) / 1000) / (self._sign))": (
+        "a sign: 1 or -1"
+    ),
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",
     f"{GATE}latch.py::Mark.engaged: 2 -> (3)": "any second byte is damage",
 }

@@ -297,7 +297,7 @@ class Gate:
         text = f"disarmed by {request.source}"
         if self.mode is GateMode.ARMED:
             self._disarm(now, text)
-        elif self._states.active:
+        else:
             self._states.disarm_at_rest = True
             if self.mode is GateMode.DRIVING:
                 self._stop(now, [_order_cause(Reason.DISARMED, text, request, now)], ordered=True)

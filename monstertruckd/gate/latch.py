@@ -169,9 +169,8 @@ class EstopLatch:
         with self._storing:
             if engaged:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                with os.fdopen(self._draft(), "w") as file:
-                    file.write("emergency stop latched\n")
-                    file.flush()
+                with os.fdopen(self._draft(), "wb", buffering=0) as file:
+                    file.write(b"emergency stop latched\n")
                     os.fsync(file.fileno())
                 self._draft_path.replace(self._path)
             else:
@@ -195,7 +194,7 @@ class EstopLatch:
         return os.open(self._draft_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
 
     def _sync_directory(self) -> None:
-        directory = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        directory = os.open(self._path.parent, os.O_RDONLY)
         try:
             os.fsync(directory)
         finally:

@@ -94,8 +94,8 @@ class Odometer:
     def __init__(self) -> None:
         self.counts = 0
         """Counts since the daemon started, controller's sign."""
-        self._raw: int | None = None
-        self._time = 0
+        self._last: tuple[int, int] | None = None
+        """Newest position of the controller, and when it was read, ns."""
 
     def update(self, raw: int, now: int, fastest: float) -> int:
         """Add the motion since the last reading; a step no motor can make is a counter that was reset.
@@ -108,16 +108,17 @@ class Odometer:
         Returns:
             ``counts``.
         """
-        if self._raw is not None:
-            step = (raw - self._raw + 2**31) % 2**32 - 2**31
-            if abs(step) <= OVERSPEED * fastest * (now - self._time) / SECOND + 1:
+        if self._last is not None:
+            before, then = self._last
+            step = (raw - before + 2**31) % 2**32 - 2**31
+            if abs(step) <= OVERSPEED * fastest * (now - then) / SECOND + 1:
                 self.counts += step
-        self._raw, self._time = raw, now
+        self._last = raw, now
         return self.counts
 
     def restart(self) -> None:
         """The controller was off in between: its next position continues here."""
-        self._raw = None
+        self._last = None
 
 
 """Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""

@@ -87,6 +87,19 @@ def test_short_faults_that_repeat_disarm(faults, mode):
     assert (Reason.FAULTS_REPEAT in {event.reason for event in rig.events}) is (mode is GateMode.DISARMED)
 
 
+def test_stops_for_a_driver_who_falls_silent_are_no_faults():
+    rig = Rig()
+    rig.armed()
+    for _ in range(6):
+        rig.driver = {"speed": 0.1, "lease": 0.2}
+        rig.tick(20)
+        assert rig.out.mode is GateMode.DRIVING
+        rig.driver = None
+        rig.tick(60)
+        assert rig.out.mode is GateMode.ARMED
+    assert not rig.reported(Reason.FAULTS_REPEAT)
+
+
 # The check of the shafts alone
 
 
@@ -112,6 +125,9 @@ def test_a_shaft_is_blocked_after_its_time_and_stays_so_until_the_reset(sign):
     assert check.blocked is None
     assert not shown(check, 1.8, commanded=sign * 0.2), "the time begins anew"
     assert not shown(check, 2.399, commanded=sign * 0.2)
+    assert shown(check, 2.4, commanded=sign * 0.2)
+    check.reset()
+    assert not shown(check, 2.5, commanded=sign * 0.2), "of a shaft that was held until the reset, too"
 
 
 @pytest.mark.parametrize(

@@ -254,9 +254,23 @@ def test_orders_are_stops_by_somebody():
     assert len(rig.trips) == 1
 
 
+def test_an_order_to_disarm_a_truck_that_stops_is_no_second_stop():
+    rig = Rig().driving(speed=0.2)
+    rig.order(Order.STOP)
+    rig.tick()
+    assert rig.out.mode is GateMode.STOPPING
+    rig.order(Order.DISARM)
+    rig.driver = None
+    rig.tick(60)
+    assert rig.out.mode is GateMode.DISARMED
+    assert [trip.reason for trip in rig.trips] == [Reason.STOPPED]
+
+
 def test_shutting_down_while_driving_is_a_stop():
     rig = Rig().driving()
     assert [trip.reason for trip in rig.gate.neutral(rig.now).trips] == [Reason.SHUTDOWN]
+    starting = Rig().driving(ticks=1)
+    assert [trip.reason for trip in starting.gate.neutral(starting.now).trips] == [Reason.SHUTDOWN]
     still = Rig().armed()
     assert still.gate.neutral(still.now).trips == ()
 

@@ -229,6 +229,35 @@ def test_an_error_in_the_first_answer_of_a_session_is_reported():
     on_bench(test)
 
 
+def speeds(rig: Rig) -> int:
+    """How often the ramp of a servo was set."""
+    given = Decoder().feed(bytes(rig.emulator.received))
+    return sum(isinstance(item, ServoCommand) and item.code is Code.SET_SPEED and item.data[0] == 1 for item in given)
+
+
+def test_after_a_lost_answer_everything_is_sent_again(monkeypatch):
+    ask, lost = MaestroSession.ask, [False]
+
+    async def losing(session: MaestroSession, *requests: bytes) -> list[int]:
+        if lost[0]:
+            lost[0] = False
+            raise DeviceTimeoutError("silence")
+        return await ask(session, *requests)
+
+    monkeypatch.setattr(MaestroSession, "ask", losing)
+
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.5)
+            before = speeds(rig)
+            lost[0] = True
+            await rig.settle(0.2)
+            assert not lost[0]
+            assert speeds(rig) == before + 1, "the lost answer may have held the only report of an error"
+
+    on_bench(test)
+
+
 def test_what_is_sent_again_after_commands_have_stopped_leaves_the_line_low():
     async def test(rig: Rig) -> None:
         async with rig.driving():
