@@ -70,6 +70,12 @@ JOIN_OVERLAP: Final = 0.75
 """The same for a submap searched for in the whole map,"""
 JOIN_BASELINE: Final = 2.0
 """and the length of the trajectory between the matches that join it, m."""
+JOIN_CONTRADICTION: Final = 0.1
+"""Share of what both of two submaps saw that they may look through: right joins of recordings had 0.07 at most."""
+CROSSED_KEYS: Final = 40
+"""Keyframes of the smaller of two submaps that are held against the other's,"""
+CROSSED_NEAR: Final = 3
+"""and how many of those each."""
 MIN_RATIO: Final = 0.02
 """Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
 MAX_CORRECTION: Final = 0.3
@@ -124,6 +130,8 @@ class LoopMatch:
     target: int
     measured: Array
     information: Array
+    made: int
+    """The newest keyframe when it was found."""
 
 
 class LoopCloser:
@@ -167,7 +175,7 @@ class LoopCloser:
         own, query = surroundings(keyframes, at)
         self._fingerprints[at] = describe(query.points)
         covariances, far = keyframes.drift(at)
-        self._hits = [hit for hit in self._hits if at - hit.target < MAX_AGE]
+        self._hits = [hit for hit in self._hits if at - hit.made < MAX_AGE]
         self._tried = {place: when for place, when in self._tried.items() if at - when < SEARCH_INTERVAL}
         for candidate in self._candidates(keyframes, at, covariances, far):
             self._tried[candidate] = at
@@ -181,21 +189,31 @@ class LoopCloser:
                 return True
         return False
 
-    def join(self, keyframes: KeyframeMap, at: int) -> Pieces[bool | None]:
-        """Verify keyframe ``at`` of the newest submap where it is in the map that the submap is apart from.
+    def join(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[bool | None]:
+        """Verify keyframe ``at`` where it is in submap ``part``, which is apart from its own.
 
-        Like a match of a wide search it needs the support of others. True if the submap was joined, False if the match
-        waits for others, None if there is none.
+        Like a match of a wide search it needs the support of others, and of all keyframes of one submap that come near
+        the other's. True if the submaps were joined, False if the match waits for others, None if there is none.
         """
         yield 2 * EDGE * len(keyframes.edges)
-        numbers = np.flatnonzero(keyframes.joined())
+        own_part = int(keyframes.part[at])
+        numbers = np.flatnonzero(keyframes.part == part)
         candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
         own, query = surroundings(keyframes, at)
         hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=JOIN_OVERLAP)
         if hit is None:
             return None
         yield EDGE_OPTIMISED * len(keyframes.edges)
-        return self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE)
+        poses, count = keyframes.poses, len(keyframes.edges)
+        if not self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE):
+            return False
+        if crossed(keyframes, own_part, part) > JOIN_CONTRADICTION:
+            keyframes.poses = poses
+            keyframes.edges.cut(count)
+            self.refused += 1
+            return None
+        keyframes.join(own_part, part)
+        return True
 
     def review(self, keyframes: KeyframeMap) -> bool:
         """Search from all keyframes (seconds of work) for places of which only a part was seen before.
@@ -316,14 +334,16 @@ class LoopCloser:
         turn = np.eye(3)
         turn[:2, :2] = rotation(keyframes.poses[origin, 2])
         covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
-        return LoopMatch(origin, at, between(keyframes.poses[origin], fit.pose), np.linalg.inv(covariance))
+        measured = between(keyframes.poses[origin], fit.pose)
+        return LoopMatch(origin, at, measured, np.linalg.inv(covariance), len(keyframes) - 1)
 
     def _accepted(self, keyframes: KeyframeMap, hit: LoopMatch, *, sure: bool, baseline: float = BASELINE) -> bool:
         """Add ``hit`` and the matches that agree with it to the graph if they are enough and the graph accepts them."""
         agreeing, against = _split_by_consistency(keyframes, hit, self._hits)
         witnesses = [hit, *agreeing]
         self._hits.append(hit)
-        enough = len(witnesses) >= MIN_SUPPORT * (1 + len(against)) and _way(keyframes, witnesses) >= baseline
+        support = len({witness.target for witness in witnesses})
+        enough = support >= MIN_SUPPORT * (1 + len(against)) and _way(keyframes, witnesses) >= baseline
         if not sure and not enough:
             return False
         if not self._added(keyframes, witnesses):
@@ -416,6 +436,24 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
     return measure(query.chosen(seen), submap.cloud, pose).overlap
 
 
+def crossed(keyframes: KeyframeMap, one: int, other: int) -> float:
+    """Share of the points of submap ``one`` and those near it of ``other`` that the opposite ones looked through."""
+    parts = [np.flatnonzero(keyframes.part == part) for part in (one, other)]
+    parts.sort(key=len)
+    few, many = parts
+    few = few[np.linspace(0, len(few) - 1, min(len(few), CROSSED_KEYS)).astype(np.intp)]
+    counts = np.zeros(2)
+    for key in few.tolist():
+        far = _distance(keyframes, key)[many]
+        near = many[np.argsort(far, kind="stable")][:CROSSED_NEAR]
+        near = near[_distance(keyframes, key)[near] < VIEW]
+        seen = [keyframes.frames[k].scan for k in near]
+        counts += _looked_through_counts(
+            [keyframes.frames[key].scan], keyframes.poses[[key]], seen, keyframes.poses[near]
+        )
+    return float(counts[0] / max(counts[1], 1))
+
+
 def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:
     """Numbers of the keyframes around ``centre``, and their points merged in its frame."""
     numbers = keyframes.around(centre, QUERY_KEYS, QUERY_REACH)
@@ -453,6 +491,11 @@ def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses
         others: the scans they are held against.
         other_poses: shape (m, 3), in the same frame.
     """
+    through, judged = _looked_through_counts(one, poses, others, other_poses)
+    return through / judged if judged else 0.0
+
+
+def _looked_through_counts(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> tuple[int, int]:
     through, judged = 0, 0
     for viewers, at, seen, seen_at in ((one, poses, others, other_poses), (others, other_poses, one, poses)):
         for viewer, pose in zip(viewers, at, strict=True):
@@ -461,7 +504,7 @@ def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses
                 counts = _looked_through(view, transform(between(pose, place), scan.points))
                 through += counts[0]
                 judged += counts[1]
-    return through / judged if judged else 0.0
+    return through, judged
 
 
 def in_view(viewers: list[Scan], poses: Array, points: Array) -> NDArray[np.bool_]:

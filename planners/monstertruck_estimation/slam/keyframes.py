@@ -173,7 +173,7 @@ class Trajectory:
         """Stamps (n,) and poses (n, 3) of all scans, given the poses of the keyframes."""
         stamps = self._stamps.view.copy()
         poses = compose(keys[self._keys.view], self._relative.view)
-        joints = np.flatnonzero(stamps[1:] == stamps[:-1])
+        joints = self._joints()
         apart = poses[joints + 1] - poses[joints]
         apart[:, 2] = wrap(apart[:, 2])
         begins = np.append(0, joints + 1)[: len(joints)]
@@ -181,6 +181,15 @@ class Trajectory:
             share = (stamps[begin:end] - stamps[begin]) / max(stamps[end] - stamps[begin], 1)
             poses[begin:end] += share[:, None] * off
         return np.delete(stamps, joints), np.delete(poses, joints, axis=0)
+
+    def marked(self, keys: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Marks of all scans, shape (n,), given those of the keyframes."""
+        return np.asarray(np.delete(keys[self._keys.view], self._joints()))
+
+    def _joints(self) -> NDArray[np.intp]:
+        """Rows of scans that became keyframes, relative to the keyframe before."""
+        stamps = self._stamps.view
+        return np.flatnonzero(stamps[1:] == stamps[:-1])
 
 
 Numbers = NDArray[np.intp]
@@ -211,29 +220,37 @@ class KeyframeMap:
         self.frames: list[Keyframe] = []
         self.poses: Array = np.zeros((0, 3))
         self.edges = EdgeList()
-        self.begin = 0
-        """First keyframe of the newest submap that began apart; 0 if there is none."""
+        self.part: NDArray[np.int64] = np.zeros(0, np.int64)
+        """Shape (n,): the submap of every keyframe, by the number of its first one; 0 = the map."""
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def add(self, scan: Scan, stamp: int, pose: Array, *, apart: bool = False) -> None:
         """Add a keyframe, without edges; ``apart``: it begins a submap that only loop closures may join to the rest."""
-        if apart:
-            self.begin = len(self)
+        self.part = np.append(self.part, len(self) if apart or not len(self) else self.part[-1])
         kept = scan.downsampled(self.config.key_cell, self.config.key_points)
         self.frames.append(Keyframe(stamp, kept, Cloud.of(kept)))
         self.poses = np.vstack((self.poses, pose))
 
-    def place(self, at: int, pose: Array) -> None:
-        """Move the newest submap, joined to nothing, so that its keyframe ``at`` is at ``pose``, shape (3,)."""
-        moved = compose(pose, between(self.poses[at], self.poses[self.begin :]))
-        self.poses = np.vstack((self.poses[: self.begin], moved))
+    def place(self, at: int, pose: Array, part: int) -> None:
+        """Align the submap of keyframe ``at`` with submap ``part``, in whose frame ``at`` is at ``pose``, shape (3,).
+
+        The map itself stays where it is.
+        """
+        own = int(self.part[at])
+        origin, target = (self.poses[at], pose) if own else (pose, self.poses[at])
+        moved = self.part == (own or part)
+        self.poses = self.poses.copy()
+        self.poses[moved] = compose(target, between(origin, self.poses[moved]))
+
+    def join(self, one: int, other: int) -> None:
+        """Submaps ``one`` and ``other`` are related by edges: they are one."""
+        self.part[self.part == max(one, other)] = min(one, other)
 
     def joined(self) -> NDArray[np.bool_]:
-        """Which keyframes are related to the first one, shape (n,)."""
-        labels = parts(self.edges.edges(), len(self))
-        return np.asarray(labels == labels[:1])
+        """Which keyframes belong to the map, shape (n,)."""
+        return np.asarray(self.part == 0)
 
     def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
         """Add the edge from the last keyframe but one to the last."""
@@ -295,7 +312,7 @@ class KeyframeMap:
     def local(self) -> Numbers:
         """Numbers, rising, of the keyframes of the submap around the newest one."""
         newest = len(self) - 1
-        recent = np.arange(max(newest - 2, self.begin), newest + 1)
+        recent = np.flatnonzero(self.part == self.part[newest])[-3:]
         return np.union1d(self.around(newest, self.config.local_keys), recent)
 
     def submap(self, numbers: Numbers) -> Submap:
@@ -316,7 +333,7 @@ class KeyframeMap:
             return False
         edges = self.edges.edges()
         poses = refine(self.frames, self.poses, edges.chosen(self.edges.odometry), edges.chosen(edges.loop))
-        pairs = witnesses(self.frames, self.poses, parts(edges, len(self)))
+        pairs = witnesses(self.frames, self.poses, self.part)
         if agreement(self.frames, poses, pairs) <= agreement(self.frames, self.poses, pairs):
             return False
         self.poses = poses
@@ -330,14 +347,14 @@ class KeyframeMap:
             its pose in the frame of that one, (n, 3).
         """
         gone, stand_in, edges, spread, odometry = pruned(
-            self.poses, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.pruning
+            self.poses, self.part, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.pruning
         )
         offset = between(self.poses[stand_in], self.poses)
         number = np.cumsum(~gone) - 1
         self.edges.replace(edges.renumbered(number), spread, odometry)
         self.frames = [key for key, left_out in zip(self.frames, gone.tolist(), strict=True) if not left_out]
         self.poses = self.poses[~gone]
-        self.begin = int(number[stand_in[self.begin]])
+        self.part = number[stand_in[self.part]][~gone]
         return ~gone, number[stand_in], offset
 
     def _closeness(self, numbers: Numbers, pose: Array) -> Array:
@@ -350,19 +367,25 @@ PRUNE_SPARED: Final = 60
 """Metres that one radian between two views counts as."""
 
 
-def redundancy(poses: Array) -> Array:
-    """Distance, m, from every pose to the most similar view, shape (n,): small means redundant."""
+def redundancy(poses: Array, part: NDArray[np.int64]) -> Array:
+    """Distance, m, from every pose to the most similar view of the same submap, shape (n,): small means redundant."""
     result = np.full(len(poses), np.inf)
     for k in range(1, len(poses)):
         off = between(poses[k], poses)
         distance = np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2])
         distance[k] = np.inf
+        distance[part != part[k]] = np.inf
         result[k] = distance.min()
     return result
 
 
 def pruned(
-    poses: Array, edges: Edges, spread: Array, odometry: NDArray[np.bool_], share: float
+    poses: Array,
+    part: NDArray[np.int64],
+    edges: Edges,
+    spread: Array,
+    odometry: NDArray[np.bool_],
+    share: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], Edges, Array, NDArray[np.bool_]]:
     """Prune: remove the most redundant ``share`` of the poses, no two of them neighbours in the graph, never the first.
 
@@ -383,7 +406,7 @@ def pruned(
         touching[i].append(k)
         touching[j].append(k)
     allowance = int(share * count)
-    for node in np.argsort(redundancy(poses), kind="stable").tolist():
+    for node in np.argsort(redundancy(poses, part), kind="stable").tolist():
         if not allowance:
             break
         if node == 0 or node >= count - PRUNE_SPARED or not touching[node]:

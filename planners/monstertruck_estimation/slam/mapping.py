@@ -51,7 +51,7 @@ class MappingEvent(StrEnum):
     APART = "apart"
     """The robot is lost: a submap that is not joined to the map was begun."""
     JOINED = "joined"
-    """The submap was joined to the map."""
+    """Two submaps were joined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class Mapper:
     @property
     def lost(self) -> bool:
         """Whether scans have not fitted the map for a while, or fit only a submap that is not joined to it."""
-        return self.map.begin > 0 or self._loss.lost
+        return self._loss.lost or not self.map.joined()[-1:].all()
 
     @property
     def twist(self) -> Vector:
@@ -186,7 +186,7 @@ class Mapper:
         return match
 
     def finish(self) -> bool:
-        """Search for remaining loop closures and register all keyframes jointly: seconds of work.
+        """Search for open submaps and remaining loop closures, register all keyframes jointly: seconds of work.
 
         Returns:
             Whether the joint registration was kept (``KeyframeMap.refine``).
@@ -194,6 +194,7 @@ class Mapper:
         if not len(self.map):
             return False
         place = between(self.map.poses[-1], self._pose)
+        self._relocation.finish(self.map, self._closer)
         self._closer.review(self.map)
         joint = self.map.refine()
         self._pose = compose(self.map.poses[-1], place)
@@ -203,6 +204,10 @@ class Mapper:
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans, as the graph has them now."""
         return self._trajectory.poses(self.map.poses)
+
+    def on_map(self) -> NDArray[np.bool_]:
+        """Which scans of ``trajectory``, shape (n,), belong to the map, not to a submap that is not joined to it."""
+        return self._trajectory.marked(self.map.joined())
 
     def _key_is_due(self, scan: Scan) -> bool:
         if len(scan) < MIN_PAIRS:
@@ -228,20 +233,19 @@ class Mapper:
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._covariance = np.zeros((3, 3))
         self._loss.restart()
-        self._relocation = Relocation()
         self._look_around()
 
     def _searched(self) -> tuple[MappingEvent, ...]:
-        """Continue the searches for loops and, while lost, for the submap's place, each as far as its budget goes."""
+        """Continue the searches for loops and for the places of submaps, as far as the budget goes."""
         if not len(self.map):
             return ()
         poses, place = self.map.poses, between(self.map.poses[-1], self._pose)
         events: tuple[MappingEvent, ...] = ()
-        if self._closer.step(self.map, ScanBudget()):
+        budget = ScanBudget()
+        # One search at a time: neither must see the other move the poses.
+        if not self._relocation.busy and self._closer.step(self.map, budget):
             events += (MappingEvent.CLOSED,)
-        # A search for loops within the submap must not see it moved.
-        if self.map.begin and not self._closer.busy and self._relocation.step(self.map, self._closer, ScanBudget()):
-            self.map.begin = 0
+        if not self._closer.busy and self._relocation.step(self.map, self._closer, budget):
             events += (MappingEvent.JOINED,)
         if events or self.map.poses is not poses:
             self._pose = compose(self.map.poses[-1], place)
@@ -398,7 +402,7 @@ class MappingEstimator:
             if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
         if joined:
-            self._draw_submap()
+            self._draw_joined()
         closed = MappingEvent.CLOSED in step.events or joined
         moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=alone, corrected=closed)
         status = (
@@ -438,15 +442,21 @@ class MappingEstimator:
 
     def finish(self) -> bool:
         """See ``Estimator``."""
+        joint = self.mapper.finish()
+        self._draw_joined()
         self._moved = True
-        return self.mapper.finish()
+        return joint
 
-    def _draw_submap(self) -> None:
-        """Add the keyframes of a submap to the grid, which waited until it was joined to the map."""
+    def _draw_joined(self) -> None:
+        """Add to the grid the keyframes of submaps that waited until they were joined to the map."""
         stamps, poses = self.mapper.trajectory()
-        for scan, stamp, mount in self._apart:
-            self.builder.add(scan, stamp, poses[np.searchsorted(stamps, stamp)], mount)
-        self._apart.clear()
+        on_map, waiting, self._apart = self.mapper.on_map(), self._apart, []
+        for scan, stamp, mount in waiting:
+            k = np.searchsorted(stamps, stamp)
+            if on_map[k]:
+                self.builder.add(scan, stamp, poses[k], mount)
+            else:
+                self._apart.append((scan, stamp, mount))
 
     def _follow(self) -> None:
         if self._moved:

@@ -62,7 +62,8 @@ class OdometryCheck:
     The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
     no sum. A slow robot's are compared over as much motion as a fast one's: within seconds alone its error would not
     exceed ``SLACK``. What was contradicted, ways or turns, must agree step by step over ``AGREED`` before odometry
-    counts again: a turn of the wrong sign agrees as long as the robot drives straight.
+    counts again: a turn of the wrong sign agrees as long as the robot drives straight. Where ways are contradicted,
+    turns count on if they agree over all that was compared, and the reverse.
     """
 
     def __init__(self) -> None:
@@ -71,14 +72,21 @@ class OdometryCheck:
         self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
         self._row = 0
         self._wrong = np.zeros(2, bool)
+        self._kept = np.ones(2, bool)
         self._agreed = np.zeros((2, 2))
         self.since = 0.0
         """Seconds before the newest scan from which on odometry is contradicted."""
 
     @property
     def contradicted(self) -> bool:
-        """Whether odometry is not to be used."""
+        """Whether ways or turns by odometry are wrong."""
         return bool(self._wrong.any())
+
+    @property
+    def kept(self) -> tuple[bool, bool]:
+        """Whether its ways, and its turns, are used even so."""
+        way, turn = self._kept.tolist()
+        return way, turn
 
     def add(self, dt: float, odom: Array, moved: Array) -> None:
         """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans."""
@@ -114,7 +122,9 @@ class OdometryCheck:
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
                 self.since = float(rows[:, 0].sum())
+                self._kept = off[-1] <= TOLERANCE * motion[-1]
             self._wrong |= wrong
+            self._kept &= ~wrong
             self._agreed[wrong] = 0.0
         if self.contradicted:
             by_odometry, by_scans = _lengths(rows[0, 1:4]), _lengths(rows[0, 4:])
@@ -208,7 +218,13 @@ class MotionPredictor:
         turn = config.odometry_floor[1] + config.blind_speed[1] * dt
         motion = self._delta * (min(dt / self._dt, 3.0) if self._dt > 0 else 0.0)
         self._by_motion = motion, np.diag((place**2, place**2, turn**2))
-        return self._by_motion if self._by_odometry is None or self.check.contradicted else self._by_odometry
+        if self._by_odometry is None:
+            return self._by_motion
+        if not self.check.contradicted:
+            return self._by_odometry
+        way, turned = self.check.kept
+        kept = np.array((way, way, turned))
+        return np.where(kept, self._by_odometry[0], motion), np.where(kept, self._by_odometry[1], self._by_motion[1])
 
     def _noise(self, delta: Array) -> Array:
         """Covariance, shape (3, 3), of the motion ``delta`` by odometry."""

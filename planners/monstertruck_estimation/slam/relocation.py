@@ -1,9 +1,10 @@
 """When scans stop fitting the map, and where the submap begun then belongs in the map before it.
 
 A robot that was carried fits nowhere near its predicted pose. Its scans begin a submap of their own, which no odometry
-joins to the map. The surroundings of its newest keyframe are searched for in the whole map (branch and bound, a slice
-of yaws per scan, so that no scan waits for all of them); a place found is verified as every loop closure is, and joins
-both only with the support of matches from other places.
+joins to the map. The surroundings of the newest keyframe are searched for in every submap but its own, the map first
+(branch and bound, a slice of yaws per scan, so that no scan waits for all of them); a place found is verified as every
+loop closure is, and joins both only with the support of matches from other places. So a submap whose place was not
+found while the robot was in it is found when the robot comes back to it, from the map or from a later submap.
 """
 
 import math
@@ -11,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between
-from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget, finished
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, surroundings
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import KeyframeMap
@@ -100,11 +101,11 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
 
     What no keyframe saw contradicts nothing: the robot drove on by odometry alone, where there was little to see.
     """
-    begin = keyframes.begin
-    off = keyframes.poses[begin:, :2] - pose[:2]
+    own = np.flatnonzero(keyframes.part == keyframes.part[-1])
+    off = keyframes.poses[own, :2] - pose[:2]
     far = np.hypot(off[:, 0], off[:, 1])
-    near = begin + np.argsort(far, kind="stable")[:NEAR]
-    near = near[far[near - begin] <= keyframes.config.local_reach]
+    order = np.argsort(far, kind="stable")[:NEAR]
+    near = own[order[far[order] <= keyframes.config.local_reach]]
     if not len(near):
         return False
     scans = [keyframes.frames[k].scan for k in near]
@@ -113,8 +114,8 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
 
 LEVELS: Final = 7
 """Levels of the pyramid of the whole map."""
-MAP_KEYS: Final = 300
-"""Keyframes of the whole map searched in, at most."""
+PART_KEYS: Final = 300
+"""Keyframes of the map, or of a submap, searched in, at most."""
 POINTS: Final = 160
 """Points of the surroundings searched for, at most."""
 SLICE: Final = 2e6
@@ -140,22 +141,30 @@ CHECK_SPACING: Final = 2
 MOST_FAILED: Final = 3
 """and failures after which it is given up."""
 FEWEST_KEYS: Final = 2
-"""Keyframes of a submap before it is searched for."""
+"""Keyframes of a submap before it is searched for, or in."""
+LAST_KEYS: Final = 12
+"""Keyframes of every open submap searched for at the end of a run, at most."""
 
 
 class Relocation:
-    """Joins the newest submap of a keyframe map to the part that begins at the first keyframe."""
+    """Joins submaps: the newest keyframe's to the map, and those left open to the one in which the robot is."""
 
     def __init__(self) -> None:
-        self._whole: tuple[int, Submap] | None = None
+        self._submaps: dict[int, tuple[int, Array, Submap]] = {}
+        """Of each part: its keyframes, the pose of its first one, and their surfaces, all when they were merged."""
         self._progress: PiecewiseSearch[bool] | None = None
         self._last = -1
 
+    @property
+    def busy(self) -> bool:
+        """Whether a search is on its way."""
+        return self._progress is not None
+
     def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> bool:
-        """Continue the search; True if the submap was joined, which moves poses. A place found moves the submap."""
+        """Continue the search; True if submaps were joined, which moves poses. A place found moves a submap."""
         newest = len(keyframes) - 1
         if self._progress is None:
-            if newest - keyframes.begin + 1 < FEWEST_KEYS or newest == self._last:
+            if newest == self._last or not _others(keyframes, newest):
                 return False
             self._last = newest
             self._progress = PiecewiseSearch(self._joined(keyframes, closer, newest))
@@ -164,35 +173,41 @@ class Relocation:
         joined, self._progress = self._progress.result, None
         return bool(joined)
 
+    def finish(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
+        """Search for every open submap in all others, without a budget; True if submaps were joined."""
+        self.forget()
+        joined = False
+        while any(finished(self._joined(keyframes, closer, at)) for at in _samples(keyframes)):
+            joined = True
+        return joined
+
     def forget(self) -> None:
         """The keyframes have other numbers."""
-        self._whole, self._progress, self._last = None, None, -1
+        self._submaps, self._progress, self._last = {}, None, -1
 
     def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[bool]:
-        """Place the submap by the surroundings of keyframe ``at``, and verify it there; True if it was joined.
+        """Place the surroundings of keyframe ``at`` in the other submaps, and verify them there; True if joined.
 
-        The place is given up when most of the keyframes verified do not fit.
+        A place is given up when most of the keyframes verified do not fit.
         """
-        pose = yield from self._place(keyframes, at)
-        if pose is None:
-            return False
-        keyframes.place(at, pose)
-        failed = 0
-        for key in _checks(keyframes, at):
-            found = yield from closer.join(keyframes, key)
-            failed += found is None
-            if found or failed > MOST_FAILED:
-                return bool(found)
+        for part in _others(keyframes, at):
+            pose = yield from self._place(keyframes, at, part)
+            if pose is None:
+                continue
+            keyframes.place(at, pose, part)
+            failed, (keys, other) = 0, _checks(keyframes, at, part)
+            for key in keys:
+                found = yield from closer.join(keyframes, key, other)
+                if found:
+                    return True
+                failed += found is None
+                if failed > MOST_FAILED:
+                    break
         return False
 
-    def _place(self, keyframes: KeyframeMap, at: int) -> Pieces[Array | None]:
-        """Where in the whole map the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
-        if self._whole is None or self._whole[0] != keyframes.begin:
-            numbers = np.flatnonzero(keyframes.joined())
-            numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), MAP_KEYS)).astype(np.intp)]
-            yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
-            self._whole = keyframes.begin, keyframes.submap(numbers)
-        submap = self._whole[1]
+    def _place(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[Array | None]:
+        """Where in submap ``part`` the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
+        origin, submap = yield from self._submap(keyframes, part)
         yield submap.grid_cost(LEVELS)
         grid, cloud = submap.grid(LEVELS), submap.cloud
         low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
@@ -214,17 +229,52 @@ class Relocation:
         window = half, RIVAL_TURN
         yield look_ups(points, window, LEVELS)
         peak = correlate(grid, points, best, window, ANYWHERE, MIN_SCORE, APART[0], WORK)
-        return None if peak is None or peak.rival > MAX_RIVAL * peak.score else peak.pose
+        if peak is None or peak.rival > MAX_RIVAL * peak.score:
+            return None
+        return compose(keyframes.poses[part], between(origin, peak.pose))
+
+    def _submap(self, keyframes: KeyframeMap, part: int) -> Pieces[tuple[Array, Submap]]:
+        """The keyframes of ``part``, merged anew when there are more of them, and where its first one was then."""
+        numbers = np.flatnonzero(keyframes.part == part)
+        known = self._submaps.get(part)
+        if known is None or known[0] != len(numbers):
+            kept = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PART_KEYS)).astype(np.intp)]
+            yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
+            known = self._submaps[part] = len(numbers), keyframes.poses[part], keyframes.submap(kept)
+        return known[1:]
 
 
-def _checks(keyframes: KeyframeMap, at: int) -> list[int]:
-    """Keyframes of the newest submap that have others of the map near, those before and after ``at`` first."""
-    known = keyframes.poses[keyframes.joined(), :2]
-    numbers = np.arange(keyframes.begin, len(keyframes))
-    off = keyframes.poses[numbers, None, :2] - known
-    near = numbers[np.hypot(off[..., 0], off[..., 1]).min(axis=1) < VIEW]
-    near = near[np.argsort(np.abs(near - at), kind="stable")][: CHECKS * CHECK_SPACING : CHECK_SPACING]
-    return [int(k) for k in near]
+def _others(keyframes: KeyframeMap, at: int) -> list[int]:
+    """Submaps that the one of keyframe ``at`` may be joined to, the map first, then the newest."""
+    parts, counts = np.unique(keyframes.part, return_counts=True)
+    if counts[parts == keyframes.part[at]] < FEWEST_KEYS:
+        return []
+    others = parts[(parts != keyframes.part[at]) & (counts >= FEWEST_KEYS)]
+    return sorted(others.tolist(), key=lambda part: -part if part else -math.inf)
+
+
+def _samples(keyframes: KeyframeMap) -> list[int]:
+    """Keyframes of every open submap, evenly chosen."""
+    parts = [np.flatnonzero(keyframes.part == part) for part in np.unique(keyframes.part[~keyframes.joined()])]
+    chosen = [own[np.linspace(0, len(own) - 1, min(len(own), LAST_KEYS)).astype(np.intp)] for own in parts]
+    return [int(k) for own in chosen for k in own]
+
+
+def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]:
+    """Keyframes to verify where submap ``part`` has been aligned with that of keyframe ``at``; the other submap.
+
+    They are of the smaller of both, for what it saw the greater one should have; those at the place of ``at`` first,
+    and only where some of the other submap are near.
+    """
+    submaps = [np.flatnonzero(keyframes.part == one) for one in (keyframes.part[at], part)]
+    few, many = sorted(submaps, key=len)
+    off = keyframes.poses[few, None, :2] - keyframes.poses[many, :2]
+    near = few[np.hypot(off[..., 0], off[..., 1]).min(axis=1) < VIEW]
+    there = keyframes.poses[few, :2] - keyframes.poses[at, :2]
+    middle = few[np.argmin(np.hypot(there[:, 0], there[:, 1]))]
+    near = near[np.abs(near - middle) <= CHECKS * CHECK_SPACING]
+    near = near[np.argsort(np.abs(near - middle), kind="stable")][: CHECKS * CHECK_SPACING : CHECK_SPACING]
+    return near.tolist(), int(keyframes.part[many[0]])
 
 
 def _unique(peaks: list[Peak]) -> Array | None:

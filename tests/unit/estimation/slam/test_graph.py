@@ -85,7 +85,9 @@ def test_thinning_hands_relations_over_so_that_the_optimum_stays():
     edges = chain(bent, [(k, k + 99, between(truth[k], truth[k + 99])) for k in range(100)])
     full = optimise(bent, edges)
     marks = np.zeros(len(edges), bool)
-    gone, stand_in, left, spread, odometry = pruned(full, edges, np.full((len(edges), 2), 1e-4), marks, 0.1)
+    gone, stand_in, left, spread, odometry = pruned(
+        full, np.zeros(len(full), np.int64), edges, np.full((len(edges), 2), 1e-4), marks, 0.1
+    )
     assert gone.sum() == 20
     assert not gone[0]
     assert not gone[-60:].any()
@@ -102,7 +104,7 @@ def test_relations_handed_over_do_not_pile_up():
     edges = chain(truth, [(k, k + gap, between(truth[k], truth[k + gap])) for gap in (2, 3, 99) for k in range(100)])
     spread, marks, poses = np.full((len(edges), 2), 1e-4), np.zeros(len(edges), bool), truth
     for _ in range(5):
-        gone, _, edges, spread, marks = pruned(poses, edges, spread, marks, 0.1)
+        gone, _, edges, spread, marks = pruned(poses, np.zeros(len(poses), np.int64), edges, spread, marks, 0.1)
         edges, poses = edges.renumbered(np.cumsum(~gone) - 1), poses[~gone]
         ends = np.sort(np.stack((edges.origin, edges.target)), axis=0)
         assert len(np.unique(ends, axis=1).T) == len(edges), "one relation between two keyframes"

@@ -30,6 +30,11 @@ def test_an_unmoved_graph_gives_back_what_was_reported():
     assert poses[:, 0] == pytest.approx(np.arange(9))
 
 
+def test_every_scan_has_the_mark_of_its_keyframe():
+    trail, _ = straight()
+    assert trail.marked(np.array((True, False, True))).tolist() == [True] * 4 + [False] * 4 + [True]
+
+
 def test_what_a_closure_moves_is_spread_over_the_scans_between():
     trail, keys = straight()
     keys[1] += (0.0, 0.4, 0.0)

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between
+from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.motion import MotionPredictor, OdometryCheck, ScanOdometry
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
@@ -167,6 +167,29 @@ def test_one_late_odometry_is_no_contradiction():
     for wrong in (0.0, 2.0):
         check.add(0.3, wrong * STEP * 10, STEP * 10)
     assert not compared(check, 1.0, 50).contradicted
+
+
+def misled(wrong):
+    """A model after 10 s of odometry that makes ``wrong`` of every motion, and what it predicts of the next one."""
+    model, odom = MotionPredictor(MapperConfig()), np.zeros(3)
+    for _ in range(100):
+        delta, noise = model.predict(0.1, odom)
+        model.learn(0.1, delta, noise, STEP, match(tuple(STEP)))
+        odom = compose(odom, STEP * wrong)
+    assert model.use is OdometryUse.CONTRADICTED
+    return model.predict(0.1, compose(odom, (2.0, 0.0, 2.0) * STEP * wrong))[0]
+
+
+def test_ways_by_odometry_count_on_if_only_its_turns_are_wrong():
+    assert misled(np.array((1, 1, -1))) == pytest.approx((3 * STEP[0], 0.0, STEP[2]), abs=5e-3)
+
+
+def test_turns_by_odometry_count_on_if_only_its_ways_are_wrong():
+    assert misled(np.array((2, 2, 1))) == pytest.approx((STEP[0], 0.0, 3 * STEP[2]), abs=5e-3)
+
+
+def test_nothing_of_odometry_counts_if_both_are_wrong():
+    assert misled(np.array((2, 2, 2))) == pytest.approx(STEP, abs=5e-3)
 
 
 def test_a_corridor_does_not_contradict_the_way_by_odometry():

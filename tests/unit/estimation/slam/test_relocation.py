@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.budget import ScanBudget
+from monstertruck_estimation.slam.closure import JOIN_CONTRADICTION, LoopCloser, crossed
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import UNKNOWN, Mapper, MappingEvent
-from monstertruck_estimation.slam.relocation import LossDetector, contradicts
+from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 from monstertruck_estimation.slam.storage import saved_graph
 from tests.unit.estimation.slam.kit import box, drifting, errors, rounds, scan
@@ -75,6 +79,82 @@ def test_somewhere_else_it_stays_apart_and_is_not_saved():
     assert len(graph.poses) <= known + 1 < len(mapper.map)
     mapper.finish()
     assert mapper.map.poses[:known] == pytest.approx(graph.poses[:known], abs=0.05)
+
+
+WAY = rounds(200, 1.0, 3.6, 2.2)[::4]
+"""Where keyframes are in the hall, 0.4 m apart."""
+SURE = np.diag((0.02**2, 0.02**2, 0.004**2))
+
+
+def extend(keyframes, poses, begin=None):
+    """Add keyframes at ``poses`` in the hall, one by one; the first at ``begin``, in a submap of its own."""
+    rng = np.random.default_rng(len(keyframes))
+    for k, pose in enumerate(poses):
+        known, stamp = scan(HALL, pose, noise=0.01, rng=rng), len(keyframes) * SECOND
+        if k == 0 and begin is not None:
+            keyframes.add(known, stamp, np.array(begin), apart=True)
+        else:
+            delta = between(poses[k - 1], pose)
+            keyframes.add(known, stamp, compose(keyframes.poses[-1], delta))
+            keyframes.add_odometry_edge(delta, SURE)
+        yield len(keyframes)
+
+
+def consume(steps):
+    for _ in steps:
+        pass
+
+
+def submaps(*stretches):
+    """Keyframes of several stretches of ``WAY``, each in a submap of its own."""
+    keyframes = KeyframeMap(MapperConfig())
+    for k, stretch in enumerate(stretches):
+        consume(extend(keyframes, WAY[stretch], (7.0 * k, 3.0 * k, 0.4 * k)))
+    return keyframes
+
+
+def test_a_submap_left_open_is_joined_when_the_robot_comes_back_to_it():
+    keyframes, relocation, closer = submaps(slice(15), slice(20, 40)), Relocation(), LoopCloser()
+    joined = [
+        (count - 35, np.unique(keyframes.part).tolist())
+        for count in extend(keyframes, WAY[5:32], (-9.0, 2.0, 2.0))
+        if relocation.step(keyframes, closer, ScanBudget(1e12))
+    ]
+    assert [parts for _, parts in joined] == [[0, 15], [0]]
+    assert joined[0][0] < 15 < joined[1][0]
+    assert errors(keyframes.poses, np.concatenate((WAY[:15], WAY[20:40], WAY[5:32]))).max() < 0.06
+
+
+def test_at_the_end_of_a_run_open_submaps_are_searched_for_once_more():
+    keyframes, relocation = submaps(slice(22), slice(10, 40)), Relocation()
+    assert relocation.finish(keyframes, LoopCloser())
+    assert keyframes.joined().all()
+    assert errors(keyframes.poses, np.concatenate((WAY[:22], WAY[10:40]))).max() < 0.06
+
+
+def test_submaps_of_different_places_stay_apart_at_the_end():
+    keyframes = submaps(slice(10), slice(25, 35))
+    assert not Relocation().finish(keyframes, LoopCloser())
+    assert np.unique(keyframes.part).tolist() == [0, 10]
+
+
+def test_aligning_a_submap_never_moves_the_map():
+    keyframes = submaps(slice(10), slice(5, 15))
+    there = keyframes.poses[:10].copy()
+    keyframes.place(12, there[7], 0)
+    assert keyframes.poses[12] == pytest.approx(there[7])
+    eighth = np.array((1.0, 1.0, 1.0))
+    keyframes.place(8, eighth, 10)
+    assert keyframes.poses[:10] == pytest.approx(there)
+    assert between(keyframes.poses[8], keyframes.poses[12]) == pytest.approx(between(eighth, there[7]))
+
+
+def test_submaps_joined_at_a_wrong_place_look_through_each_other():
+    keyframes = submaps(slice(22), slice(10, 40))
+    keyframes.place(22, keyframes.poses[10], 0)
+    assert crossed(keyframes, 0, 22) < 0.3 * JOIN_CONTRADICTION
+    keyframes.place(22, compose(keyframes.poses[10], np.array((0.0, 1.5, 0.8))), 0)
+    assert crossed(keyframes, 0, 22) > JOIN_CONTRADICTION
 
 
 def fit(overlap, degeneracy=0.5):
