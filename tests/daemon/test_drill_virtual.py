@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -81,11 +81,15 @@ def test_draws_are_the_seeds():
 # The observer, with nobody driving but the test
 
 
+TAPPED = ("drive", "steering", "lidar", "compass")
+
+
 @dataclass(frozen=True)
 class Bare:
     world: World
     ports: dict[str, MemoryPort]
     clock: VirtualClock
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
 
 
 def watched(
@@ -94,13 +98,14 @@ def watched(
     stops: bool = False,
     disarms: bool = False,
     disarmed: bool = False,
+    estopped: bool = False,
     seconds: float = 3.0,
 ) -> set[str]:
     """Rules broken by a scene."""
 
     async def main(clock: VirtualClock) -> set[str]:
         world = World(demo().sim.world, seed=1)
-        ports = {role: MemoryPort(role) for role in ("drive", "steering")}
+        ports = {role: MemoryPort(role) for role in TAPPED}
         bare = Bare(world, ports, clock)
         observer = Observer(demo(), world, ports, clock)
         watching = asyncio.create_task(observer.run())
@@ -109,6 +114,8 @@ def watched(
             observer.begin(stops=stops, disarms=disarms)
             if disarmed:
                 observer.disarm()
+            if estopped:
+                observer.estop()
             scene(bare)
             await clock.sleep(seconds)
         finally:
@@ -122,6 +129,11 @@ def motor(rpm: float) -> Callable[[Bare], None]:
     return lambda bare: bare.world.motor.command(bare.clock.now(), -rpm, 1e5)
 
 
+def said(bare: Bare, role: str) -> None:
+    """A device's bytes reach the host."""
+    bare.ports[role].device.on_bytes(False, b"?")
+
+
 def pulses(channel: int, us: int) -> bytes:
     return bytes((0x84, channel, 4 * us & 0x7F, 4 * us >> 7))
 
@@ -132,6 +144,22 @@ def test_a_quiet_drive_breaks_no_rule():
 
 def test_motion_of_a_disarmed_truck_is_seen():
     assert watched(motor(10_000), disarmed=True) == {"disarmed"}
+
+
+def test_motion_after_an_emergency_stop_is_seen_until_it_is_reset():
+    assert watched(motor(10_000), estopped=True) == {"emergency stop"}
+
+    async def main(clock: VirtualClock) -> bool:
+        observer = Observer(demo(), World(demo().sim.world, seed=1), {r: MemoryPort(r) for r in TAPPED}, clock)
+        observer.estop()
+        observer.reset()
+        watching = asyncio.create_task(observer.run())
+        motor(10_000)(Bare(observer._world, {}, clock))
+        await clock.sleep(2.0)
+        watching.cancel()
+        return not observer.violations()
+
+    assert run_virtual(main)
 
 
 def test_motion_after_a_fault_that_must_stop_is_seen():
@@ -156,6 +184,37 @@ def test_a_truck_that_is_too_fast_is_seen():
     assert watched(motor(20_000)) == {"speed"}
 
 
+def test_a_truck_that_backs_too_fast_is_seen():
+    assert watched(motor(-13_500), seconds=2.0) == {"speed"}
+    assert watched(motor(-12_000), seconds=2.0) == set()
+
+
+@pytest.mark.parametrize("role", TAPPED)
+@pytest.mark.parametrize(("silent", "seen"), [(0.7, False), (1.2, True)])
+def test_driving_on_though_a_device_is_silent_is_seen(role: str, silent: float, seen: bool):
+    def scene(bare: Bare) -> None:
+        motor(10_000)(bare)
+        said(bare, role)
+
+    assert watched(scene, seconds=silent) == ({"silence"} if seen else set())
+    assert watched(lambda bare: said(bare, role), seconds=silent) == set(), "it stands"
+
+
+def test_driving_towards_something_faster_than_it_brakes_is_seen():
+    def before(metres: float, rpm: float) -> Callable[[Bare], None]:
+        def scene(bare: Bare) -> None:
+            truth = bare.world.truth(bare.clock.now())
+            ahead = demo().sim.world.truck.length / 2 + metres + 0.1
+            x, y = truth.x + ahead * math.cos(truth.yaw), truth.y + ahead * math.sin(truth.yaw)
+            bare.world.add(bare.clock.now(), Disc(x, y, 0.1))
+            motor(rpm)(bare)
+
+        return scene
+
+    assert "braking" in watched(before(0.25, 17_000), seconds=1.3)
+    assert watched(before(0.25, 4_000), seconds=1.3) == set()
+
+
 def test_driving_into_something_is_seen():
     def scene(bare: Bare) -> None:
         now = bare.clock.now()
@@ -166,7 +225,16 @@ def test_driving_into_something_is_seen():
     assert watched(scene) == {"contact", "obstacle"}
 
 
-@pytest.mark.parametrize(("pulse", "rules"), [(1240, set[str]()), (900, {"angle bytes"})])
+@pytest.mark.parametrize(
+    ("pulse", "rules"),
+    [
+        (1240, set[str]()),
+        (1088, set()),
+        (1087, {"pulse bytes"}),
+        (1841, {"pulse bytes"}),
+        (900, {"pulse bytes", "angle bytes"}),
+    ],
+)
 def test_pulses_beyond_the_limits_are_seen(pulse: int, rules: set[str]):
     assert watched(lambda bare: bare.ports["steering"].device.take(pulses(1, pulse))) == rules
 
@@ -179,9 +247,37 @@ def test_a_truck_that_does_not_turn_as_its_pulses_ask_is_seen():
     assert watched(scene, seconds=4.0) == {"steering"}
 
 
-def test_target_speeds_beyond_the_limit_are_seen():
-    frame = write_request(od.TARGET_VELOCITY, -30_000, 1)
-    assert watched(lambda bare: bare.ports["drive"].device.take(frame.body)) == {"speed bytes"}
+RPM = 81_997
+"""Of the motor at 1 m/s; the controller's positive sense drives backwards."""
+
+
+@pytest.mark.parametrize(
+    ("speed", "rules"), [(0.21, set[str]()), (0.215, {"speed bytes"}), (-0.15, set[str]()), (-0.16, {"speed bytes"})]
+)
+def test_target_speeds_beyond_the_limit_are_seen(speed: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        targets(bare, *((0.02 * tick, 0.01 * tick * speed / abs(speed)) for tick in range(15)), (0.4, speed))
+
+    assert watched(scene) == rules
+
+
+@pytest.mark.parametrize(("then", "rules"), [(0.145, set[str]()), (0.16, {"ramp bytes"}), (0.0, set[str]())])
+def test_bytes_that_ask_for_a_speed_sooner_than_the_ramp_are_seen(then: float, rules: set[str]):
+    assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.15, 0.08), (0.2, then))) == rules
+    assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.2, 0.0), (0.5, then))) == set()
+
+
+def targets(bare: Bare, *speeds: tuple[float, float]) -> None:
+    """Ask for speeds, each (s from now, m/s)."""
+
+    async def ask() -> None:
+        began = bare.clock.now()
+        for at, speed in speeds:
+            await bare.clock.sleep_until(began + round(at * SECOND))
+            frame = write_request(od.TARGET_VELOCITY, round(-RPM * speed), 1)
+            bare.ports["drive"].device.take(frame.body)
+
+    bare.tasks.append(asyncio.get_running_loop().create_task(ask()))
 
 
 def test_a_truck_before_something_is_distinguished_from_one_in_the_open():

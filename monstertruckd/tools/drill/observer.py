@@ -1,11 +1,11 @@
 """The observer of a drill: checks invariants by the bytes on two wires and the world's truth, not by the daemon's word.
 
-It sees the wires of drive and steering, the true state of the truck and the operator's orders.
+It sees the wires of drive, steering, lidar and compass, the true state of the truck and the operator's orders.
 """
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,8 +42,16 @@ TURN_ERROR: Final = 0.5
 TURN_WINDOW: Final = 2.0
 FAN: Final = np.linspace(-1.2, 1.2, 49)
 """Directions of the distances that are checked ahead, rad."""
+FAR: Final = 100.0
+"""Distance of what is not there, m."""
 HELD_WITHIN: Final = 1.0
 """Seconds for which a motor may be commanded to turn a shaft that is held."""
+RAMP_SLACK: Final = 0.1
+"""Seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common beat."""
+BRAKES_WITHIN: Final = 0.4
+"""Seconds for which a truck may be too fast for the room before it: something may step in its way."""
+ROOM: Final = np.linspace(0.0, 0.5, 26)
+"""Ways ahead of which the ground is looked at, m."""
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -70,19 +78,26 @@ class WireTap:
         """(ns, bytes) as the last of them reached the device."""
         self.to_host: list[tuple[int, bytes]] = []
         """(ns, bytes) as the last of them reached the host."""
+        self.heard: int | None = None
+        """When the host last got any, ns."""
         self._clock = clock
         port.device.on_bytes = self._pass
 
     def _pass(self, to_device: bool, data: bytes) -> None:
-        (self.to_device if to_device else self.to_host).append((self._clock.now(), data))
+        now = self._clock.now()
+        (self.to_device if to_device else self.to_host).append((now, data))
+        if not to_device:
+            self.heard = now
 
 
 def written(tap: WireTap, since: int = 0) -> list[tuple[int, int, int]]:
     """Objects the host wrote to an EPOS: (ns, index, raw value); whatever is not a whole frame is skipped."""
+    return _writes(item for item in tap.to_device if item[0] >= since)
+
+
+def _writes(received: Iterable[tuple[int, bytes]]) -> list[tuple[int, int, int]]:
     found = []
-    for instant, data in tap.to_device:
-        if instant < since:
-            continue
+    for instant, data in received:
         with suppress(FrameError):
             words = decode_body(Opcode.WRITE, data).words
             if len(words) == 4:
@@ -105,7 +120,7 @@ class Observer:
     Args:
         config: of the truck, for its limits.
         world: the simulated world.
-        ports: whose wires are tapped: drive and steering.
+        ports: whose wires are tapped: drive and steering, and those of lidar and compass where it has them.
         clock: time.
     """
 
@@ -117,14 +132,27 @@ class Observer:
         self._clock = clock
         self.drive = WireTap(ports["drive"], clock)
         self._steering = WireTap(ports["steering"], clock)
+        gate = config.gate
+        wires = {"drive": self.drive, "steering": self._steering}
+        wires |= {role: WireTap(ports[role], clock) for role in ("lidar", "compass") if role in ports}
+        limits = {"drive": gate.drive, "steering": gate.steering, "lidar": gate.scan, "compass": gate.attitude}
+        self._senses = [(role, tap, limits[role].stale_after) for role, tap in wires.items() if limits[role].critical]
+        """Wires of what the truck may not drive without: device, wire, and for how long it may be silent, s."""
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
         self._truck = truck = config.sim.world.truck
         self._chassis = truck.chassis()
         self._angle = config.gate.angle + ANGLE_MARGIN
-        self._speed = config.gate.speed
+        self._speeds = gate.reverse_speed, gate.speed
+        """Greatest backwards and forwards, m/s."""
+        self._braking = gate.obstacle.deceleration
         self._camera = config.sim.world.camera.x
         drivetrain = DriveTrain(truck.motor.ratio, truck.wheel_radius)
-        self._rpm = drivetrain.motor_rate(config.gate.speed) * 30 / math.pi
+        self._rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if truck.motor.inverted else 1)
+        """Of the motor at 1 m/s, in the controller's sign."""
+        self._acceleration = gate.acceleration
+        self._ramp = 0.0, 0
+        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns."""
+        self._servos = {servo.channel: servo for servo in config.devices.steering.driver.servos}
         self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
         """Servo angles that the newest pulses ask for, rad."""
         self._turn_errors: deque[tuple[int, float]] = deque()
@@ -132,9 +160,13 @@ class Observer:
         """Motor speed that the newest bytes ask for, rpm."""
         self._held: int | None = None
         """Since when the motor has been asked to turn a shaft that is held, ns."""
+        self._fast: int | None = None
+        """Since when the truck has been too fast for the room before it, ns."""
         self._disarmed: int | None = None
+        self._estopped: int | None = None
         self._began = 0
-        self._read_until = 0
+        self._read = 0
+        """How much of the drive's bytes was checked."""
         self._must_stop = False
         self._disarms = False
         self._stood: int | None = None
@@ -158,8 +190,9 @@ class Observer:
             self._check_bytes(now)
             self._check_shaft(now)
             self._check_steering(now, truth)
-            if turn % 5 == 0 and truth.v > 2 * AT_REST:
-                self._check_ahead(now)
+            self._check_senses(now)
+            if turn % 5 == 0:
+                self._check_ahead(now, truth)
             turn += 1
             due += SAMPLE
             await self._clock.sleep_until(due)
@@ -174,6 +207,14 @@ class Observer:
         """The operator arms: the truck may move."""
         self._disarmed = None
 
+    def estop(self) -> None:
+        """The operator stops: the truck must stand soon, until ``reset``."""
+        self._estopped = self._estopped or self._clock.now()
+
+    def reset(self) -> None:
+        """The operator resets the emergency stop: an armed truck may move."""
+        self._estopped = None
+
     def begin(self, *, stops: bool, disarms: bool = False) -> None:
         """A fault begins; with ``stops`` the truck must stand soon, with ``disarms`` not set off again by itself."""
         self._began = self._clock.now()
@@ -182,7 +223,9 @@ class Observer:
         self._path.clear()
         self.top_speed = 0.0
         self._turn_errors.clear()
+        self._check_bytes(self._began)
         self._violations.clear()
+        self._read = 0
         self.drive.to_device.clear()
         self.drive.to_host.clear()
 
@@ -223,12 +266,14 @@ class Observer:
             if not moving:
                 self._stood = now
         limit = STOPS_WITHIN * SECOND
-        if abs(truth.v) > self._speed * SPEED_MARGIN:
-            self._violate(now, "speed", f"{truth.v:.3f} m/s: at most {self._speed:.3f}")
+        if abs(truth.v) > (most := self._speeds[truth.v > 0]) * SPEED_MARGIN:
+            self._violate(now, "speed", f"{truth.v:.3f} m/s: at most {most:.3f}")
         if truth.stuck:
             self._violate(now, "contact", "ran into something")
         if moving and self._disarmed is not None and now > self._disarmed + limit:
             self._violate(now, "disarmed", f"{truth.v:.3f} m/s though disarmed")
+        if moving and self._estopped is not None and now > self._estopped + limit:
+            self._violate(now, "emergency stop", f"{truth.v:.3f} m/s though stopped and not reset")
         if moving and self._must_stop and now > self._began + limit:
             self._violate(now, "stop", f"{truth.v:.3f} m/s: must stand")
         if moving and self._disarms and self._stood is not None:
@@ -236,13 +281,13 @@ class Observer:
 
     def _check_bytes(self, now: int) -> None:
         """Commands to motor and servos, within their limits."""
-        since, self._read_until = self._read_until, now + 1
-        for _, index, value in written(self.drive, since):
+        fresh = self.drive.to_device[self._read :]
+        self._read += len(fresh)
+        for instant, index, value in _writes(fresh):
             rpm = value - (1 << 32) if value >= 1 << 31 else value
             if index == od.TARGET_VELOCITY.index:
                 self._target = rpm
-                if abs(rpm) > self._rpm * 1.01:
-                    self._violate(now, "speed bytes", f"{rpm} rpm: at most {self._rpm:.0f}")
+                self._check_target(now, instant, rpm / self._rpm)
             elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
                 self._target = 0
         received, self._steering.to_device[:] = list(self._steering.to_device), []
@@ -251,6 +296,23 @@ class Observer:
             for command in self._maestro.feed(data):
                 if isinstance(command, ServoCommand) and command.code is Code.SET_TARGET and command.value:
                     self._pulse(now, command.data[0], command.value / 4)
+
+    def _check_target(self, now: int, instant: int, speed: float) -> None:
+        """Bytes that ask for a speed, m/s: within the limit, and no sooner than the ramp from the bytes before."""
+        if abs(speed) > (most := self._speeds[speed > 0]) * 1.01:
+            self._violate(now, "speed bytes", f"{speed:.3f} m/s: at most {most:.3f}")
+        allowed, then = self._ramp
+        allowed += self._acceleration * (instant - then) / SECOND
+        if abs(speed) > allowed * 1.01:
+            self._violate(now, "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon")
+        self._ramp = min(allowed, abs(speed) + self._acceleration * RAMP_SLACK), instant
+
+    def _check_senses(self, now: int) -> None:
+        """A truck stops when a device is silent without which it may not drive."""
+        for role, tap, longest in self._senses:
+            silent = 0.0 if tap.heard is None else (now - tap.heard) / SECOND
+            if silent > longest + STOPS_WITHIN and abs(self.speed) > AT_REST:
+                self._violate(now, "silence", f"{self.speed:.3f} m/s though {role} is silent for {silent:.2f} s")
 
     def _check_shaft(self, now: int) -> None:
         """A motor that cannot turn is not driven on."""
@@ -263,6 +325,9 @@ class Observer:
 
     def _pulse(self, now: int, channel: int, pulse_us: float) -> None:
         truck = self._truck
+        limits = self._servos.get(channel)
+        if limits is not None and not limits.min_us - 0.5 <= pulse_us <= limits.max_us + 0.5:
+            self._violate(now, "pulse bytes", f"{pulse_us:.1f} us: {limits.min_us:g} to {limits.max_us:g}")
         for servo in (truck.front_servo, truck.rear_servo):
             if servo.channel == channel:
                 self._pulses[channel] = _arm(servo, pulse_us)
@@ -278,14 +343,29 @@ class Observer:
         if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
             self._violate(now, "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s")
 
-    def _check_ahead(self, now: int) -> None:
-        """Driving forwards: the nearest obstacle before the width of the truck."""
-        ranges = self._world.view.ranges(now, FAN)
-        ahead, aside = ranges * np.cos(FAN), ranges * np.sin(FAN)
-        before = ahead[np.abs(aside) < self._truck.width / 2]
-        room = float(before.min(initial=math.inf)) + self._camera - self._truck.length / 2
+    def _check_ahead(self, now: int, truth: TruthState) -> None:
+        """Driving forwards: what is before the width of the truck, and what is in its way on its arc."""
+        if truth.v <= 2 * AT_REST:
+            self._fast = None
+            return
+        ranges = np.minimum(self._world.view.ranges(now, FAN), FAR)
+        ahead, aside = self._camera + ranges * np.cos(FAN), ranges * np.sin(FAN)
+        width, half = self._truck.width, self._truck.length / 2
+        room = float(ahead[np.abs(aside) < width / 2].min(initial=math.inf)) - half
         if room < CLOSEST:
             self._violate(now, "obstacle", f"{self.speed:.3f} m/s towards something {room:.3f} m ahead")
+        turn = ROOM * truth.wz / truth.v
+        at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
+        dx, dy = ahead - at_x[:, None], aside - at_y[:, None]
+        c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+        met = ((np.abs(c * dx + s * dy) < half) & (np.abs(c * dy - s * dx) < width / 2)).any(axis=1)
+        room = float(ROOM[met].min(initial=math.inf))
+        if truth.v**2 / (2 * self._braking) <= room:
+            self._fast = None
+        elif self._fast is None:
+            self._fast = now
+        elif now - self._fast > BRAKES_WITHIN * SECOND:
+            self._violate(now, "braking", f"{self.speed:.3f} m/s with something on its way in {room:.3f} m")
 
 
 def _arm(servo: ServoModelConfig, pulse_us: float) -> float:

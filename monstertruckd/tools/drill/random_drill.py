@@ -40,6 +40,8 @@ TIMEOUT: Final = 15.0
 """Seconds after which a service that has not recovered is stuck."""
 RECOVERS_WITHIN: Final = 4.0
 """Seconds within which everything should be back: the goal of a lost hub."""
+ESTOPS: Final = 5
+"""Every so many faults are followed by an emergency stop, the others by a disarm order."""
 QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.OBSTACLE_SLOW})
 """Reasons that explain nothing."""
 DEADMAN: Final[dict[str, Any]] = {
@@ -272,7 +274,8 @@ class _LegRun:
             async with DrillTruck.running(self._config, self._clock) as truck:
                 await truck.until(lambda: not truck.blockers(), TIMEOUT)  # called within this turn only
                 for fault in left:
-                    outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)))
+                    order = Order.DISARM if (len(self._outcomes) + 1) % ESTOPS else Order.ESTOP
+                    outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)), order)
                     if outcome is None:
                         break
                     self._outcomes.append(outcome)
@@ -297,8 +300,11 @@ def _draw(catalog: FaultCatalog, count: int, rng: np.random.Generator) -> list[C
     return faults
 
 
-async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> FaultOutcome | None:
-    """Drive for ``cruise`` seconds, have the fault, end it, recover. None: the truck could not be driven before it."""
+async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: Order) -> FaultOutcome | None:
+    """Drive for ``cruise`` seconds, have the fault, give an order that stops, end the fault, recover.
+
+    None: the truck could not be driven before it.
+    """
     clock, observer, context = truck.clock, truck.observer, truck.rig.context
     if not await _drive(truck):
         return None
@@ -309,15 +315,19 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float) -> Fault
     await clock.sleep(fault.hold)
     stop_bytes, metres = observer.stop_bytes_after(), observer.metres()
     observer.end_fault()
-    observer.disarm()
-    await truck.order(Order.DISARM)
+    if order is Order.ESTOP:
+        observer.estop()
+    else:
+        observer.disarm()
+    await truck.order(order)
     await clock.sleep(STOPS_WITHIN / 2)
     standstill = observer.standstill_after()
     reason = next((reason for report in truck.reports() for reason in _reasons(report)), None)
     ended = clock.now()
     await apply(fault.end, context)
     truck.listen()
-    await truck.until(lambda: not truck.blockers(), TIMEOUT)
+    await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET if order is Order.ESTOP else None)
+    observer.reset()
     recovered = (clock.now() - ended) / SECOND
     blockers = truck.blockers()
     if not blockers and not await _drive(truck):
