@@ -6,6 +6,7 @@ GATE: Final = "monstertruckd/gate/"
 DRIVE: Final = "drivers/monstertruck_drivers/epos/driver.py"
 NANOSECOND: Final = "a nanosecond, at the very beginning of time"
 UNREAD: Final = "set before it is read"
+ROUNDED: Final = "a difference of rounded distances is never exactly 3 cm"
 CACHE: Final = "the cached value is computed once more"
 
 EQUIVALENTS: Final[dict[str, str]] = {
@@ -15,6 +16,10 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::ObstacleGuard._look: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard._delay: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
+    f"{GATE}limiter.py::ScanMemory.forget: 0.0 -> (1.0)": "poses and distances are compared by their differences",
+    f"{GATE}limiter.py::ScanMemory.seen: beyond_x < DRIFT -> (beyond_x <= DRIFT)": ROUNDED,
+    f"{GATE}limiter.py::ScanMemory.seen: beyond_y < DRIFT -> (beyond_y <= DRIFT)": ROUNDED,
+    f"{GATE}limiter.py::ScanMemory.points: beams >= edge -> (beams > edge)": "0.1 rad are 16.3 beams of the lidar",
     f"{GATE}limiter.py::Motion.servos: self._servos[0] != self.angles -> True": CACHE,
     f"{GATE}limiter.py::Motion.shaft_speeds: self._shafts[0] != command -> True": CACHE,
     f"{GATE}limiter.py::Motion.shaft_speeds: 0 -> (1)": CACHE,

@@ -410,7 +410,7 @@ class ObstacleGuard:
             self._look(rounded)
             hidden = [way for way in rounded if way[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
-            self._free = min(self._free_distance(*way, behind if way in hidden else None) for way in rounded)
+            self._free = min(self._free_distance(*way, behind) for way in rounded)
             self.known = self._known_distance(hidden)
         return self._free
 

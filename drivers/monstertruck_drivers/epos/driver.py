@@ -229,8 +229,8 @@ class _DriveSession:
         self._fault: int | None = None
         self._stopping = False
         """The quick stop that is wanted now was sent."""
-        self._commanded_off = False
-        """The power stage was switched off by this host."""
+        self._control_sent: Control | None = None
+        """Newest controlword of this host."""
         self._prepared = False
         """Mode and profile are those configured."""
         self._commands_after = self._clock.now()
@@ -446,7 +446,7 @@ class _DriveSession:
         if self._state in OFF and was not in OFF:
             self._prepared = False
             await self._check_mark()
-            if was is State.ENABLED and not self._commanded_off:
+            if was is State.ENABLED and self._control_sent is not Control.DISABLE_VOLTAGE:
                 raise DeviceRestartedError("the controller restarted")
         if self._state in FAULTED:
             await self._attend_fault()
@@ -477,7 +477,7 @@ class _DriveSession:
             await self._control(control)
 
     async def _control(self, control: Control) -> None:
-        self._commanded_off = control is Control.DISABLE_VOLTAGE
+        self._control_sent = control
         try:
             await self._line.write(od.CONTROLWORD, control)
         except ObjectError as error:

@@ -308,6 +308,13 @@ def test_a_failed_service_is_named_in_its_event():
     assert rig.reported(Reason.DISARMED)[-1].text == Reason.SERVICE_FAILED.text
 
 
+def test_another_reason_says_no_more_than_itself():
+    rig = Rig().driving()
+    rig.tilt = 0.5
+    rig.tick()
+    assert rig.reported(Reason.TILT_STOP)[0].text == Reason.TILT_STOP.text
+
+
 @pytest.mark.parametrize(("apart", "disarms"), [(2.5, True), (10 / 3, True), (10 / 3 + 0.001, False)])
 def test_so_many_short_faults_within_their_time_disarm(apart, disarms):
     rig = Rig().driving()

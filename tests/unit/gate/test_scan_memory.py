@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import DRIFT, MEMORY, ScanMemory, spaced
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.limiter import DRIFT, MEMORY, ObstacleGuard, ScanMemory, spaced
 from tests.unit.gate.rig import TICK, Rig, scan
 
 FOOTPRINT = Footprint()
@@ -95,6 +96,13 @@ def test_points_that_the_body_stands_on_are_none():
     remembered = memory()
     see(remembered, SECOND, (0.3, FOOTPRINT.half_width - 0.01))
     assert len(see(remembered, drive(remembered, 0.5))) == 0
+
+
+def test_how_far_the_truck_has_come_before_does_not_matter():
+    remembered = memory(distance=0.5)
+    now = drive(remembered, 2.0)
+    see(remembered, now, (0.2, 0.4))
+    assert len(see(remembered, drive(remembered, 0.45, now=now))) == 1
 
 
 def seen(remembered, *xs):
@@ -200,6 +208,14 @@ def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
     assert remembered.seen(np.array([here, beyond, aside])).tolist() == [True, False, False]
 
 
+@pytest.mark.parametrize("code", range(21))
+def test_beams_that_met_nothing_see_free_ground_and_those_that_say_nothing_do_not(code):
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    message = fan(SECOND, 11, reach=math.inf)
+    remembered.observe(message.model_copy(update={"codes": np.full(11, code, np.uint8)}), np.empty((0, 2)))
+    assert seen(remembered, 0.9) is (code <= 2)
+
+
 def test_scans_of_different_geometry_are_remembered_each_by_its_own():
     remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
     for second, (beams, bearing) in enumerate([(21, 2.0), (5, 0.0), (11, math.pi / 2)], 1):
@@ -223,6 +239,13 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
 
 
 # In the gate
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.5, math.inf), (0.495, 0.0)])
+def test_ways_less_than_half_forwards_are_held_against_what_is_known(share, known):
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard.free_distance(((share, math.sqrt(1.0 - share**2), 0.0),))
+    assert guard.known == known
 
 
 def surround(rig, *obstacles):

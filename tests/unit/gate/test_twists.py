@@ -5,10 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_planners.collision import Footprint
+from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import ANY_GROUND, Robot
+from tests.unit.gate.rig import ANY_GROUND, Rig, Robot
 
 SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
 
@@ -143,6 +145,39 @@ def test_wheels_turn_at_standstill_before_they_drive_elsewhere():
         moved.append((angle, max(map(abs, robot.shafts))))
     assert moved[-1] == pytest.approx((math.pi / 2, 0.1))
     assert all(speed == 0.0 for angle, speed in moved if 0.01 < angle < math.pi / 2 - 0.36)
+
+
+def test_wheels_do_not_turn_aside_under_a_body_that_still_rolls():
+    robot = Robot("wheels").driving(vx=0.15, ticks=60)
+    robot.driver = SIDE
+    robot.tick()
+    while any(robot.out.speeds):
+        robot.tick()
+    robot.shafts = [0.1] * len(robot.shafts)
+    robot._obey = lambda: None
+    before = robot.out.servos
+    robot.tick(10)
+    assert robot.out.servos == before
+    robot.shafts = [0.0] * len(robot.shafts)
+    robot.tick(10)
+    assert robot.out.servos != before
+
+
+def test_a_body_that_is_to_turn_brakes_for_what_is_ahead_while_it_still_drives_there():
+    robot = Robot("differential").driving(vx=0.2, ticks=60)
+    robot.driver = {"wz": 0.5}
+    robot.obstacles = [(Footprint().half_length + 0.03, 0.0)]
+    robot.tick()
+    assert robot.out.action is DriveAction.QUICK_STOP
+
+
+def test_the_limit_of_reverse_holds_from_the_first_tick():
+    rig = Rig(obstacle=ANY_GROUND).armed()
+    rig.driver = {"speed": -0.2}
+    assert Reason.CLIPPED in rig.tick().reasons
+    rig = Rig(obstacle=ANY_GROUND).armed()
+    rig.driver = {"speed": 0.2}
+    assert Reason.CLIPPED not in rig.tick().reasons
 
 
 def test_wheels_turn_no_further_than_they_must():

@@ -147,6 +147,24 @@ def test_sectors_of_travel_are_those_of_the_ground_it_takes():
     assert len(visibility.last_seen(back)) < len(back)
 
 
+def test_a_lidar_that_has_never_seen_the_way_keeps_the_truck_standing():
+    rig = Rig()
+    rig.unknown = ((-119.0, 120.0, 7),)
+    rig.driving(speed=0.2)
+    assert Reason.LIDAR_BLIND in rig.out.reasons
+    assert rig.travelled == 0.0
+
+
+def test_a_way_not_seen_for_the_scans_limit_itself_is_driven_slowly():
+    rig = Rig(scan={"stale_after": 0.24}).driving(speed=0.2)
+    rig.unknown = ((-119.0, 120.0, 7),)
+    rig.tick(12)
+    assert rig.gate._obstacles.unseen == 0.24
+    assert Reason.LIDAR_SLOW in rig.out.reasons
+    rig.tick()
+    assert Reason.LIDAR_BLIND in rig.out.reasons
+
+
 def test_the_mode_stays_driving_and_goes_on_when_the_lidar_sees_again():
     rig = Rig().driving(speed=0.2)
     rig.unknown = ((-30.0, 30.0, 6),)

@@ -505,7 +505,7 @@ def test_power_that_goes_off_by_itself_is_a_restart(asked: bool, off: State):
         session = rig.session
         rig.driver.mark = 0
         session._reported = State.ENABLED
-        session._commanded_off = asked
+        session._control_sent = Control.DISABLE_VOLTAGE if asked else Control.ENABLE
         rig.line.values[od.STATUSWORD] = off.value
         if asked:
             await session._look()
