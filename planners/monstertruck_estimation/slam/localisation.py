@@ -166,13 +166,14 @@ class LocalisationEstimator:
             # The predicted motion may be wrong: by a late odometry, or by stamps that are not those of the scans.
             before = compose(guess, inverse(delta))
             still = self._front.match(scan, np.zeros(3), before, covariance, self._submap)
-            match = still if fits(still) else match
+            if fits(still) or (_strayed(match, guess) and not _strayed(still, before)):
+                match, guess = still, before
         place, turn = deviations(match.covariance)
         good = fits(match)
         if good:
             evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
             good = evidence.contradiction <= MAX_CONTRADICTION
-        if match.accepted and not good and _apart(match.pose, guess):
+        if match.accepted and not good and _strayed(match, guess):
             match = rejected(guess, covariance, MatchStatus.FAR)
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
         self._misfits = 0 if good else self._misfits + 1
@@ -209,6 +210,11 @@ class LocalisationEstimator:
         self._global, self._tracking = self._search_anew(), False
         self.counts["searches"] += 1
         return True
+
+
+def _strayed(match: ScanMatch, guess: Array) -> bool:
+    """Whether a match is rejected, or not of the place where it began."""
+    return not match.accepted or _apart(match.pose, guess)
 
 
 def _apart(one: Array, other: Array) -> bool:

@@ -124,3 +124,21 @@ def test_a_match_elsewhere_counts_only_if_all_of_it_fits(monkeypatch, away, over
     estimate = followed(SavedMap(drawn(), None), ROOM, [truth], start=tuple(believed.tolist()))[-1]
     assert np.array(estimate.pose) == pytest.approx(said if taken else believed)
     assert ("rejected" in estimate.events) is not taken
+
+
+@pytest.mark.parametrize("there", [MatchStatus.ACCEPTED, MatchStatus.FAR])
+def test_half_a_scan_counts_where_the_robot_last_was_if_none_does_where_the_motion_led(monkeypatch, there):
+    """As a robot leaves the map, one wrong motion must not move it on."""
+    truth = np.repeat(rounds(80, laps=0.6)[:1], 2, axis=0)
+    wheels = truth + np.array(((0.0, 0.0, 0.0), (1.4, 0.0, 0.0)))
+
+    class Matcher:
+        def match(self, _scan, _delta, guess, covariance, _submap):
+            near = math.hypot(*(guess - truth[0])[:2]) < 0.3
+            said, status = (truth[0], MatchStatus.ACCEPTED) if near else (guess + np.array((2.0, 0.0, 0.0)), there)
+            return ScanMatch(said, covariance, 0.5, 0.01, 1.0, 0.0, status, np.eye(3))
+
+    monkeypatch.setattr(localisation, "PlanarMatcher", Matcher)
+    estimate = followed(SavedMap(drawn(), None), ROOM, truth, start=tuple(truth[0].tolist()), wheels=wheels)[-1]
+    assert np.array(estimate.pose) == pytest.approx(truth[0])
+    assert "rejected" not in estimate.events
