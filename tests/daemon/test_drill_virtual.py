@@ -264,7 +264,7 @@ def test_target_speeds_beyond_the_limit_are_seen(speed: float, rules: set[str]):
 @pytest.mark.parametrize(("then", "rules"), [(0.145, set[str]()), (0.16, {"ramp bytes"}), (0.0, set[str]())])
 def test_bytes_that_ask_for_a_speed_sooner_than_the_ramp_are_seen(then: float, rules: set[str]):
     assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.15, 0.08), (0.2, then))) == rules
-    assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.2, 0.0), (0.5, then))) == set()
+    assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.2, 0.0), (0.3, then))) == set()
 
 
 def targets(bare: Bare, *speeds: tuple[float, float]) -> None:

@@ -150,8 +150,8 @@ class Observer:
         self._rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if truck.motor.inverted else 1)
         """Of the motor at 1 m/s, in the controller's sign."""
         self._acceleration = gate.acceleration
-        self._ramp = 0.0, 0
-        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns."""
+        self._ramp: tuple[float, int] | None = None
+        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns; None = it begins anew."""
         self._servos = {servo.channel: servo for servo in config.devices.steering.driver.servos}
         self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
         """Servo angles that the newest pulses ask for, rad."""
@@ -289,7 +289,7 @@ class Observer:
                 self._target = rpm
                 self._check_target(now, instant, rpm / self._rpm)
             elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
-                self._target = 0
+                self._target, self._ramp = 0, None
         received, self._steering.to_device[:] = list(self._steering.to_device), []
         self._steering.to_host.clear()
         for _, data in received:
@@ -298,14 +298,20 @@ class Observer:
                     self._pulse(now, command.data[0], command.value / 4)
 
     def _check_target(self, now: int, instant: int, speed: float) -> None:
-        """Bytes that ask for a speed, m/s: within the limit, and no sooner than the ramp from the bytes before."""
+        """Bytes that ask for a speed, m/s: within the limit, and no sooner than the ramp from one before."""
         if abs(speed) > (most := self._speeds[speed > 0]) * 1.01:
             self._violate(now, "speed bytes", f"{speed:.3f} m/s: at most {most:.3f}")
-        allowed, then = self._ramp
-        allowed += self._acceleration * (instant - then) / SECOND
-        if abs(speed) > allowed * 1.01:
-            self._violate(now, "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon")
-        self._ramp = min(allowed, abs(speed) + self._acceleration * RAMP_SLACK), instant
+        if speed == 0:  # a drive that was stopped for a moment may go on as fast as before
+            self._ramp = None
+            return
+        ramp = abs(speed) + self._acceleration * RAMP_SLACK
+        if self._ramp is not None:
+            before, then = self._ramp
+            allowed = before + self._acceleration * (instant - then) / SECOND
+            if abs(speed) > allowed * 1.01:
+                self._violate(now, "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon")
+            ramp = min(ramp, allowed)
+        self._ramp = ramp, instant
 
     def _check_senses(self, now: int) -> None:
         """A truck stops when a device is silent without which it may not drive."""
