@@ -69,6 +69,7 @@ def test_a_truck_that_is_carried_is_lost_until_its_places_are_joined():
     assert drive.truth[-1, 0] > joined + 2.0
     reasons = [event.reason for event in drive.events if event.source == "slam"]
     assert reasons.index(Reason.POSE_LOST) < reasons.index(Reason.POSE_FOUND)
+    assert "two submaps are joined" in {event.text for event in drive.events if event.reason is Reason.LOOP_CLOSED}
     before = [pose.stamp / SECOND < at[0] for pose in drive.poses]
     off = drive.off()
     assert off[before].max() < 0.08

@@ -438,19 +438,15 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
 
 def crossed(keyframes: KeyframeMap, one: int, other: int) -> float:
     """Share of the points of submap ``one`` and those near it of ``other`` that the opposite ones looked through."""
-    parts = [np.flatnonzero(keyframes.part == part) for part in (one, other)]
-    parts.sort(key=len)
-    few, many = parts
+    few, many = sorted((np.flatnonzero(keyframes.part == part) for part in (one, other)), key=len)
     few = few[np.linspace(0, len(few) - 1, min(len(few), CROSSED_KEYS)).astype(np.intp)]
     counts = np.zeros(2)
     for key in few.tolist():
-        far = _distance(keyframes, key)[many]
-        near = many[np.argsort(far, kind="stable")][:CROSSED_NEAR]
-        near = near[_distance(keyframes, key)[near] < VIEW]
+        far = _distance(keyframes, key)
+        near = many[np.argsort(far[many], kind="stable")][:CROSSED_NEAR]
+        near = near[far[near] < VIEW]
         seen = [keyframes.frames[k].scan for k in near]
-        counts += _looked_through_counts(
-            [keyframes.frames[key].scan], keyframes.poses[[key]], seen, keyframes.poses[near]
-        )
+        counts += _counted([keyframes.frames[key].scan], keyframes.poses[[key]], seen, keyframes.poses[near])
     return float(counts[0] / max(counts[1], 1))
 
 
@@ -491,11 +487,12 @@ def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses
         others: the scans they are held against.
         other_poses: shape (m, 3), in the same frame.
     """
-    through, judged = _looked_through_counts(one, poses, others, other_poses)
+    through, judged = _counted(one, poses, others, other_poses)
     return through / judged if judged else 0.0
 
 
-def _looked_through_counts(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> tuple[int, int]:
+def _counted(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> tuple[int, int]:
+    """How many points the opposite scans looked through, and how many were in their view."""
     through, judged = 0, 0
     for viewers, at, seen, seen_at in ((one, poses, others, other_poses), (others, other_poses, one, poses)):
         for viewer, pose in zip(viewers, at, strict=True):

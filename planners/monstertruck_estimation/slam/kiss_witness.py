@@ -25,7 +25,7 @@ COMPARED: Final = 5 * SECOND
 """Time over which motions are compared, ns."""
 MAX_DISAGREEMENT: Final = 0.2
 """Difference of those that is reported, m."""
-JUMPS: Final = frozenset({"closed", "found", "refuted"})
+JUMPS: Final = frozenset({"closed", "joined", "found", "refuted"})
 """Events after which the estimate's next motion does not follow its last pose."""
 COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
 """Elsewhere the estimate says itself that it is in doubt, or in a corridor, where scans do not constrain the motion."""

@@ -42,6 +42,8 @@ HISTORY: Final = 128
 """Poses of odometry kept: 2.5 s at 50 Hz."""
 STALE: Final = SECOND // 5
 """Odometry older than the scan by more than this is not used, ns."""
+CORRECTIONS: Final = {"closed": "closure {}", "joined": "two submaps are joined"}
+"""What is reported of a step that has corrected the map; {} is the number of closures."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 """The pose in map means nothing."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
@@ -305,8 +307,8 @@ class SlamService:
         if estimate.disagreement is not None:
             text = f"by {estimate.disagreement:.2f} m over the last seconds"
             self._events(Reason.WITNESS_DISAGREES, Severity.WARNING, self.name, text, distance=estimate.disagreement)
-        if "closed" in estimate.events:
-            self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, f"closure {outputs.counts['closures']}")
+        for text in (CORRECTIONS[event] for event in estimate.events if event in CORRECTIONS):
+            self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, text.format(outputs.counts["closures"]))
         if estimate.offset is not None and not self._offset_reported:
             self._offset_reported = True
             text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"

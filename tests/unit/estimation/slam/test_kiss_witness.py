@@ -52,6 +52,7 @@ def test_an_estimate_that_slides_away_is_reported_again_and_again():
 
 def test_a_loop_closure_and_a_doubtful_estimate_are_not_compared():
     assert reports_of(lambda k: 0.01 * k, events=("closed",)) == []
+    assert reports_of(lambda k: 0.01 * k, events=("joined",)) == []
     assert reports_of(lambda k: 0.01 * k, status=LocalisationStatus.DEGENERATE) == []
 
 
