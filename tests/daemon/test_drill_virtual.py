@@ -100,14 +100,16 @@ def watched(
     disarmed: bool = False,
     estopped: bool = False,
     seconds: float = 3.0,
+    deadman: bool = True,
 ) -> set[str]:
     """Rules broken by a scene."""
 
     async def main(clock: VirtualClock) -> set[str]:
-        world = World(demo().sim.world, seed=1)
+        config = with_overlay(demo(), DEADMAN) if deadman else demo()
+        world = World(config.sim.world, seed=1)
         ports = {role: MemoryPort(role) for role in TAPPED}
         bare = Bare(world, ports, clock)
-        observer = Observer(demo(), world, ports, clock)
+        observer = Observer(config, world, ports, clock)
         watching = asyncio.create_task(observer.run())
         try:
             world.truth(clock.now())
@@ -198,6 +200,14 @@ def test_driving_on_though_a_device_is_silent_is_seen(role: str, silent: float, 
 
     assert watched(scene, seconds=silent) == ({"silence"} if seen else set())
     assert watched(lambda bare: said(bare, role), seconds=silent) == set(), "it stands"
+
+
+def test_without_the_deadman_line_nothing_stops_a_drive_that_is_silent():
+    def scene(bare: Bare) -> None:
+        motor(10_000)(bare)
+        said(bare, "drive")
+
+    assert watched(scene, seconds=1.2, deadman=False) == set()
 
 
 def test_driving_towards_something_faster_than_it_brakes_is_seen():

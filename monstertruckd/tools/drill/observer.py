@@ -136,8 +136,14 @@ class Observer:
         wires = {"drive": self.drive, "steering": self._steering}
         wires |= {role: WireTap(ports[role], clock) for role in ("lidar", "compass") if role in ports}
         limits = {"drive": gate.drive, "steering": gate.steering, "lidar": gate.scan, "compass": gate.attitude}
-        self._senses = [(role, tap, limits[role].stale_after) for role, tap in wires.items() if limits[role].critical]
-        """Wires of what the truck may not drive without: device, wire, and for how long it may be silent, s."""
+        unreachable = set() if config.sim.deadman_wired else {"drive"}
+        self._senses = [
+            (role, tap, limits[role].stale_after)
+            for role, tap in wires.items()
+            if limits[role].critical and role not in unreachable
+        ]
+        """Wires of what the truck may not drive without: device, wire, and for how long it may be silent, s; without
+        the deadman line nothing stops a drive that cannot be reached."""
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
         self._truck = truck = config.sim.world.truck
         self._chassis = truck.chassis()
