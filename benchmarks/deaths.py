@@ -22,12 +22,9 @@ import numpy as np
 
 from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.drill.observer import AT_REST
+from monstertruckd.tools.simulation.config import DEADMAN_LINE
 from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
-LINE = {
-    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
-    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
-}
 FROZEN = 1.5
 """Seconds for which a daemon is stopped where nothing else stops the truck."""
 WATCHED = 3.0
@@ -84,9 +81,9 @@ class Way:
 
 
 WAYS = {
-    "killed, deadman line": Way(kill, LINE, 0.75),
+    "killed, deadman line": Way(kill, DEADMAN_LINE, 0.75),
     "killed, no line, stop script": Way(kill_and_stop, {}, 2.0),
-    "frozen, deadman line": Way(freeze, LINE, 0.75),
+    "frozen, deadman line": Way(freeze, DEADMAN_LINE, 0.75),
     "frozen 1.5 s, no line, then continued": Way(freeze_and_continue, {}, 1.0),
     "asked to end": Way(terminate, {}, 0.6),
 }

@@ -23,6 +23,7 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
+from monstertruckd.tools.simulation.config import DEADMAN_LINE
 from tests.daemon.wall_kit import Robot, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
@@ -201,11 +202,7 @@ async def test_an_emergency_stop_outlasts_kill_9_on_a_full_disk(tmp_path: Path):
 
 async def test_a_daemon_without_memory_goes_on_or_ends_with_a_truck_that_stands(tmp_path: Path):
     """Neutral is its last word; if it cannot say it, the deadman line falls."""
-    line = {
-        "devices": {"steering": {"driver": {"deadman_channel": 2}}},
-        "sim": {"deadman_wired": True, "servo_timeout": 0.3},
-    }
-    async with robot(tmp_path, line) as truck:
+    async with robot(tmp_path, DEADMAN_LINE) as truck:
         await truck.start_simulator()
         await truck.start_daemon()
         async with truck.client() as client:

@@ -19,14 +19,10 @@ from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.logs.summary import info
+from monstertruckd.tools.simulation.config import DEADMAN_LINE
 from tests.daemon.wall_kit import ROOT, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
-
-DEADMAN = {
-    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
-    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
-}
 
 
 def speed_after(truth: np.ndarray, instant: float, seconds: float) -> float:
@@ -101,7 +97,7 @@ async def test_kill_9_loses_at_most_a_second_of_log_and_the_next_start_stops_the
 
 
 async def test_sigstop_is_caught_by_the_deadman_line_where_wired(tmp_path: Path):
-    async with robot(tmp_path, DEADMAN) as truck:
+    async with robot(tmp_path, DEADMAN_LINE) as truck:
         await truck.start_simulator()
         await truck.start_daemon()
         async with truck.client() as client:

@@ -121,9 +121,8 @@ class Odometer:
         self._last = None
 
 
-"""Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
-
 HANDSHAKE_ATTEMPTS = 2
+"""Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
 FAILURE_LIMIT = 3
 """Failed exchanges in a row that end the session."""
 SAFE_DEADLINE = 0.3

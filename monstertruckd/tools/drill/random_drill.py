@@ -27,7 +27,7 @@ from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
 from monstertruckd import __version__
 from monstertruckd.tools.drill.observer import STOPS_WITHIN, Violation
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -44,12 +44,8 @@ ESTOPS: Final = 5
 """Every so many faults are followed by an emergency stop, the others by a disarm order."""
 QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.OBSTACLE_SLOW})
 """Reasons that explain nothing."""
-DEADMAN: Final[dict[str, Any]] = {
-    "map": None,
-    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
-    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
-}
-"""The deadman line is wired: without it a truck drives on when its drive controller cannot be reached."""
+DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
+"""Of every truck: the deadman line, and no map."""
 
 
 def default_jobs() -> int:

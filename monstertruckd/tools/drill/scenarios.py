@@ -25,6 +25,7 @@ from monstertruck_sim.faults import (
 )
 from monstertruck_sim.world.config import GroundTilt, SinusoidTilt
 from monstertruckd.tools.drill.scenario import SENSORS, Expect, Scenario, ScenarioContext
+from monstertruckd.tools.simulation.config import DEADMAN_LINE
 
 STALE: Final[Mapping[str, Reason]] = {
     "lidar": Reason.SCAN_STALE,
@@ -32,11 +33,6 @@ STALE: Final[Mapping[str, Reason]] = {
     "drive": Reason.DRIVE_STALE,
     "steering": Reason.STEERING_STALE,
 }
-LINE: Final[Mapping[str, Any]] = {
-    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
-    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
-}
-"""The deadman line is wired."""
 BY_REQUESTS: Final[Mapping[str, Any]] = {"tracker": None, "path": None}
 HUNG_WORKER: Final[Mapping[str, Any]] = {"map": {"latency": 5.0, "deadline": 1.0, "period": 0.5}}
 """Its steps take five times as long as they may."""
@@ -126,7 +122,7 @@ def with_line() -> Iterator[Scenario]:
             Expect.STOP_BY_LINE,
             seen=(Reason.DRIVE_STALE,),
             device="drive",
-            overlay=LINE,
+            overlay=DEADMAN_LINE,
             timeout=4.0,
         )
 

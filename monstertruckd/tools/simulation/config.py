@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Final, Self
 
 from pydantic import model_validator
 
@@ -10,6 +10,12 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_sim.config import SimConfig
 from monstertruckd.config.load import Tree, calibrated, load_tree, validated
 from monstertruckd.config.truck import TruckConfig
+
+DEADMAN_LINE: Final[Mapping[str, Any]] = {
+    "devices": {"steering": {"driver": {"deadman_channel": 2}}},
+    "sim": {"deadman_wired": True, "servo_timeout": 0.3},
+}
+"""Overlay that wires the deadman line: without it a truck drives on when its drive controller cannot be reached."""
 
 
 class SimulatedTruckConfig(TruckConfig):
