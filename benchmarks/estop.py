@@ -90,11 +90,15 @@ def serve(config: Path) -> None:
 
 
 def flood(kind: str, endpoint: str, nonce: str) -> None:
-    """Flood until standard input ends; prints how many were sent, and in how many seconds."""
+    """Flood until standard input ends; prints how many were sent, and in how many seconds.
+
+    It yields to the emulated devices that share its core: real ones have processors of their own.
+    """
     import select  # noqa: PLC0415 - of this process only
 
     import zenoh  # noqa: PLC0415
 
+    os.nice(10)
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))

@@ -31,7 +31,7 @@ from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
-from monstertruckd.gate.sensors import STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
+from monstertruckd.gate.sensors import DRIVE_LOSSES, STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
 
 URGENT: Final = frozenset(
@@ -42,7 +42,7 @@ URGENT: Final = frozenset(
 DISARMING: Final = frozenset(
     {
         Reason.DRIVE_FAULT,
-        Reason.DEVICE_RESTARTED,
+        *DRIVE_LOSSES,
         Reason.BATTERY_CRITICAL,
         Reason.SERVICE_FAILED,
         Reason.STEERING_DEAD,

@@ -51,6 +51,9 @@ STALE_SENSORS: Final = {
 }
 """Which sensor is stale, by reason."""
 
+DRIVE_LOSSES: Final = (Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED)
+"""Why a drive's service may have ended that makes arming necessary, however short the loss."""
+
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
@@ -109,7 +112,8 @@ class SensorMonitor:
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
         self._failed: tuple[str, ...] = ()
-        self._restarted = False
+        self._drive_losses: set[Reason] = set()
+        """Those of ``DRIVE_LOSSES`` that a drive's service gives for its end."""
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
         self._critical = _critical(config, steered=chassis.steered)
@@ -163,10 +167,11 @@ class SensorMonitor:
             if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
                 self._lost[stale] = max(service.since, self._lost.get(stale, service.since))
                 self._speed = None
-        self._restarted = any(
-            service.reason is Reason.DEVICE_RESTARTED and self._services.get(service.name) is Reason.DRIVE_STALE
+        self._drive_losses = {
+            service.reason
             for service in table.services
-        )
+            if service.reason in DRIVE_LOSSES and self._services.get(service.name) is Reason.DRIVE_STALE
+        }
         self._failed = tuple(
             service.name
             for service in table.services
@@ -254,8 +259,7 @@ class SensorMonitor:
                 values["drive_fault_code"] = drive.fault_code
         if values:
             blocks.append(Reason.DRIVE_FAULT)
-        if self._restarted:
-            blocks.append(Reason.DEVICE_RESTARTED)
+        blocks += [reason for reason in DRIVE_LOSSES if reason in self._drive_losses]
         if self._failed:
             blocks.append(Reason.SERVICE_FAILED)
         fresh = self._all_fresh(now)

@@ -79,6 +79,12 @@ class DeviceRestartedError(DeviceLostError):
     reason = Reason.DEVICE_RESTARTED
 
 
+class DeviceStoppedError(DeviceError):
+    """The device stopped although this program wanted motion: a hardware line or another master did it."""
+
+    reason = Reason.DEVICE_STOPPED
+
+
 class DeviceTimeoutError(DeviceError):
     """The device did not answer in time."""
 

@@ -50,6 +50,7 @@ class Reason(StrEnum):
     DEVICE_MISMATCH = "device_mismatch", 25, "device's parameters differ from the configuration"
     DEVICE_BUSY = "device_busy", 26, "port is held by another process"
     DEVICE_RESTARTED = "device_restarted", 27, "device restarted by itself: it lost its supply"
+    DEVICE_STOPPED = "device_stopped", 28, "drive stopped by another than this program: deadman line or second master"
     DEVICE_READY = "device_ready", 0, "device is up"
 
     # Gate

@@ -25,6 +25,7 @@ from monstertruck_runtime.errors import (
     DeviceFaultError,
     DeviceMismatchError,
     DeviceRestartedError,
+    DeviceStoppedError,
     DeviceTimeoutError,
     ProtocolError,
     WrongDeviceError,
@@ -184,6 +185,7 @@ class EposDriver:
         Raises:
             DeviceLostError: nothing plugged in; the link went down.
             DeviceRestartedError: the controller restarted.
+            DeviceStoppedError: a motor that was to turn was stopped by another than this program.
             PortBusyError: another process holds the port.
             WrongDeviceError: something else answers.
             DeviceMismatchError: motor or encoder data contradict the configuration.
@@ -447,6 +449,8 @@ class _DriveSession:
             await self._check_mark()
             if was is State.ENABLED and self._control_sent is not Control.DISABLE_VOLTAGE:
                 raise DeviceRestartedError("the controller restarted")
+        if self._state is State.QUICK_STOP and was is State.ENABLED and self._control_sent is not Control.QUICK_STOP:
+            self._judge_foreign_stop()
         if self._state in FAULTED:
             await self._attend_fault()
         elif self._fault is not None:
@@ -455,6 +459,17 @@ class _DriveSession:
             self._commands_after = self._clock.now()
         if self._state not in FAULTED:
             self._driver.reported_fault = None
+
+    def _judge_foreign_stop(self) -> None:
+        """End the session if the motor was to turn: whoever stopped it does not expect it to set off again at once.
+
+        Raises:
+            DeviceStoppedError: it was.
+        """
+        if self._want().rpm != 0:
+            text = "quick stop by another than this program: the deadman line fell, or a second master commands"
+            self._tell(Reason.DEVICE_STOPPED, Severity.WARNING, text)
+            raise DeviceStoppedError(text)
 
     async def _step(self, goal: State) -> None:
         """One controlword towards ``goal``."""

@@ -112,7 +112,7 @@ def of_device(role: str) -> Iterator[Scenario]:
 
 
 def with_line() -> Iterator[Scenario]:
-    """The drive's link is lost, and the deadman line is wired."""
+    """The deadman line is wired: the drive's link is lost, or the line itself falls."""
     for name, broken, mended in (
         ("unplugged", "unplug", "plug"),
         ("stalled", "line stalled on", "line stalled off"),
@@ -125,6 +125,12 @@ def with_line() -> Iterator[Scenario]:
             overlay=DEADMAN_LINE,
             timeout=4.0,
         )
+    yield Scenario(
+        Fault("steering: supply dips for 0.1 s, deadman line wired", command("steering", "brown_out 0.1")),
+        Expect.STOP,
+        down={"drive": Reason.DEVICE_STOPPED},
+        overlay=DEADMAN_LINE,
+    )
 
 
 def wrong_devices() -> Iterator[Scenario]:

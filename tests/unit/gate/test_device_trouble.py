@@ -54,16 +54,15 @@ def test_the_blocked_shafts_current_is_in_the_stops_causes():
     assert figures["motor current"] == 2.0
 
 
-def test_a_drive_controller_that_restarted_disarms():
+@pytest.mark.parametrize("reason", [Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED])
+def test_a_drive_controller_that_restarted_or_was_stopped_by_another_disarms(reason):
     rig = Rig().driving(speed=0.2)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=Reason.DEVICE_RESTARTED))
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
     rig.tick(3)
     rig.gate.observe_health(health(rig.now, ServiceState.READY, "drive"))
     rig.tick(60)
     assert rig.out.mode is GateMode.DISARMED
-    assert Reason.DEVICE_RESTARTED in {trip.reason for trip in rig.trips} | {
-        cause.reason for trip in rig.trips for cause in trip.causes
-    }
+    assert reason in {trip.reason for trip in rig.trips} | {cause.reason for trip in rig.trips for cause in trip.causes}
 
 
 def test_one_that_was_unplugged_for_a_moment_does_not():

@@ -222,25 +222,26 @@ def test_the_speed_is_not_known_from_the_instant_of_the_loss():
 
 
 @pytest.mark.parametrize(
-    ("name", "reason", "restarted"),
+    ("name", "reason", "blocks"),
     [
         ("drive", Reason.DEVICE_RESTARTED, True),
+        ("drive", Reason.DEVICE_STOPPED, True),
         ("drive_2", Reason.DEVICE_RESTARTED, True),
         ("lidar", Reason.DEVICE_RESTARTED, False),
         ("slam", Reason.DEVICE_RESTARTED, False),
         ("drive", Reason.DEVICE_LOST, False),
     ],
 )
-def test_a_drive_controller_that_restarted_stops_the_truck_until_its_service_says_otherwise(name, reason, restarted):
+def test_a_drive_that_restarted_or_was_stopped_stops_the_truck_until_its_service_is_ready(name, reason, blocks):
     sensors = complete(monitor(), NOW)
     tables = (
         ServiceHealth(name="lidar", state=ServiceState.READY, since=0),
         ServiceHealth(name=name, state=ServiceState.BACKOFF, since=0, reason=reason),
     )
     sensors.observe_health(HealthTable(**header(NOW), services=tables))
-    assert (Reason.DEVICE_RESTARTED in sensors.assess(NOW).blocks) is restarted
+    assert (reason in sensors.assess(NOW).blocks) is blocks
     sensors.observe_health(lost(name, 0, ServiceState.READY))
-    assert Reason.DEVICE_RESTARTED not in sensors.assess(NOW).blocks
+    assert reason not in sensors.assess(NOW).blocks
 
 
 def test_only_failed_services_that_nobody_tolerates_stop_the_truck():

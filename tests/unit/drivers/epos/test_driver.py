@@ -325,20 +325,20 @@ def test_a_quick_stop_that_latches_is_left_the_long_way():
 # The hardware line, and other obstinacy
 
 
-def test_the_deadman_line_is_obeyed_and_driving_goes_on_when_it_is_released():
+def test_the_deadman_line_is_obeyed_and_the_next_session_drives_when_it_is_released():
     async def test(rig: Rig) -> None:
-        async with rig.driving():
+        async with rig.supervised():
             await rig.drive(6_000)
             rig.emulator.set_quick_stop_input(True)
             await rig.until(lambda: rig.shaft_rpm == 0, 0.1)
             await rig.settle(0.2)
-            assert rig.newest.mode is DriveMode.QUICK_STOP
             assert targets(rig)[-1] == 0
-            await rig.settle(3.0)
+            await rig.settle(3.5)
             assert rig.shaft_rpm == 0
             assert rig.newest.mode is not DriveMode.ENABLED
             assert [event for event in rig.events.reasons() if event is not Reason.DEVICE_READY] == [
-                Reason.DEVICE_TIMEOUT
+                Reason.DEVICE_STOPPED,
+                Reason.DEVICE_TIMEOUT,
             ], "reported once"
             rig.emulator.set_quick_stop_input(False)
             await rig.drive(6_000)
@@ -350,8 +350,10 @@ def test_controlwords_refused_by_state_are_no_failure():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("strict", "on")
         async with rig.driving():
-            await rig.drive(6_000)
+            await rig.drive(0)
             rig.emulator.set_quick_stop_input(True)
+            await rig.settle(0.5)
+            rig.gate.say(DriveAction.RUN, 6_000)
             await rig.settle(1.0)
             rig.emulator.set_quick_stop_input(False)
             await rig.drive(6_000)

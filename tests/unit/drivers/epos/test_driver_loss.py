@@ -278,7 +278,21 @@ def test_a_quick_restart_is_noticed_by_the_state():
     on_bench(test)
 
 
-def test_nothing_plugged_in():
+def test_a_deadman_line_that_fell_for_a_moment_ends_the_session():
+    """The controller stays in its quick stop; setting off again at once would be a motion that nobody ordered."""
+
+    async def test(rig: Rig) -> None:
+        async with rig.supervised():
+            await rig.drive(6_000)
+            rig.emulator.set_quick_stop_input(active=True)
+            await rig.settle(0.05)
+            rig.emulator.set_quick_stop_input(active=False)
+            await rig.settle(0.5)
+            assert Reason.DEVICE_STOPPED in [row.reason for row in rig.health]
+            assert rig.events.reasons().count(Reason.DEVICE_STOPPED) == 1
+
+    on_bench(test)
+
     async def test(rig: Rig) -> None:
         rig.port.unplug()
         with pytest.raises(DeviceLostError, match="not plugged in"):

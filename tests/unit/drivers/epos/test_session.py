@@ -144,9 +144,11 @@ def test_no_reset_at_all_if_so_configured():
 def test_a_controller_that_does_not_follow_is_reported_once_after_two_seconds():
     async def test(rig: Rig) -> None:
         async with rig.driving():
-            await rig.drive(3_000)
-            rig.emulator.set_quick_stop_input(True)
+            await rig.drive(0)
             began = rig.clock.now()
+            rig.emulator.set_quick_stop_input(True)
+            await rig.settle(0.5)
+            rig.gate.say(DriveAction.RUN, 3_000)
             await rig.until(lambda: Reason.DEVICE_TIMEOUT in rig.events.reasons(), 4.0)
             assert 1.9 < (rig.clock.now() - began) / SECOND < 2.6
             await rig.settle(4.0)

@@ -11,7 +11,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, EposDriver, _DriveSession
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, EposDriver, Wanted, _DriveSession
 from monstertruck_drivers.epos.exchange import ObjectError
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State
@@ -20,6 +20,7 @@ from monstertruck_runtime.errors import (
     DeviceFaultError,
     DeviceMismatchError,
     DeviceRestartedError,
+    DeviceStoppedError,
     DeviceTimeoutError,
     ProtocolError,
     WrongDeviceError,
@@ -513,6 +514,31 @@ def test_power_that_goes_off_by_itself_is_a_restart(asked: bool, off: State):
             with pytest.raises(DeviceRestartedError):
                 await session._look()
         assert not session._prepared
+
+    steps(test)
+
+
+@pytest.mark.parametrize(
+    ("control", "before", "rpm", "raises"),
+    [
+        (Control.ENABLE, State.ENABLED, 500, True),
+        (Control.ENABLE, State.ENABLED, 0, False),
+        (Control.QUICK_STOP, State.ENABLED, 500, False),
+        (Control.ENABLE, State.QUICK_STOP, 500, False),
+    ],
+    ids=["while it was to turn", "at rest", "by this program", "still"],
+)
+def test_a_quick_stop_by_another_ends_the_session(
+    control: Control, before: State, rpm: int, raises: bool, monkeypatch: pytest.MonkeyPatch
+):
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._reported, session._control_sent = before, control
+        monkeypatch.setattr(session, "_want", lambda: Wanted(State.ENABLED, rpm))
+        rig.line.values[od.STATUSWORD] = State.QUICK_STOP.value
+        with pytest.raises(DeviceStoppedError) if raises else contextlib.nullcontext():
+            await session._look()
+        assert rig.events.reasons() == [Reason.DEVICE_STOPPED] * raises
 
     steps(test)
 
