@@ -2,8 +2,9 @@
 
 A local map is built of the first scans (one scan of a 4 m lidar looks alike in many rooms); at every keyframe its
 surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V). What one look finds
-is a hypothesis. It becomes the answer when a later look has found the same place, when what was seen since the first
-look fits, too, and when the beams of all that time do not contradict the saved grid.
+is a hypothesis. It becomes the answer when a look some way further on has found the same place, when what was seen
+between both fits, too, and when the beams of all the time since the first look do not contradict the saved grid. Ground
+that is not on the map fits nowhere, but contradicts nothing: a robot that has crossed it is found when it is back.
 """
 
 import math
@@ -44,8 +45,7 @@ MIN_SEPARATION: Final = 1.0
 CONFIRM_TOLERANCE: Final = (0.3, 0.1)
 """Two looks found the same place if they differ by less, m and rad."""
 BASELINE: Final = (0.8, 3.0)
-"""Way between the first look and the last one that makes a place certain, m: of looks that found it unique, and of
-all."""
+"""Way between two looks that makes a place certain, m: if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """After these events keyframes of the local map are elsewhere, or have other numbers: it begins anew."""
 OUTSIDE_AFTER: Final = 10 * SECOND
@@ -56,14 +56,10 @@ OUTSIDE_AFTER: Final = 10 * SECOND
 class Hypothesis:
     """A place that a look has found, and what later looks said of it."""
 
-    key: int
-    """Keyframe of the newest look that found it."""
     pose: Array
-    """Shape (3,): that keyframe in the saved map."""
-    first: int
-    """Keyframe of the first look."""
-    unique: int | None
-    """Keyframe of the first look that found no other place nearly as good; None before it."""
+    """Shape (3,), in the saved map: the keyframe of the newest look that found it."""
+    looks: list[tuple[int, bool]]
+    """Keyframe of every look that found it, and whether it found no other place nearly as good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,28 +155,34 @@ class GlobalLocaliser:
         newest = len(known) - 1
         same = next((h for h in self._hypotheses if self._agree(h, look.pose)), None)
         if same is None:
-            self._hypotheses.append(Hypothesis(newest, look.pose, newest, newest if look.unique else None))
+            self._hypotheses.append(Hypothesis(look.pose, [(newest, look.unique)]))
             return None
-        same.key, same.pose = newest, look.pose
-        if look.unique and same.unique is None:
-            same.unique = newest
-        far = self._ways[newest] - self._ways[same.first] >= BASELINE[1]
-        if look.unique and same.unique is not None:
-            far |= self._ways[newest] - self._ways[same.unique] >= BASELINE[0]
-        return look.pose if far and self._foreseen(same) else None
+        same.pose = look.pose
+        same.looks.append((newest, look.unique))
+        since = self._far_enough(same)
+        return look.pose if since is not None and self._foreseen(same, since) else None
+
+    def _far_enough(self, hypothesis: Hypothesis) -> int | None:
+        """Keyframe of the last look that is as far from the newest one as ``BASELINE`` asks; None if there is none."""
+        newest, unique = hypothesis.looks[-1]
+        for key, also in reversed(hypothesis.looks):
+            if self._ways[newest] - self._ways[key] >= BASELINE[0 if unique and also else 1]:
+                return key
+        return None
 
     def _agree(self, hypothesis: Hypothesis, pose: Array) -> bool:
         poses = self._mapper.map.poses
-        off = between(compose(hypothesis.pose, between(poses[hypothesis.key], poses[-1])), pose)
+        off = between(compose(hypothesis.pose, between(poses[hypothesis.looks[-1][0]], poses[-1])), pose)
         return math.hypot(off[0], off[1]) < CONFIRM_TOLERANCE[0] and abs(float(off[2])) < CONFIRM_TOLERANCE[1]
 
-    def _foreseen(self, hypothesis: Hypothesis) -> bool:
-        """Whether every keyframe since the first look fits the map where the hypothesis has it."""
+    def _foreseen(self, hypothesis: Hypothesis, since: int) -> bool:
+        """Whether all seen from keyframe ``since`` on fits the map, and nothing since the first look contradicts it."""
         newest = len(self._mapper.map) - 1
-        numbers = np.arange(hypothesis.first, newest + 1)
-        query = self._merged(numbers, newest)
-        fits = measure(query, self._submap.cloud, hypothesis.pose).overlap >= MIN_OVERLAP
-        return fits and self._contradiction(numbers, newest, hypothesis.pose) <= MAX_CONTRADICTION
+        query = self._merged(np.arange(since, newest + 1), newest)
+        if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_OVERLAP:
+            return False
+        numbers = np.arange(hypothesis.looks[0][0], newest + 1)
+        return self._contradiction(numbers, newest, hypothesis.pose) <= MAX_CONTRADICTION
 
     def _merged(self, numbers: NDArray[np.intp], centre: int) -> Scan:
         """The numbered keyframes in the frame of ``centre``."""

@@ -83,13 +83,45 @@ def test_a_robot_that_stands_still_outside_the_map_is_reported():
     assert estimates[-1].status is LocalisationStatus.OUTSIDE
 
 
+DOOR = [*box(-3.0, -2.0, 3.0, 2.5)[:1], ((3.0, -2.0), (3.0, -0.5)), ((3.0, 0.5), (3.0, 2.5)), *ROOM[2:]]
+"""The same room with a door on its right side."""
+BEYOND = [*box(3.0, -3.0, 9.0, 3.0)[:3], *box(6.0, 1.0, 7.0, 2.0), *box(4.0, -2.5, 5.5, -1.5)]
+"""What is behind it."""
+
+
+def along(legs):
+    """Poses, 40 per leg, from one of ``legs`` to the next."""
+    share = np.linspace(0.0, 1.0, 40)[:, None]
+    return np.concatenate([np.array(a) + share * (np.array(b) - np.array(a)) for a, b in itertools.pairwise(legs)])
+
+
+@pytest.mark.parametrize("odom", [True, False])
+def test_a_robot_that_was_off_the_map_meanwhile_is_found_when_it_is_back(odom: bool):
+    """One look finds it before it leaves; what it then sees behind the door fits nowhere, but contradicts nothing."""
+    out = [(2.0, 0.0, 1.6), (2.1, 0.0, 0.0), (5.5, 0.0, 0.0), (5.5, 0.0, math.pi)]
+    back = [(2.0, 0.0, math.pi), (1.8, 1.4, 2.6), (-1.8, 1.4, math.pi)]
+    truth = along([*out, *back])
+    estimates = followed(SavedMap(drawn(DOOR), None), [*DOOR, *BEYOND], truth, odom=odom)
+    assert not PLACED & {estimate.status for estimate in estimates[:160]}
+    found = [k for k, estimate in enumerate(estimates) if estimate.status in PLACED]
+    assert found
+    for k in found:
+        assert math.hypot(*(np.array(estimates[k].pose) - truth[k])[:2]) < 0.1
+
+
+def test_a_place_is_not_taken_against_what_was_seen_since_its_first_look():
+    """As before, but where the robot then is, the map has no walls: it is the other room's map."""
+    lobby = box(3.0, -2.8, 3.85, 2.8)[:3]
+    out = [(1.95, 0.45, 2.6), (2.05, 0.2, 2.0), (2.1, 0.0, 0.0), (3.4, 0.0, 0.0), (3.4, 0.0, math.pi)]
+    truth = along([*out, (2.0, 0.0, math.pi), (1.8, 1.4, 2.6), (-1.8, 1.4, math.pi)])
+    estimates = followed(SavedMap(drawn(DOOR, half_width=4.0), None), [*DOOR, *lobby], truth)
+    assert not PLACED & {estimate.status for estimate in estimates}
+
+
 def test_a_wrong_place_is_refuted_within_metres():
     """A closed room of the map looks as the robot's, which has a door: driven through it, the robot is elsewhere."""
-    open_side = [*box(-3.0, -2.0, 3.0, 2.5)[:1], ((3.0, -2.0), (3.0, -0.5)), ((3.0, 0.5), (3.0, 2.5)), *ROOM[2:]]
-    walls = [*open_side, *box(3.0, -3.0, 9.0, 3.0)[:1], ((9.0, -3.0), (9.0, 3.0)), ((9.0, 3.0), (3.0, 3.0))]
-    way = np.linspace(0.0, 1.0, 40)[:, None]
-    legs = [(-2.4, 0.0, -1.0), (-1.8, -1.3, 0.0), (2.0, -1.3, 0.7), (2.2, 0.0, 0.0), (7.0, 0.0, 0.0)]
-    truth = np.concatenate([np.array(a) + way * (np.array(b) - np.array(a)) for a, b in itertools.pairwise(legs)])
+    walls = [*DOOR, *box(3.0, -3.0, 9.0, 3.0)[:3]]
+    truth = along([(-2.4, 0.0, -1.0), (-1.8, -1.3, 0.0), (2.0, -1.3, 0.7), (2.2, 0.0, 0.0), (7.0, 0.0, 0.0)])
     saved = SavedMap(drawn(), None)
     estimates = followed(saved, walls, truth, start=tuple(truth[0].tolist()))
     inside = [estimate.status for estimate in estimates[:60]]
