@@ -3,7 +3,8 @@
 The whole log is mapped first; that trajectory is the truth, and the frame of the maps. A stretch of it makes the map:
 as keyframes with their grid, or as the grid alone. A start follows the log from a random scan outside that stretch,
 with or without wheels, until it is placed and has driven on, for at most ``WAY`` metres or ``SECONDS``. Many begin in
-rooms that are not on the map: those that never come to it are to be reported as outside.
+rooms that are not on the map: those that never come to it are to be reported as outside. A pose reported as degenerate
+says where the robot is across a corridor; along it the pose is judged by its own covariance.
 """
 
 import math
@@ -21,7 +22,7 @@ from monstertruck_estimation.slam.mapping import Mapper
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import prepare, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, trinary
-from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
 from monstertruck_schemas.health import LocalisationStatus
 from slam_parts.logs import Log, load
 
@@ -31,6 +32,8 @@ SECONDS, WAY = 90.0, 15.0
 FOLLOWED = 3.5
 """Way after the first fix over which it must stay right, m."""
 RIGHT = (0.5, math.radians(10))
+COVERED = 3.0
+"""Standard deviations along a corridor by which a degenerate pose may be off."""
 ON_MAP = 0.9
 """A scan overlaps by this at its true pose where the place is on the map."""
 OFF_MAP = 0.7
@@ -76,13 +79,31 @@ def truth(log: Log) -> np.ndarray:
     return mapper.trajectory()[1]
 
 
+def error(pose: np.ndarray, estimate: SlamEstimate) -> tuple[bool, bool]:
+    """Whether an estimate is off by more than ``RIGHT`` from ``pose``, (3,), and whether it did not say so."""
+    off = np.array(estimate.pose) - pose
+    off[2] = math.remainder(off[2], math.tau)
+    if abs(float(off[2])) > RIGHT[1]:
+        return True, True
+    if estimate.status is not LocalisationStatus.DEGENERATE or math.hypot(off[0], off[1]) <= RIGHT[0]:
+        return (math.hypot(off[0], off[1]) > RIGHT[0],) * 2
+    along = np.array((math.cos(estimate.direction), math.sin(estimate.direction)))
+    way, variance = float(along @ off[:2]), float(along @ np.reshape(estimate.covariance, (3, 3))[:2, :2] @ along)
+    across = math.hypot(*(off[:2] - way * along))
+    return True, across > RIGHT[0] or abs(way) > COVERED * math.sqrt(variance)
+
+
 def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str]:
-    """What one robot believed: outcome (right, wrong, lost, outside, silent, searching), way and time of the fix."""
+    """What one robot believed: outcome, way and time of the fix.
+
+    right, wrong at the first pose, lost behind it, degenerate (off along a corridor by less than it said); searching at
+    a place of the map, between (it skirted the map), outside, or silent of being outside.
+    """
     log, geometry = case.log, case.log.geometry
     submap = submap_of(case.saved)
     estimator = LocalisationEstimator(case.saved, MapperConfig())
     way, fixed_at, seen, said = 0.0, None, [], Counter[LocalisationStatus]()
-    errors: list[bool] = []
+    errors: list[tuple[bool, bool]] = []
     for k in range(start, len(log.stamps)):
         way += math.hypot(*(case.poses[k] - case.poses[max(k - 1, start)])[:2])
         seconds = (log.stamps[k] - log.stamps[start]) * 1e-9
@@ -106,11 +127,11 @@ def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str
         if fixed_at is None and k % 10 == 0:
             seen.append(measure(scan, submap.cloud, case.poses[k]).overlap)
         if estimate.status in PLACED:
-            off = between(case.poses[k], np.array(estimate.pose))
             fixed_at = fixed_at or (way, seconds)
-            errors.append(math.hypot(off[0], off[1]) > RIGHT[0] or abs(float(off[2])) > RIGHT[1])
+            errors.append(error(case.poses[k], estimate))
     if fixed_at is not None:
-        outcome = "wrong" if errors[0] else "right" if not any(errors) else "lost"
+        off, unsaid = np.array(errors).any(axis=0)
+        outcome = "wrong" if errors[0][0] else "lost" if unsaid else "degenerate" if off else "right"
         return {"outcome": outcome, "way": fixed_at[0], "seconds": fixed_at[1]}
     if np.mean(np.array(seen) > ON_MAP) > 0.2:
         return {"outcome": "searching"}
@@ -140,12 +161,14 @@ def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[st
         every += results
     outcomes = Counter(str(result["outcome"]) for result in every)
     ways = [float(result["way"]) for result in every if "way" in result]
-    on_map = outcomes["right"] + outcomes["wrong"] + outcomes["lost"] + outcomes["searching"]
+    on_map = outcomes["right"] + outcomes["wrong"] + outcomes["lost"] + outcomes["degenerate"] + outcomes["searching"]
     off_map = outcomes["outside"] + outcomes["silent"]
     figures = {
         "localise.starts": len(every),
         "localise.wrong": outcomes["wrong"] + outcomes["lost"],
         "localise.right": outcomes["right"],
+        "localise.degenerate": outcomes["degenerate"],
+        "localise.searching": outcomes["searching"],
         "localise.right_share": round(outcomes["right"] / max(on_map, 1), 3),
         "localise.outside_share": round(outcomes["outside"] / off_map, 3) if off_map else 1.0,
         "localise.way_median_m": round(float(np.median(ways)), 2) if ways else math.inf,

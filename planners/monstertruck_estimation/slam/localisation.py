@@ -15,7 +15,7 @@ from monstertruck_estimation.slam.correlation import Submap, merged
 from monstertruck_estimation.slam.global_search import GlobalLocaliser
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, fits, status_of
-from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry
+from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, constrained
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scan_matcher import (
     MatchStatus,
@@ -32,8 +32,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
-FOUND_DEVIATION: Final = (0.05, 0.02)
-"""Standard deviation of a pose found by global localisation, m and rad."""
+FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
+"""Of a pose found by global localisation, m and rad."""
 LOST_DEVIATION: Final = (1.0, 0.5)
 """Standard deviation from which the robot is searched for on the whole map, m and rad."""
 MAX_CONTRADICTION: Final = 0.3
@@ -82,6 +82,9 @@ class LocalisationEstimator:
         """Way since the place was found, m."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
+        """Of the pose as the matches have it: the prior of the next one."""
+        self._published_covariance = self._covariance
+        """Along the weak direction of degenerate matches that of the predicted motion."""
         self._stamp: int | None = None
         self._misfits = 0
         self._published = False
@@ -109,7 +112,9 @@ class LocalisationEstimator:
         delta, noise = self._motion.predict(dt, odom)
         guess = compose(self._pose, delta)
         by_pose, by_delta = compose_jacobians(self._pose, delta)
-        covariance = by_pose @ self._covariance @ by_pose.T + by_delta @ noise @ by_delta.T
+        moved_by = by_delta @ noise @ by_delta.T
+        covariance = by_pose @ self._covariance @ by_pose.T + moved_by
+        published = by_pose @ self._published_covariance @ by_pose.T + moved_by
         self._stamp = stamp
         self.counts["scans"] += 1
         events: tuple[str, ...] = ()
@@ -119,6 +124,7 @@ class LocalisationEstimator:
             match, status = self._unknown(guess, covariance)
             if found is not None:
                 match, status = self._found(scan, found, mount)
+                published = FOUND_COVARIANCE
                 events = ("found",)
                 self._scan_odometry.forget()
         else:
@@ -131,11 +137,14 @@ class LocalisationEstimator:
         alone = odom is None or self.odometry is not OdometryUse.USED
         moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
         self._pose, self._covariance = match.pose, match.covariance
+        if match.information is not None:
+            published = np.linalg.inv(constrained(match, match.information) + np.linalg.inv(published))
+        self._published_covariance = published
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
         odom_now = self._motion.odom
         correction = None if odom is None or odom_now is None else compose(self._pose, inverse(odom_now))
-        placed = (self._pose, self._covariance, correction)
+        placed = (self._pose, published, correction)
         return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
@@ -196,8 +205,7 @@ class LocalisationEstimator:
     def _found(self, scan: Scan, pose: Array, mount: Vector) -> tuple[ScanMatch, LocalisationStatus]:
         """Track from ``pose``; the search goes on, as a check."""
         self._tracking, self._checked, self._misfits = True, 0.0, 0
-        place, turn = FOUND_DEVIATION
-        return self._track(scan, np.zeros(3), pose, np.diag((place**2, place**2, turn**2)), mount)
+        return self._track(scan, np.zeros(3), pose, FOUND_COVARIANCE, mount)
 
     def _refuted(self, pose: Array, found: Array | None, delta: Array) -> bool:
         """Whether the check says that the robot is not at ``pose``; it ends when it has confirmed the place."""

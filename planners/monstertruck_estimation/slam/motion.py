@@ -305,7 +305,7 @@ class ScanOdometry:
         since, origin = last
         turn = np.eye(3)
         turn[:2, :2] = rotation(-match.pose[2])
-        covariance = turn @ np.linalg.inv(_known(match, match.information) + UNCONSTRAINED) @ turn.T
+        covariance = turn @ np.linalg.inv(constrained(match, match.information) + UNCONSTRAINED) @ turn.T
         covariance = (covariance + covariance.T) / 2 + np.diag(
             np.square((MATCH_FLOOR[0], MATCH_FLOOR[0], MATCH_FLOOR[1]))
         )
@@ -317,8 +317,8 @@ class ScanOdometry:
         self._last, self._least = None, LOW_OVERLAP
 
 
-def _known(match: ScanMatch, information: Array) -> Array:
-    """Information without its component along the weak direction of a degenerate match.
+def constrained(match: ScanMatch, information: Array) -> Array:
+    """``information`` of a match, shape (3, 3), without its component along the weak direction if it is degenerate.
 
     That component comes from the ends of the visible walls, which move along with the robot.
     """

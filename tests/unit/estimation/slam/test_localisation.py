@@ -174,3 +174,29 @@ def test_half_a_scan_counts_where_the_robot_last_was_if_none_does_where_the_moti
     estimate = followed(SavedMap(drawn(), None), ROOM, truth, start=tuple(truth[0].tolist()), wheels=wheels)[-1]
     assert np.array(estimate.pose) == pytest.approx(truth[0])
     assert "rejected" not in estimate.events
+
+
+def test_along_a_corridor_the_covariance_is_that_of_the_motion(monkeypatch):
+    """The ends of the visible walls move along with the robot: however often they fit, they say nothing of its way."""
+    truth = np.tile(rounds(80)[0], (101, 1))
+    corridor = range(20, 100)
+
+    class Matcher:
+        def __init__(self):
+            self.scans = 0
+
+        def match(self, _scan, _delta, guess, covariance, _submap):
+            information = np.diag((20.0 if self.scans in corridor else 1e4, 1e4, 1e4))
+            ratio = float(information[0, 0]) / 1e4
+            self.scans += 1
+            posterior = np.linalg.inv(information + np.linalg.inv(covariance))
+            return ScanMatch(guess, posterior, 0.95, 0.01, ratio, 0.0, MatchStatus.ACCEPTED, information)
+
+    monkeypatch.setattr(localisation, "PlanarMatcher", Matcher)
+    estimates = followed(SavedMap(drawn(), None), ROOM, truth, odom=False, start=tuple(truth[0].tolist()))
+    deviations = np.sqrt([np.diag(np.reshape(estimate.covariance, (3, 3))) for estimate in estimates])
+    assert {estimates[k].status for k in corridor} == {LocalisationStatus.DEGENERATE}
+    # Without odometry a step of 0.1 s has a standard deviation of 0.07 m.
+    assert deviations[99, 0] == pytest.approx(0.07 * math.sqrt(len(corridor)), rel=0.05)
+    assert deviations[:, 1].max() < 0.02
+    assert deviations[100, 0] < 0.02
