@@ -36,8 +36,9 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
 """Where the tests of the parts are whose coverage is a gate (marked in tests/conftest.py)."""
-TESTS = ("-n", "2", "--hypothesis-profile", "ci")
-"""Two at a time; property tests have the same examples every time, and no time limit. Plain pytest draws new ones."""
+TESTS = ("-n", "2", "--dist", "worksteal", "--hypothesis-profile", "ci")
+"""Two at a time, neighbours in one process, for what they share is cached; property tests have the same examples every
+time, and no time limit. Plain pytest draws new ones."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""

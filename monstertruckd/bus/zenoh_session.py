@@ -139,6 +139,7 @@ class ZenohBridge:
                                     lambda call: guard(partial(self._serve, *call, calls, active)),
                                     MAX_WAITING_CALLS,
                                     self._bus.add_drops,
+                                    lambda call: self._called(call[0])[0] in ORDERS,
                                 )
                             )
                         )

@@ -103,17 +103,16 @@ def test_drive(seed: int, tmp_path: Path):
     assert len(session.result.estimates) == 4 + 6
 
 
-@pytest.mark.parametrize("seed", [1, 6])
-def test_steering(seed: int, tmp_path: Path):
-    config, rng = yard(tmp_path, seed, "steering")
+def test_steering(tmp_path: Path):
+    """A truck one of whose axles turns the wrong way."""
+    config, rng = yard(tmp_path, 6, "steering")
     session = run_session(config, steering_wizard(), rng)
     world = config.sim.world.truck
-    wrong = [servo for servo in (world.front_servo, world.rear_servo) if servo.us_per_degree > 0]
-    assert (session.result.again is not None) is bool(wrong), "a restart turns wrong directions round"
+    assert world.front_servo.us_per_degree > 0 > world.rear_servo.us_per_degree
+    assert session.result.again is not None, "a restart turns wrong directions round"
     judged(session, config)
-    if wrong:
-        session = run_session(config, steering_wizard(), rng)
-        judged(session, config)
+    session = run_session(config, steering_wizard(), rng)
+    judged(session, config)
     assert session.result.again is None
 
 

@@ -271,6 +271,17 @@ def test_target_speeds_beyond_the_limit_are_seen(speed: float, rules: set[str]):
     assert watched(scene) == rules
 
 
+@pytest.mark.parametrize(
+    ("rpm", "asked", "rules"), [(10_000, -0.02, {"reversal bytes"}), (10_000, 0.02, set()), (3_000, -0.02, set())]
+)
+def test_bytes_that_turn_a_motor_round_before_it_stands_are_seen(rpm: float, asked: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        motor(rpm)(bare)
+        targets(bare, (0.5, asked))
+
+    assert watched(scene) == rules
+
+
 @pytest.mark.parametrize(("then", "rules"), [(0.145, set[str]()), (0.16, {"ramp bytes"}), (0.0, set[str]())])
 def test_bytes_that_ask_for_a_speed_sooner_than_the_ramp_are_seen(then: float, rules: set[str]):
     assert watched(lambda bare: targets(bare, (0.0, 0.0), (0.1, 0.05), (0.15, 0.08), (0.2, then))) == rules

@@ -1,11 +1,12 @@
 """The observer of a drill: checks invariants by the bytes on two wires and the world's truth, not by the daemon's word.
 
 It sees the wires of drive, steering, lidar and compass, the true state of the truck and the operator's orders.
+A hundred times a second each rule says what is unsafe in an ``Observation``.
 """
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,14 +18,14 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_sim.world.config import ServoModelConfig
 from monstertruck_sim.world.truck_plant import TruthState
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-SAMPLE: Final = SECOND // 100
+PERIOD: Final = SECOND // 100
 AT_REST: Final = 0.01
 """True speed of a truck that stands, m/s."""
 STOPS_WITHIN: Final = 0.6
@@ -50,8 +51,12 @@ RAMP_SLACK: Final = 0.1
 """Seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common beat."""
 BRAKES_WITHIN: Final = 0.4
 """Seconds for which a truck may be too fast for the room before it: something may step in its way."""
+LOOKS: Final = 5
+"""Samples from one look ahead to the next: it casts rays."""
 ROOM: Final = np.linspace(0.0, 0.5, 26)
 """Ways ahead of which the ground is looked at, m."""
+REVERSES_BELOW: Final = 0.05
+"""True speed, m/s, from which on a motor may not be asked to turn the other way."""
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -114,6 +119,270 @@ def stop_bytes(tap: WireTap, since: int) -> int | None:
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What is seen at one instant."""
+
+    now: int
+    """Ns."""
+    truth: TruthState
+    targets: tuple[tuple[int, float], ...]
+    """Speeds that bytes since the one before ask the motor for: (ns, m/s over ground); 0 = any stop."""
+    target: float
+    """Speed that the newest bytes ask for, m/s."""
+    pulses: tuple[tuple[int, float], ...]
+    """Pulses that bytes since the one before ask the servos for: (channel, us)."""
+
+
+Broken = Iterator[tuple[str, str]]
+"""Names of the rules that an observation breaks, each with what was seen."""
+
+Rule = Callable[[Observation], Broken]
+"""One subject of the observer; gets every observation once, in order."""
+
+
+class Duration:
+    """For how long something has been so without a break."""
+
+    def __init__(self) -> None:
+        self._since: int | None = None
+
+    def update(self, now: int, *, so: bool) -> float:
+        """Seconds at ``now`` (ns); 0 while it is not so."""
+        self._since = (now if self._since is None else self._since) if so else None
+        return 0.0 if self._since is None else (now - self._since) / SECOND
+
+
+class _Standstill:
+    """The truck stands where operator or fault demand it; and how far and for how long it went on."""
+
+    def __init__(self) -> None:
+        self.began = 0
+        """Of the fault, ns."""
+        self.must_stop = False
+        """The fault must stop the truck."""
+        self.disarms = False
+        """After the fault the truck may not set off again by itself."""
+        self.disarmed: int | None = None
+        """When the operator disarmed it, ns."""
+        self.estopped: int | None = None
+        """When the operator stopped it, ns, until the reset."""
+        self.stood: int | None = None
+        """When it first stood after the fault, ns."""
+        self.top_speed = 0.0
+        """Greatest true speed since the fault, m/s."""
+        self._path: list[tuple[float, float]] = []
+
+    def begin(self, now: int, *, must_stop: bool, disarms: bool) -> None:
+        """A fault begins."""
+        self.began, self.must_stop, self.disarms = now, must_stop, disarms
+        self.stood, self.top_speed = None, 0.0
+        self._path.clear()
+
+    def metres(self) -> float:
+        """Truly travelled since the fault, m, to standstill or until the call."""
+        return sum(math.dist(a, b) for a, b in pairwise(self._path))
+
+    def __call__(self, seen: Observation) -> Broken:
+        now, speed = seen.now, seen.truth.v
+        self.top_speed = max(self.top_speed, abs(speed))
+        moving = abs(speed) > AT_REST
+        if self.stood is None:
+            self._path.append((seen.truth.x, seen.truth.y))
+            if not moving:
+                self.stood = now
+        if not moving:
+            return
+        limit = round(STOPS_WITHIN * SECOND)
+        if self.disarmed is not None and now > self.disarmed + limit:
+            yield "disarmed", f"{speed:.3f} m/s though disarmed"
+        if self.estopped is not None and now > self.estopped + limit:
+            yield "emergency stop", f"{speed:.3f} m/s though stopped and not reset"
+        if self.must_stop and now > self.began + limit:
+            yield "stop", f"{speed:.3f} m/s: must stand"
+        if self.disarms and self.stood is not None:
+            yield "unarmed", f"{speed:.3f} m/s: set off again though nobody armed it"
+
+
+class _Speeds:
+    """Speeds, true and asked for, stay within the limits; nobody asks for the other direction before standstill.
+
+    Args:
+        backwards: limit, m/s.
+        forwards: limit, m/s.
+    """
+
+    def __init__(self, backwards: float, forwards: float) -> None:
+        self._limits = backwards, forwards
+
+    def __call__(self, seen: Observation) -> Broken:
+        speed = seen.truth.v
+        if abs(speed) > (most := self._limits[speed > 0]) * SPEED_MARGIN:
+            yield "speed", f"{speed:.3f} m/s: at most {most:.3f}"
+        for _, asked in seen.targets:
+            if abs(asked) > (most := self._limits[asked > 0]) * 1.01:
+                yield "speed bytes", f"{asked:.3f} m/s: at most {most:.3f}"
+            if abs(speed) > REVERSES_BELOW and asked * speed < 0:
+                yield "reversal bytes", f"{asked:.3f} m/s at {speed:.3f} m/s"
+
+
+class _Ramp:
+    """Bytes ask for a speed no sooner than the ramp from the one before.
+
+    Args:
+        acceleration: of the ramp, m/s^2.
+    """
+
+    def __init__(self, acceleration: float) -> None:
+        self._acceleration = acceleration
+        self._newest: tuple[float, int] | None = None
+        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns; None = it begins anew."""
+
+    def __call__(self, seen: Observation) -> Broken:
+        for instant, speed in seen.targets:
+            if speed == 0:  # a drive that was stopped for a moment may go on as fast as before
+                self._newest = None
+                continue
+            ramp = abs(speed) + self._acceleration * RAMP_SLACK
+            if self._newest is not None:
+                before, then = self._newest
+                allowed = before + self._acceleration * (instant - then) / SECOND
+                if abs(speed) > allowed * 1.01:
+                    yield "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon"
+                ramp = min(ramp, allowed)
+            self._newest = ramp, instant
+
+
+class _HeldShaft:
+    """A motor that cannot turn is not driven on."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._held = Duration()
+
+    def __call__(self, seen: Observation) -> Broken:
+        if self._held.update(seen.now, so=seen.target != 0 and self._world.shaft_blocked()) > HELD_WITHIN:
+            yield "held shaft", f"{seen.target:.3f} m/s asked for though the shaft is held"
+
+
+class _Pulses:
+    """Servos are asked for angles within their limits and those of the axles, and the truck turns as they ask.
+
+    Args:
+        config: of the truck, with a steering device.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig) -> None:
+        assert config.devices.steering is not None
+        truck = config.sim.world.truck
+        self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
+        self._chassis = truck.chassis()
+        self._angle = config.gate.angle + ANGLE_MARGIN
+        self._models = {servo.channel: servo for servo in (truck.front_servo, truck.rear_servo)}
+        self._arms = dict.fromkeys(self._models, 0.0)
+        """Servo angles that the newest pulses ask for, rad."""
+        self._turn_errors: deque[tuple[int, float]] = deque()
+
+    def begin(self) -> None:
+        """Turns before do not count."""
+        self._turn_errors.clear()
+
+    def __call__(self, seen: Observation) -> Broken:
+        for channel, pulse_us in seen.pulses:
+            yield from self._check_pulse(channel, pulse_us)
+        yield from self._check_turn(seen.now, seen.truth)
+
+    def _check_pulse(self, channel: int, pulse_us: float) -> Broken:
+        limits, model = self._limits.get(channel), self._models.get(channel)
+        if limits is not None and not limits.min_us - 0.5 <= pulse_us <= limits.max_us + 0.5:
+            yield "pulse bytes", f"{pulse_us:.1f} us: {limits.min_us:g} to {limits.max_us:g}"
+        if model is not None:
+            self._arms[channel] = math.radians((pulse_us - model.centre_us) / model.us_per_degree)
+        if (angle := max(map(abs, self._steering()))) > self._angle:
+            yield "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}"
+
+    def _check_turn(self, now: int, truth: TruthState) -> Broken:
+        """The true rate of turn against the one that the pulses ask for, while the truck drives."""
+        asked = self._chassis.bicycle.body_twist(truth.v, *self._steering())[2]
+        self._turn_errors.append((now, (truth.wz - asked) * PERIOD / SECOND))
+        while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
+            self._turn_errors.popleft()
+        if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
+            yield "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s"
+
+    def _steering(self) -> tuple[float, ...]:
+        """Axle angles that the newest pulses ask for, rad."""
+        return self._chassis.steering(*self._arms.values())
+
+
+class _Silence:
+    """A truck stops when a device is silent without which it may not drive.
+
+    Args:
+        devices: (role, wire, for how long it may be silent, s) of those devices.
+    """
+
+    def __init__(self, devices: Iterable[tuple[str, WireTap, float]]) -> None:
+        self._devices = list(devices)
+
+    def __call__(self, seen: Observation) -> Broken:
+        for role, tap, longest in self._devices:
+            silent = 0.0 if tap.heard is None else (seen.now - tap.heard) / SECOND
+            if silent > longest + STOPS_WITHIN and abs(seen.truth.v) > AT_REST:
+                yield "silence", f"{seen.truth.v:.3f} m/s though {role} is silent for {silent:.2f} s"
+
+
+class _Ahead:
+    """Driving forwards: what is before the width of the truck, and what is in its way on its arc.
+
+    Args:
+        config: of the truck.
+        world: whose obstacles are looked at from the camera's place.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig, world: World) -> None:
+        truck = config.sim.world.truck
+        self._world = world
+        self._camera = config.sim.world.camera.x
+        self._width, self._half = truck.width, truck.length / 2
+        self._braking = config.gate.obstacle.deceleration
+        self._fast = Duration()
+        self._count = 0
+
+    def __call__(self, seen: Observation) -> Broken:
+        self._count += 1
+        if self._count % LOOKS != 1:
+            return
+        now, truth = seen.now, seen.truth
+        if truth.v <= 2 * AT_REST:
+            self._fast.update(now, so=False)
+            return
+        ranges = np.minimum(self._world.view.ranges(now, FAN), FAR)
+        ahead, aside = self._camera + ranges * np.cos(FAN), ranges * np.sin(FAN)
+        room = float(ahead[np.abs(aside) < self._width / 2].min(initial=math.inf)) - self._half
+        if room < CLOSEST:
+            yield "obstacle", f"{truth.v:.3f} m/s towards something {room:.3f} m ahead"
+        room = self._room(truth.wz / truth.v, ahead, aside)
+        if self._fast.update(now, so=truth.v**2 / (2 * self._braking) > room) > BRAKES_WITHIN:
+            yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
+
+    def _room(self, curvature: float, ahead: Array, aside: Array) -> float:
+        """Way along the present arc to the first of these points, m."""
+        turn = ROOM * curvature
+        at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
+        dx, dy = ahead - at_x[:, None], aside - at_y[:, None]
+        c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+        along, across = np.abs(c * dx + s * dy), np.abs(c * dy - s * dx)
+        met = ((along < self._half) & (across < self._width / 2)).any(axis=1)
+        return float(ROOM[met].min(initial=math.inf))
+
+
+def _contact(seen: Observation) -> Broken:
+    """The truck runs into nothing."""
+    if seen.truth.stuck:
+        yield "contact", "ran into something"
+
+
 class Observer:
     """Checks the invariants of one truck, and measures how it reacts; ``begin`` and ``end_fault`` bound one fault.
 
@@ -130,106 +399,64 @@ class Observer:
         assert config.devices.steering is not None
         self._world = world
         self._clock = clock
-        self.drive = WireTap(ports["drive"], clock)
-        self._steering = WireTap(ports["steering"], clock)
-        gate = config.gate
-        wires = {"drive": self.drive, "steering": self._steering}
-        wires |= {role: WireTap(ports[role], clock) for role in ("lidar", "compass") if role in ports}
-        limits = {"drive": gate.drive, "steering": gate.steering, "lidar": gate.scan, "compass": gate.attitude}
-        unreachable = set() if config.sim.deadman_wired else {"drive"}
-        self._senses = [
-            (role, tap, limits[role].stale_after)
-            for role, tap in wires.items()
-            if limits[role].critical and role not in unreachable
-        ]
-        """Wires of what the truck may not drive without: device, wire, and for how long it may be silent, s; without
-        the deadman line nothing stops a drive that cannot be reached."""
+        taps = {r: WireTap(ports[r], clock) for r in ("drive", "steering", "lidar", "compass") if r in ports}
+        self.drive, self._servos = taps["drive"], taps["steering"]
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
-        self._truck = truck = config.sim.world.truck
-        self._chassis = truck.chassis()
-        self._angle = config.gate.angle + ANGLE_MARGIN
-        self._speeds = gate.reverse_speed, gate.speed
-        """Greatest backwards and forwards, m/s."""
-        self._braking = gate.obstacle.deceleration
-        self._camera = config.sim.world.camera.x
-        drivetrain = DriveTrain(truck.motor.ratio, truck.wheel_radius)
-        self._rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if truck.motor.inverted else 1)
+        motor = config.sim.world.truck.motor
+        drivetrain = DriveTrain(motor.ratio, config.sim.world.truck.wheel_radius)
+        self._rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if motor.inverted else 1)
         """Of the motor at 1 m/s, in the controller's sign."""
-        self._acceleration = gate.acceleration
-        self._ramp: tuple[float, int] | None = None
-        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns; None = it begins anew."""
-        self._servos = {servo.channel: servo for servo in config.devices.steering.driver.servos}
-        self._pulses = {truck.front_servo.channel: 0.0, truck.rear_servo.channel: 0.0}
-        """Servo angles that the newest pulses ask for, rad."""
-        self._turn_errors: deque[tuple[int, float]] = deque()
-        self._target = 0
-        """Motor speed that the newest bytes ask for, rpm."""
-        self._held: int | None = None
-        """Since when the motor has been asked to turn a shaft that is held, ns."""
-        self._fast: int | None = None
-        """Since when the truck has been too fast for the room before it, ns."""
-        self._disarmed: int | None = None
-        self._estopped: int | None = None
-        self._began = 0
         self._read = 0
         """How much of the drive's bytes was checked."""
-        self._must_stop = False
-        self._disarms = False
-        self._stood: int | None = None
-        self._path: list[tuple[float, float]] = []
-        self.top_speed = 0.0
-        """Greatest true speed since the fault began, m/s."""
+        self._target = 0.0
+        gate = config.gate
+        self._standstill = _Standstill()
+        self._pulses = _Pulses(config)
+        self._rules: tuple[Rule, ...] = (
+            self._standstill,
+            _Speeds(gate.reverse_speed, gate.speed),
+            _Ramp(gate.acceleration),
+            _HeldShaft(world),
+            self._pulses,
+            _Silence(_indispensable(config, taps)),
+            _Ahead(config, world),
+            _contact,
+        )
         self._violations: dict[str, Violation] = {}
         self.speed = 0.0
         """True speed, m/s."""
 
     async def run(self) -> None:
-        """Sample a hundred times a second until cancelled."""
+        """Observe a hundred times a second until cancelled."""
         due = self._clock.now()
-        turn = 0
         while True:
-            now = self._clock.now()
-            truth = self._world.truth(now)
-            self.speed = truth.v
-            self.top_speed = max(self.top_speed, abs(truth.v))
-            self._check_motion(now, truth)
-            self._check_bytes(now)
-            self._check_shaft(now)
-            self._check_steering(now, truth)
-            self._check_senses(now)
-            if turn % 5 == 0:
-                self._check_ahead(now, truth)
-            turn += 1
-            due += SAMPLE
+            self._observe()
+            due += PERIOD
             await self._clock.sleep_until(due)
 
     # Called by the drill
 
     def disarm(self) -> None:
         """The operator disarms: the truck must stand soon."""
-        self._disarmed = self._clock.now()
+        self._standstill.disarmed = self._clock.now()
 
     def arm(self) -> None:
         """The operator arms: the truck may move."""
-        self._disarmed = None
+        self._standstill.disarmed = None
 
     def estop(self) -> None:
         """The operator stops: the truck must stand soon, until ``reset``."""
-        self._estopped = self._estopped or self._clock.now()
+        self._standstill.estopped = self._standstill.estopped or self._clock.now()
 
     def reset(self) -> None:
         """The operator resets the emergency stop: an armed truck may move."""
-        self._estopped = None
+        self._standstill.estopped = None
 
     def begin(self, *, stops: bool, disarms: bool = False) -> None:
         """A fault begins; with ``stops`` the truck must stand soon, with ``disarms`` not set off again by itself."""
-        self._began = self._clock.now()
-        self._must_stop, self._disarms = stops, disarms
-        self._stood = None
-        self._path.clear()
-        self.top_speed = 0.0
-        self._turn_errors.clear()
-        self._check_bytes(self._began)
+        self._observe()
+        self._standstill.begin(self._clock.now(), must_stop=stops, disarms=disarms)
+        self._pulses.begin()
         self._violations.clear()
         self._read = 0
         self.drive.to_device.clear()
@@ -237,20 +464,27 @@ class Observer:
 
     def end_fault(self) -> None:
         """The fault is over."""
-        self._must_stop = self._disarms = False
+        self._standstill.must_stop = self._standstill.disarms = False
 
     def violations(self) -> tuple[Violation, ...]:
         """What was unsafe since ``begin``: the first case of every rule."""
         return tuple(self._violations.values())
 
+    @property
+    def top_speed(self) -> float:
+        """Greatest true speed since the fault began, m/s."""
+        return self._standstill.top_speed
+
     def stop_bytes_after(self) -> float | None:
         """Seconds from the fault to the first bytes that stop the motor."""
-        instant = stop_bytes(self.drive, self._began)
-        return None if instant is None else (instant - self._began) / SECOND
+        began = self._standstill.began
+        instant = stop_bytes(self.drive, began)
+        return None if instant is None else (instant - began) / SECOND
 
     def standstill_after(self) -> float | None:
         """Seconds from the fault to standstill."""
-        return None if self._stood is None else (self._stood - self._began) / SECOND
+        stood = self._standstill.stood
+        return None if stood is None else (stood - self._standstill.began) / SECOND
 
     def before_something(self) -> bool:
         """Whether an obstacle in front is so near that the truck may rightly not start."""
@@ -258,127 +492,47 @@ class Observer:
 
     def metres(self) -> float:
         """Truly travelled since the fault, m, to standstill or until the call."""
-        return sum(math.dist(a, b) for a, b in pairwise(self._path))
+        return self._standstill.metres()
 
-    # Rules
+    # What is seen
 
-    def _violate(self, now: int, rule: str, text: str) -> None:
-        self._violations.setdefault(rule, Violation((now - self._began) / SECOND, rule, text))
+    def _observe(self) -> None:
+        now = self._clock.now()
+        truth = self._world.truth(now)
+        self.speed = truth.v
+        targets = tuple(self._new_targets())
+        if targets:
+            self._target = targets[-1][1]
+        seen = Observation(now, truth, targets, self._target, tuple(self._new_pulses()))
+        for rule in self._rules:
+            for name, text in rule(seen):
+                self._violations.setdefault(name, Violation((now - self._standstill.began) / SECOND, name, text))
 
-    def _check_motion(self, now: int, truth: TruthState) -> None:
-        moving = abs(truth.v) > AT_REST
-        if self._stood is None:
-            self._path.append((truth.x, truth.y))
-            if not moving:
-                self._stood = now
-        limit = STOPS_WITHIN * SECOND
-        if abs(truth.v) > (most := self._speeds[truth.v > 0]) * SPEED_MARGIN:
-            self._violate(now, "speed", f"{truth.v:.3f} m/s: at most {most:.3f}")
-        if truth.stuck:
-            self._violate(now, "contact", "ran into something")
-        if moving and self._disarmed is not None and now > self._disarmed + limit:
-            self._violate(now, "disarmed", f"{truth.v:.3f} m/s though disarmed")
-        if moving and self._estopped is not None and now > self._estopped + limit:
-            self._violate(now, "emergency stop", f"{truth.v:.3f} m/s though stopped and not reset")
-        if moving and self._must_stop and now > self._began + limit:
-            self._violate(now, "stop", f"{truth.v:.3f} m/s: must stand")
-        if moving and self._disarms and self._stood is not None:
-            self._violate(now, "unarmed", f"{truth.v:.3f} m/s: set off again though nobody armed it")
-
-    def _check_bytes(self, now: int) -> None:
-        """Commands to motor and servos, within their limits."""
+    def _new_targets(self) -> Iterator[tuple[int, float]]:
         fresh = self.drive.to_device[self._read :]
         self._read += len(fresh)
         for instant, index, value in _writes(fresh):
-            rpm = value - (1 << 32) if value >= 1 << 31 else value
             if index == od.TARGET_VELOCITY.index:
-                self._target = rpm
-                self._check_target(now, instant, rpm / self._rpm)
+                yield instant, (value - (1 << 32) if value >= 1 << 31 else value) / self._rpm
             elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
-                self._target, self._ramp = 0, None
-        received, self._steering.to_device[:] = list(self._steering.to_device), []
-        self._steering.to_host.clear()
+                yield instant, 0.0
+
+    def _new_pulses(self) -> Iterator[tuple[int, float]]:
+        received, self._servos.to_device[:] = list(self._servos.to_device), []
+        self._servos.to_host.clear()
         for _, data in received:
             for command in self._maestro.feed(data):
                 if isinstance(command, ServoCommand) and command.code is Code.SET_TARGET and command.value:
-                    self._pulse(now, command.data[0], command.value / 4)
-
-    def _check_target(self, now: int, instant: int, speed: float) -> None:
-        """Bytes that ask for a speed, m/s: within the limit, and no sooner than the ramp from one before."""
-        if abs(speed) > (most := self._speeds[speed > 0]) * 1.01:
-            self._violate(now, "speed bytes", f"{speed:.3f} m/s: at most {most:.3f}")
-        if speed == 0:  # a drive that was stopped for a moment may go on as fast as before
-            self._ramp = None
-            return
-        ramp = abs(speed) + self._acceleration * RAMP_SLACK
-        if self._ramp is not None:
-            before, then = self._ramp
-            allowed = before + self._acceleration * (instant - then) / SECOND
-            if abs(speed) > allowed * 1.01:
-                self._violate(now, "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon")
-            ramp = min(ramp, allowed)
-        self._ramp = ramp, instant
-
-    def _check_senses(self, now: int) -> None:
-        """A truck stops when a device is silent without which it may not drive."""
-        for role, tap, longest in self._senses:
-            silent = 0.0 if tap.heard is None else (now - tap.heard) / SECOND
-            if silent > longest + STOPS_WITHIN and abs(self.speed) > AT_REST:
-                self._violate(now, "silence", f"{self.speed:.3f} m/s though {role} is silent for {silent:.2f} s")
-
-    def _check_shaft(self, now: int) -> None:
-        """A motor that cannot turn is not driven on."""
-        if not self._target or not self._world.shaft_blocked():
-            self._held = None
-        elif self._held is None:
-            self._held = now
-        elif now - self._held > HELD_WITHIN * SECOND:
-            self._violate(now, "held shaft", f"{self._target} rpm though the shaft is held")
-
-    def _pulse(self, now: int, channel: int, pulse_us: float) -> None:
-        truck = self._truck
-        limits = self._servos.get(channel)
-        if limits is not None and not limits.min_us - 0.5 <= pulse_us <= limits.max_us + 0.5:
-            self._violate(now, "pulse bytes", f"{pulse_us:.1f} us: {limits.min_us:g} to {limits.max_us:g}")
-        for servo in (truck.front_servo, truck.rear_servo):
-            if servo.channel == channel:
-                self._pulses[channel] = _arm(servo, pulse_us)
-        if (angle := max(map(abs, self._chassis.steering(*self._pulses.values())))) > self._angle:
-            self._violate(now, "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}")
-
-    def _check_steering(self, now: int, truth: TruthState) -> None:
-        """The true rate of turn against the one that the pulses ask for, while the truck drives."""
-        commanded = self._chassis.bicycle.body_twist(truth.v, *self._chassis.steering(*self._pulses.values()))[2]
-        self._turn_errors.append((now, (truth.wz - commanded) * SAMPLE / SECOND))
-        while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
-            self._turn_errors.popleft()
-        if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
-            self._violate(now, "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s")
-
-    def _check_ahead(self, now: int, truth: TruthState) -> None:
-        """Driving forwards: what is before the width of the truck, and what is in its way on its arc."""
-        if truth.v <= 2 * AT_REST:
-            self._fast = None
-            return
-        ranges = np.minimum(self._world.view.ranges(now, FAN), FAR)
-        ahead, aside = self._camera + ranges * np.cos(FAN), ranges * np.sin(FAN)
-        width, half = self._truck.width, self._truck.length / 2
-        room = float(ahead[np.abs(aside) < width / 2].min(initial=math.inf)) - half
-        if room < CLOSEST:
-            self._violate(now, "obstacle", f"{self.speed:.3f} m/s towards something {room:.3f} m ahead")
-        turn = ROOM * truth.wz / truth.v
-        at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
-        dx, dy = ahead - at_x[:, None], aside - at_y[:, None]
-        c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
-        met = ((np.abs(c * dx + s * dy) < half) & (np.abs(c * dy - s * dx) < width / 2)).any(axis=1)
-        room = float(ROOM[met].min(initial=math.inf))
-        if truth.v**2 / (2 * self._braking) <= room:
-            self._fast = None
-        elif self._fast is None:
-            self._fast = now
-        elif now - self._fast > BRAKES_WITHIN * SECOND:
-            self._violate(now, "braking", f"{self.speed:.3f} m/s with something on its way in {room:.3f} m")
+                    yield command.data[0], command.value / 4
 
 
-def _arm(servo: ServoModelConfig, pulse_us: float) -> float:
-    return math.radians((pulse_us - servo.centre_us) / servo.us_per_degree)
+def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:
+    """Wires of what the truck may not drive without: role, wire, and for how long it may be silent, s.
+
+    Without the deadman line nothing stops a drive that cannot be reached.
+    """
+    gate = config.gate
+    limits = {"drive": gate.drive, "steering": gate.steering, "lidar": gate.scan, "compass": gate.attitude}
+    for role, tap in taps.items():
+        if limits[role].critical and (role != "drive" or config.sim.deadman_wired):
+            yield role, tap, limits[role].stale_after
