@@ -53,8 +53,10 @@ ORDERS = frozenset(order.value for order in Order)
 MAX_CALLS = 16
 """Remote calls served at once."""
 MAX_WAITING_CALLS = 64
+"""Calls that wait to be served; twice as many with orders."""
 CALL_RATE = 100.0
 """Calls a second of one source that are not orders."""
+TOO_MANY = "too many calls at once"
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
@@ -137,9 +139,8 @@ class ZenohBridge:
                             closing(
                                 ThreadHop(
                                     lambda call: guard(partial(self._serve, *call, calls, active)),
-                                    MAX_WAITING_CALLS,
+                                    2 * MAX_WAITING_CALLS,
                                     self._bus.add_drops,
-                                    lambda call: self._called(call[0])[0] in ORDERS,
                                 )
                             )
                         )
@@ -280,13 +281,15 @@ class ZenohBridge:
             _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
         elif name not in ORDERS and not rates.spend(source or ANONYMOUS):
             _refuse(query, Reason.BUSY, f"more than {CALL_RATE:g} calls a second")
+        elif queries.waiting >= (2 * MAX_WAITING_CALLS if name in ORDERS else MAX_WAITING_CALLS):
+            _refuse(query, Reason.BUSY, TOO_MANY)
         else:
             queries.put((query, door))
 
     def _serve(self, query: zenoh.Query, door: Door, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
         name, source = self._called(query)
         if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
-            _refuse(query, Reason.BUSY, "too many calls at once")
+            _refuse(query, Reason.BUSY, TOO_MANY)
             return
         task = calls.create_task(self._answer(query, name, _sender(door, source)))
         active.add(task)

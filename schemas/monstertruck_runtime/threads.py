@@ -57,6 +57,11 @@ class ThreadHop(Generic[T]):
             if not self._closed:
                 raise
 
+    @property
+    def waiting(self) -> int:
+        """Items not delivered yet."""
+        return len(self._items)
+
     def close(self) -> None:
         """Discard what waits and everything to come; to be called while the loop lives."""
         self._closed = True
