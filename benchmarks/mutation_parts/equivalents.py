@@ -16,6 +16,11 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::ObstacleGuard._look: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard._delay: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
+    f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked = rounded -> pass": CACHE,
+    f"{GATE}limiter.py::Visibility.observe: geometry != self._geometry -> True": CACHE,
+    f"{GATE}limiter.py::Visibility.__init__: 0 -> (1)": UNREAD,
+    f"{GATE}limiter.py::_sector: bearings + math.pi -> ((bearings) - (math.pi))": "a whole turn, counted modulo turns",
+    f"{GATE}limiter.py::module: 1e-6 -> (2e-06)": "a micrometre",
     f"{GATE}limiter.py::ScanMemory.forget: 0.0 -> (1.0)": "poses and distances are compared by their differences",
     f"{GATE}limiter.py::ScanMemory.seen: beyond_x < DRIFT -> (beyond_x <= DRIFT)": ROUNDED,
     f"{GATE}limiter.py::ScanMemory.seen: beyond_y < DRIFT -> (beyond_y <= DRIFT)": ROUNDED,
@@ -26,6 +31,11 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::Motion.servos: 0 -> (1)": CACHE,
     f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the way",
     f"{GATE}limiter.py::CommandLimiter.update: pace <= allowed -> (pace < allowed)": "scaled by 1",
+    f"{GATE}limiter.py::CommandLimiter.update: "
+    "pace > max_pace * (1 + ROUNDING) -> (pace >= (max_pace * (1 + ROUNDING)))": "a rounded product",
+    f"{GATE}limiter.py::Motion._reached: "
+    "max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > SATURATED -> "
+    "(max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) >= SATURATED)": "a rounded difference",
     f"{GATE}core.py::Gate.__init__: 0 -> (1)": NANOSECOND,
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed is None or self._speed[0] != now -> True": CACHE,
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed[0] != now -> True": CACHE,

@@ -449,8 +449,6 @@ class ObstacleGuard:
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
-        if math.isinf(free):
-            return math.inf
         room = max(free - self._config.obstacle.ahead, 0.0)
         delay, deceleration = self._delay(now), self._config.obstacle.deceleration
         return deceleration * (math.sqrt(delay**2 + 2 * room / deceleration) - delay)

@@ -12,7 +12,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import DRIFT, MEMORY, ObstacleGuard, ScanMemory, spaced
+from monstertruckd.gate.limiter import DRIFT, ObstacleGuard, ScanMemory, spaced
 from tests.unit.gate.rig import TICK, Rig, scan
 
 FOOTPRINT = Footprint()
@@ -87,9 +87,28 @@ def test_points_are_forgotten_after_their_distance_and_time():
     see(remembered, SECOND, (0.2, 0.4))
     now = drive(remembered, 0.45)
     assert len(see(remembered, now)) == 1
-    assert len(see(remembered, SECOND + MEMORY - 1)) == 1
-    assert len(see(remembered, SECOND + MEMORY)) == 0
+    assert len(see(remembered, 31 * SECOND - 1)) == 1
+    assert len(see(remembered, 31 * SECOND)) == 0
     assert len(see(remembered, drive(remembered, 0.1, now=now))) == 0
+
+
+@pytest.mark.parametrize(("inside", "kept"), [(-2.0, 1), (2.0, 1), (5.0, 1), (6.5, 0), (20.0, 0)])
+@pytest.mark.parametrize("side", [1, -1])
+def test_points_at_the_edge_of_the_lidars_field_are_remembered(side, inside, kept):
+    """Within 0.1 rad, 5.7 degrees; ``inside`` are the degrees from the edge of the field."""
+    remembered = memory()
+    bearing = side * math.radians(120 - inside)
+    there = np.array([(0.14 + 0.6 * math.cos(bearing), 0.6 * math.sin(bearing))])
+    remembered.observe(scan(SECOND), there)
+    remembered.observe(scan(SECOND), np.empty((0, 2)))
+    assert len(remembered.points()) == kept
+
+
+def test_a_scan_of_a_single_beam_is_remembered():
+    remembered = memory()
+    one = {"end_angle": -math.radians(120), "ranges": np.array([0.5]), "codes": np.full(1, 255, np.uint8)}
+    remembered.observe(scan(SECOND).model_copy(update=one), np.array([(0.0, -0.5)]))
+    assert remembered.points() == pytest.approx(np.array([(0.0, -0.5)]))
 
 
 def test_points_that_the_body_stands_on_are_none():
@@ -138,9 +157,9 @@ def test_seen_ground_ages():
     now = drive(remembered, 0.4)
     see(remembered, now)
     assert seen(remembered, -BACK - 0.3)
-    see(remembered, SECOND + MEMORY - 1)
+    see(remembered, 31 * SECOND - 1)
     assert seen(remembered, -BACK - 0.3)
-    see(remembered, SECOND + MEMORY)
+    see(remembered, 31 * SECOND)
     assert not seen(remembered, -BACK - 0.3)
 
 
@@ -246,6 +265,19 @@ def test_ways_less_than_half_forwards_are_held_against_what_is_known(share, know
     guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
     guard.free_distance(((share, math.sqrt(1.0 - share**2), 0.0),))
     assert guard.known == known
+
+
+@pytest.mark.parametrize(("beside", "behind"), [(0.5, 0.35), (0.35, 0.5)])
+def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(beside, behind):
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard.observe(scan(SECOND, (0.3, behind)))
+    now = SECOND
+    for _ in range(120):
+        now += TICK
+        guard.move(now, (0.2, 0.0, 0.0), 0.02)
+    guard.observe(scan(now, (0.1, beside)))
+    nearest = min(beside - GateConfig().obstacle.side_clearance, behind + DRIFT)
+    assert guard.free_distance(((0.0, 1.0, 0.0),)) == pytest.approx(nearest - FOOTPRINT.half_width, abs=0.02)
 
 
 def surround(rig, *obstacles):
