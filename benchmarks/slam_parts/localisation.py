@@ -3,8 +3,8 @@
 The whole log is mapped first; that trajectory is the truth, and the frame of the maps. A stretch of it makes the map:
 as keyframes with their grid, or as the grid alone. A start follows the log from a random scan outside that stretch,
 with or without wheels, until it is placed and has driven on, for at most ``WAY`` metres or ``SECONDS``. Many begin in
-rooms that are not on the map: those that never come to it are to be reported as outside. A pose reported as degenerate
-says where the robot is across a corridor; along it the pose is judged by its own covariance.
+rooms that are not on the map: those that never come to it are to be reported as outside. A pose behind the first one
+that is off by no more than its covariance says, as along a corridor by scans alone, is neither right nor wrong.
 """
 
 import math
@@ -33,7 +33,7 @@ FOLLOWED = 3.5
 """Way after the first fix over which it must stay right, m."""
 RIGHT = (0.5, math.radians(10))
 COVERED = 3.0
-"""Standard deviations along a corridor by which a degenerate pose may be off."""
+"""Standard deviations of its own covariance by which a pose behind the first one may be off."""
 ON_MAP = 0.9
 """A scan overlaps by this at its true pose where the place is on the map."""
 OFF_MAP = 0.7
@@ -80,24 +80,21 @@ def truth(log: Log) -> np.ndarray:
 
 
 def error(pose: np.ndarray, estimate: SlamEstimate) -> tuple[bool, bool]:
-    """Whether an estimate is off by more than ``RIGHT`` from ``pose``, (3,), and whether it did not say so."""
+    """Whether an estimate is off by more than ``RIGHT`` from ``pose``, (3,), and whether its covariance hides that."""
     off = np.array(estimate.pose) - pose
-    off[2] = math.remainder(off[2], math.tau)
-    if abs(float(off[2])) > RIGHT[1]:
-        return True, True
-    if estimate.status is not LocalisationStatus.DEGENERATE or math.hypot(off[0], off[1]) <= RIGHT[0]:
-        return (math.hypot(off[0], off[1]) > RIGHT[0],) * 2
-    along = np.array((math.cos(estimate.direction), math.sin(estimate.direction)))
-    way, variance = float(along @ off[:2]), float(along @ np.reshape(estimate.covariance, (3, 3))[:2, :2] @ along)
-    across = math.hypot(*(off[:2] - way * along))
-    return True, across > RIGHT[0] or abs(way) > COVERED * math.sqrt(variance)
+    yaw, way = abs(math.remainder(off[2], math.tau)), math.hypot(off[0], off[1])
+    covariance = np.reshape(estimate.covariance, (3, 3))
+    # Standard deviation in the direction of the error.
+    deviation = math.sqrt(off[:2] @ covariance[:2, :2] @ off[:2]) / max(way, 1e-9)
+    hidden = way > max(RIGHT[0], COVERED * deviation), yaw > max(RIGHT[1], COVERED * math.sqrt(covariance[2, 2]))
+    return way > RIGHT[0] or yaw > RIGHT[1], any(hidden)
 
 
 def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str]:
     """What one robot believed: outcome, way and time of the fix.
 
-    right, wrong at the first pose, lost behind it, degenerate (off along a corridor by less than it said); searching at
-    a place of the map, between (it skirted the map), outside, or silent of being outside.
+    right, wrong at the first pose, lost behind it, uncertain (off by no more than it said); searching at a place of the
+    map, between (it skirted the map), outside, or silent of being outside.
     """
     log, geometry = case.log, case.log.geometry
     submap = submap_of(case.saved)
@@ -130,8 +127,8 @@ def followed(case: Mapped, start: int, *, wheels: bool) -> dict[str, float | str
             fixed_at = fixed_at or (way, seconds)
             errors.append(error(case.poses[k], estimate))
     if fixed_at is not None:
-        off, unsaid = np.array(errors).any(axis=0)
-        outcome = "wrong" if errors[0][0] else "lost" if unsaid else "degenerate" if off else "right"
+        off, hidden = np.array(errors).any(axis=0)
+        outcome = "wrong" if errors[0][0] else "lost" if hidden else "uncertain" if off else "right"
         return {"outcome": outcome, "way": fixed_at[0], "seconds": fixed_at[1]}
     if np.mean(np.array(seen) > ON_MAP) > 0.2:
         return {"outcome": "searching"}
@@ -161,13 +158,13 @@ def run(folder: Path, *, quick: bool = False) -> tuple[dict[str, float], dict[st
         every += results
     outcomes = Counter(str(result["outcome"]) for result in every)
     ways = [float(result["way"]) for result in every if "way" in result]
-    on_map = outcomes["right"] + outcomes["wrong"] + outcomes["lost"] + outcomes["degenerate"] + outcomes["searching"]
+    on_map = outcomes["right"] + outcomes["wrong"] + outcomes["lost"] + outcomes["uncertain"] + outcomes["searching"]
     off_map = outcomes["outside"] + outcomes["silent"]
     figures = {
         "localise.starts": len(every),
         "localise.wrong": outcomes["wrong"] + outcomes["lost"],
         "localise.right": outcomes["right"],
-        "localise.degenerate": outcomes["degenerate"],
+        "localise.uncertain": outcomes["uncertain"],
         "localise.searching": outcomes["searching"],
         "localise.right_share": round(outcomes["right"] / max(on_map, 1), 3),
         "localise.outside_share": round(outcomes["outside"] / off_map, 3) if off_map else 1.0,

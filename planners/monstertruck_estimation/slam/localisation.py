@@ -84,9 +84,10 @@ class LocalisationEstimator:
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
         """Of the pose as the matches have it: the prior of the next one."""
         self._published_covariance = self._covariance
-        """Along the weak direction of degenerate matches that of the predicted motion."""
+        """That of the predicted motion where matches do not count, and along the weak direction of degenerate ones."""
         self._stamp: int | None = None
         self._misfits = 0
+        """Matches in a row that do not count."""
         self._published = False
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
@@ -137,7 +138,7 @@ class LocalisationEstimator:
         alone = odom is None or self.odometry is not OdometryUse.USED
         moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
         self._pose, self._covariance = match.pose, match.covariance
-        if match.information is not None:
+        if match.information is not None and not self._misfits:
             published = np.linalg.inv(constrained(match, match.information) + np.linalg.inv(published))
         self._published_covariance = published
         if inputs.odom is not None and match.accepted:
@@ -171,17 +172,15 @@ class LocalisationEstimator:
         self, scan: Scan, delta: Array, guess: Array, covariance: Array, mount: Vector
     ) -> tuple[ScanMatch, LocalisationStatus]:
         match = self._front.match(scan, delta, guess, covariance, self._submap)
-        if not fits(match):
+        good = self._counts(match, scan, mount)
+        if not good:
             # The predicted motion may be wrong: by a late odometry, or by stamps that are not those of the scans.
             before = compose(guess, inverse(delta))
             still = self._front.match(scan, np.zeros(3), before, covariance, self._submap)
-            if fits(still) or (_strayed(match, guess) and not _strayed(still, before)):
+            good = self._counts(still, scan, mount)
+            if good or (_strayed(match, guess) and not _strayed(still, before)):
                 match, guess = still, before
         place, turn = deviations(match.covariance)
-        good = fits(match)
-        if good:
-            evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
-            good = evidence.contradiction <= MAX_CONTRADICTION
         if match.accepted and not good and _strayed(match, guess):
             match = rejected(guess, covariance, MatchStatus.FAR)
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
@@ -193,6 +192,13 @@ class LocalisationEstimator:
             return match, LocalisationStatus.SEARCHING
         lost = self._misfits >= LOST_AFTER and not match.accepted
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
+
+    def _counts(self, match: ScanMatch, scan: Scan, mount: Vector) -> bool:
+        """Whether ``scan`` fits the map at its match, and its beams do not contradict the grid there."""
+        if not fits(match):
+            return False
+        evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
+        return evidence.contradiction <= MAX_CONTRADICTION
 
     def _search_anew(self) -> GlobalLocaliser:
         return GlobalLocaliser(self._submap, self._evidence, self._config)
