@@ -21,6 +21,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::Visibility.__init__: 0 -> (1)": UNREAD,
     f"{GATE}limiter.py::_sector: bearings + math.pi -> ((bearings) - (math.pi))": "a whole turn, counted modulo turns",
     f"{GATE}limiter.py::module: 1e-6 -> (2e-06)": "a micrometre",
+    f"{GATE}limiter.py::ObstacleGuard._swept: 1 -> (2)": "the length that follows from the others: any negative number",
     f"{GATE}limiter.py::ScanMemory.forget: 0.0 -> (1.0)": "poses and distances are compared by their differences",
     f"{GATE}limiter.py::ScanMemory.seen: beyond_x < DRIFT -> (beyond_x <= DRIFT)": ROUNDED,
     f"{GATE}limiter.py::ScanMemory.seen: beyond_y < DRIFT -> (beyond_y <= DRIFT)": ROUNDED,
@@ -40,6 +41,8 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed is None or self._speed[0] != now -> True": CACHE,
     f"{GATE}sensors.py::SensorMonitor.speed: self._speed[0] != now -> True": CACHE,
     f"{GATE}sensors.py::SensorMonitor.speed: 0 -> (1)": CACHE,
+    f"{GATE}sensors.py::ShaftCheck.observe: "
+    "measured * math.copysign(1.0, commanded) -> ((measured) / (math.copysign(1.0, commanded)))": "a sign: 1 or -1",
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
     f"{GATE}sensors.py::SteeringCheck._begin: 0.0 -> (1.0)": "turns are compared by their differences",
     f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": UNREAD,
@@ -47,6 +50,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
         "what is stored is compared once more with the mode"
     ),
     f"{GATE}service.py::GateService._tick_for_ever: 0 -> (1)": "a tick a nanosecond earlier",
+    f"{DRIVE}::Odometer.update: raw - before + 2**31 -> ((raw - before) - (2**31))": "the same modulo 2**32",
     f"{DRIVE}::_DriveSession._idle: 0 -> (1)": "a nanosecond less to wait",
     f"{DRIVE}::_DriveSession.__init__: 1 -> (2)": UNREAD,
     f"{DRIVE}::_DriveSession._cycle: "

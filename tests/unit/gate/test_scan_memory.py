@@ -59,6 +59,15 @@ def test_a_point_stays_where_it_was_seen_as_the_truck_passes_it():
     assert (x, y) == pytest.approx((-0.3, 0.4), abs=0.01)
 
 
+@pytest.mark.parametrize(("metres", "remembered_points"), [(0.11, 1), (0.09, 0)])
+def test_another_scan_is_remembered_a_tenth_of_a_metre_further_on(metres, remembered_points):
+    remembered = memory()
+    see(remembered, SECOND)
+    now = drive(remembered, metres, speed=0.1)
+    see(remembered, now, (0.3, 0.4))
+    assert len(see(remembered, drive(remembered, 0.6, now=now))) == remembered_points
+
+
 def test_a_point_turns_about_a_turning_truck():
     remembered = memory()
     see(remembered, SECOND, (0.4, -0.3))

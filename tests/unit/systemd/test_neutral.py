@@ -198,6 +198,21 @@ def test_without_an_answer_it_waits_a_quarter_of_a_second(neutral, monkeypatch):
     assert waits == [0.25]
 
 
+def test_of_what_comes_in_pieces_no_more_is_read_than_was_asked_for(neutral, monkeypatch):
+    reader, writer = os.pipe()
+    pieces = [b"ab", b"cde"]
+
+    def arrive(*_):
+        os.write(writer, pieces.pop(0))
+        return [reader], [], []
+
+    monkeypatch.setattr(neutral.select, "select", arrive)
+    assert neutral.receive(reader, 3) == b"abc"
+    assert os.read(reader, 9) == b"de"
+    os.close(reader)
+    os.close(writer)
+
+
 def test_a_port_that_is_not_there_is_reported_and_a_failure(neutral, tmp_path, capsys):
     assert neutral.main([str(tmp_path / "none")]) == 1
     assert "No such file" in capsys.readouterr().err
