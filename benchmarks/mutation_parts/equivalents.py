@@ -22,6 +22,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::_sector: bearings + math.pi -> ((bearings) - (math.pi))": "a whole turn, counted modulo turns",
     f"{GATE}limiter.py::module: 1e-6 -> (2e-06)": "a micrometre",
     f"{GATE}limiter.py::ObstacleGuard._swept: 1 -> (2)": "the length that follows from the others: any negative number",
+    f"{GATE}limiter.py::spaced: 1.0 -> (2.0)": "less than the first number of a step",
     f"{GATE}limiter.py::ScanMemory.forget: 0.0 -> (1.0)": "poses and distances are compared by their differences",
     f"{GATE}limiter.py::ScanMemory.seen: beyond_x < DRIFT -> (beyond_x <= DRIFT)": ROUNDED,
     f"{GATE}limiter.py::ScanMemory.seen: beyond_y < DRIFT -> (beyond_y <= DRIFT)": ROUNDED,

@@ -33,6 +33,7 @@ def command(action: DriveAction, rpm: float = 0.0) -> DriveCommand:
         (0.0, DriveAction.RUN, 1000, Wanted(State.ENABLED, -1000)),
         (0.25, DriveAction.RUN, -1000, Wanted(State.ENABLED, 1000)),
         (-0.1, DriveAction.RUN, 30000, Wanted(State.ENABLED, -18000)),
+        (0.0, DriveAction.RUN, -30000, Wanted(State.ENABLED, 18000)),
         (0.26, DriveAction.RUN, 1000, Wanted(State.ENABLED, 0)),
         (1.0, DriveAction.RUN, 1000, Wanted(State.ENABLED, 0)),
         (1.01, DriveAction.RUN, 1000, STOP),
