@@ -33,6 +33,10 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::Motion.servos: 0 -> (1)": CACHE,
     f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the way",
     f"{GATE}limiter.py::CommandLimiter.update: pace <= allowed -> (pace < allowed)": "scaled by 1",
+    f"{GATE}limiter.py::CommandLimiter._check_obstacles: allowed < (2 * crawl if self.blocked else crawl) -> "
+    "(allowed <= (2 * crawl if self.blocked else crawl))": "a rounded speed",
+    f"{GATE}limiter.py::ObstacleGuard.observe: np.hypot(points[:, 0], points[:, 1]) < self._near -> "
+    "(np.hypot(points[:, 0], points[:, 1]) <= self._near)": "a rounded distance",
     f"{GATE}limiter.py::CommandLimiter.update: "
     "pace > max_pace * (1 + ROUNDING) -> (pace >= (max_pace * (1 + ROUNDING)))": "a rounded product",
     f"{GATE}limiter.py::Motion._reached: "
@@ -44,6 +48,9 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}sensors.py::SensorMonitor.speed: 0 -> (1)": CACHE,
     f"{GATE}sensors.py::ShaftCheck.observe: "
     "measured * math.copysign(1.0, commanded) -> ((measured) / (math.copysign(1.0, commanded)))": "a sign: 1 or -1",
+    f"{GATE}sensors.py::SensorMonitor._fresh_drives: "
+    "d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE) -> "
+    "((self._fresh(d, limit, now, Reason.DRIVE_STALE)))": "what was never measured is not fresh either",
     f"{GATE}sensors.py::SensorMonitor._fresh: 1 -> (2)": "both are before all time",
     f"{GATE}sensors.py::SteeringCheck._begin: 0.0 -> (1.0)": "turns are compared by their differences",
     f"{GATE}sensors.py::SteeringCheck.__init__: 0.0 -> (1.0)": UNREAD,
@@ -53,6 +60,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}service.py::GateService._tick_for_ever: 0 -> (1)": "a tick a nanosecond earlier",
     f"{DRIVE}::Odometer.update: raw - before + 2**31 -> ((raw - before) - (2**31))": "the same modulo 2**32",
     f"{DRIVE}::_DriveSession._idle: 0 -> (1)": "a nanosecond less to wait",
+    f"{DRIVE}::_DriveSession.__init__: 0 -> (1)": NANOSECOND,
     f"{DRIVE}::_DriveSession.__init__: 1 -> (2)": UNREAD,
     f"{DRIVE}::_DriveSession._cycle: "
     "await self._read(od.CURRENT) / 1000 * self._sign -> ((await self._read(od.CURRENT) / 1000) / (self._sign))": (

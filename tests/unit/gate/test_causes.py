@@ -165,18 +165,27 @@ def test_stops_are_numbered_kept_until_they_are_read_and_read_once():
     assert log.drain(NOW) == ()
 
 
+LIDAR_LOST = HealthTable(
+    **header(NOW),
+    services=(ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=NOW, reason=Reason.DEVICE_LOST),),
+)
+
+
+def test_a_stop_is_read_before_what_became_known_of_it():
+    found = outages()
+    log = StopLog(found)
+    add(log)
+    found.observe_health(LIDAR_LOST)
+    assert [len(trip.causes) for _ in range(3) for trip in log.drain(NOW)] == [1, 2]
+
+
 @pytest.mark.parametrize(("later", "reported"), [(3 * SECOND, True), (3 * SECOND + 1, False)])
 def test_what_becomes_known_soon_after_a_stop_is_added_to_it_once(later, reported):
     found = outages()
     log = StopLog(found)
     add(log)
     log.drain(NOW)
-    found.observe_health(
-        HealthTable(
-            **header(NOW),
-            services=(ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=NOW, reason=Reason.DEVICE_LOST),),
-        )
-    )
+    found.observe_health(LIDAR_LOST)
     again = log.drain(NOW + later)
     assert [(trip.number, len(trip.causes)) for trip in again] == ([(1, 2)] if reported else [])
     assert log.drain(NOW + later) == ()

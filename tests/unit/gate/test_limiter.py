@@ -349,6 +349,17 @@ def test_what_stops_a_slow_truck_in_time_is_no_quick_stop():
     assert not rig.trips[-1].quick
 
 
+def test_a_limit_at_the_present_pace_limits_nothing(monkeypatch):
+    rig = Rig().driving(speed=0.2)
+    rig.obstacles = wall(0.3)
+    for allowed, limited in ((0.2, False), (0.199, True)):
+        monkeypatch.setattr(rig.gate._obstacles, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
+        rig.speed = rig.out.speeds[0]
+        rig.tick()
+        assert (Reason.OBSTACLE_SLOW in rig.out.reasons) is limited
+        assert (Reason.UNSEEN_SLOW in rig.out.reasons) is limited
+
+
 def test_a_truck_that_was_stopped_by_an_obstacle_goes_on_at_twice_the_speed_below_which_it_stops(monkeypatch):
     rig = Rig().driving(speed=0.2)
     rig.obstacles = wall(0.3)
@@ -360,7 +371,7 @@ def test_a_truck_that_was_stopped_by_an_obstacle_goes_on_at_twice_the_speed_belo
 
 
 def test_a_truck_at_rest_and_one_of_unknown_speed_need_no_distance_to_stop():
-    rig = Rig()
+    rig = Rig(deceleration=0.8)
     rig.silent = {"drive"}
     rig.tick()
     assert rig.out.stopping_distance == 0.0
@@ -369,7 +380,15 @@ def test_a_truck_at_rest_and_one_of_unknown_speed_need_no_distance_to_stop():
     assert rig.out.stopping_distance == 0.0
     rig.speed = -0.2
     rig.tick()
-    assert rig.out.stopping_distance == pytest.approx(0.2 * 0.08 + 0.2**2 / 2)
+    assert rig.out.stopping_distance == pytest.approx(0.2 * 0.08 + 0.2**2 / 1.6)
+
+
+def test_without_an_obstacle_no_distance_is_reported_for_it():
+    rig = Rig().driving(speed=0.1)
+    assert rig.gate._limiter.free is None
+    rig.obstacles = [(0.6, 0.0)]
+    rig.tick(10)
+    assert rig.gate._limiter.free == pytest.approx(0.6 - FOOTPRINT.half_length - FOOTPRINT.offset, abs=0.05)
 
 
 def test_what_appears_before_a_truck_that_brakes_is_a_quick_stop():

@@ -264,6 +264,9 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
     assert np.diff(kept[:, 0]).max() < 0.025
     assert (kept[0] == wall[0]).all()
     assert spaced(wall[:0], 0.02).shape == (0, 2)
+    remembered = memory()
+    remembered.observe(scan(SECOND), wall - np.array((1.5, 0.0)))
+    assert len(remembered.points()) == pytest.approx(50, abs=1)
 
 
 # In the gate

@@ -573,6 +573,21 @@ def test_a_goal_may_take_its_time_and_no_longer(late: int, reported: bool):
     steps(test)
 
 
+def test_the_time_of_a_goal_begins_when_a_fault_is_gone():
+    async def test(rig: Steps) -> None:
+        session = rig.session
+        session._state = State.FAULT
+        for _ in range(2):
+            await session._step(State.ENABLED)
+            rig.clock.time += 2 * SECOND + 1
+        session._state = State.SWITCHED_ON
+        rig.clock.time -= 1
+        await session._step(State.ENABLED)
+        assert rig.events.reasons() == []
+
+    steps(test)
+
+
 @pytest.mark.parametrize(
     ("late", "rpm", "control"),
     [
